@@ -1,0 +1,80 @@
+"""The paper's genetic algorithm (Alg. 1): select, mutate, update, until converged or G_max; pymoo's GA.
+
+The population starts around the nominal model, not anywhere in the bounds: default operators on all genes of a
+uniform population converge long before the friction curves do.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from pymoo.algorithms.soo.nonconvex.ga import GA
+from pymoo.core.problem import Problem
+from pymoo.operators.crossover.sbx import SBX
+from pymoo.operators.mutation.pm import PM
+from pymoo.optimize import minimize
+from pymoo.termination.max_time import TimeBasedTermination
+
+from r2s.identify import Search, SearchResult
+
+
+def ga_search(
+    *,
+    population: int = 72,
+    generations: int = 40,
+    minutes: float = 10.0,
+    spread: float = 0.12,
+    patience: int = 15,
+    tolerance: float = 1e-3,
+    seed: int = 0,
+) -> Search:
+    """Return the search.
+
+    Args:
+        population: individuals, all simulated at once.
+        generations: G_max. minutes: wall-clock bound, whichever comes first.
+        spread: standard deviation of the first population about the nominal model, of the unit cube.
+        patience, tolerance: converged once the best error improved by less than `tolerance` (relative) over
+            `patience` generations.
+        seed: of every draw.
+    """
+
+    def search(
+        residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray, report: Callable[[dict], None]
+    ) -> SearchResult:
+        costs: list[float] = []
+        rng = np.random.default_rng(seed)
+        first = np.clip(start + spread * rng.normal(size=(population, len(start))), 0, 1)
+        first[0] = start
+
+        class Replay(Problem):
+            def __init__(self):
+                super().__init__(n_var=len(start), n_obj=1, xl=0.0, xu=1.0)
+
+            def _evaluate(self, x, out, *args, **kwargs):
+                out["F"] = (residual(x) ** 2).sum(-1, keepdims=True)
+
+        def after_generation(algorithm) -> None:
+            cost = float(algorithm.opt[0].F[0])
+            costs.append(cost)
+            row = {"search": "ga", "generation": algorithm.n_gen, "evaluations": algorithm.evaluator.n_eval}
+            report(row | {"cost": cost, "done": algorithm.n_gen, "total": generations})
+            stale = len(costs) > patience and costs[-1 - patience] - cost < tolerance * cost
+            if stale or algorithm.n_gen >= generations:
+                algorithm.termination.terminate()
+
+        result = minimize(
+            Replay(),
+            GA(
+                pop_size=population,
+                sampling=first,
+                crossover=SBX(eta=10, prob=0.9),
+                mutation=PM(eta=15),
+                eliminate_duplicates=True,
+            ),
+            TimeBasedTermination(60 * minutes),
+            seed=seed,
+            callback=after_generation,
+        )
+        return SearchResult(np.asarray(result.X, dtype=float), None, residual(result.X[None])[0])
+
+    return search
