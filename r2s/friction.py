@@ -69,7 +69,9 @@ def passive_torque(
     return np.where(held, -tau, offset) - friction_torque(dq, phi)
 
 
-def pack(phi: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float, damping: np.ndarray) -> np.ndarray:
+def pack(
+    phi: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float, damping: np.ndarray
+) -> np.ndarray:
     """Return the (..., n, WIDTH) rows of `jnt_user` for the arguments of `passive_torque`; damping is the MJCF's."""
     rows = np.empty((*np.broadcast_shapes(phi.shape[:-1], offset.shape, breakaway.shape[:-1]), WIDTH))
     rows[..., MARK] = MARKER
@@ -96,7 +98,10 @@ def _callback() -> Any:
     nv_at, nuser_at = at["nv"] // 8, at["nuser_jnt"] // 8
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
     qvel_at, applied_at, passive_at = at["qvel"] // 8, at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
-    model_words, data_words = max(at[k] for k in _MODEL_FIELDS) // 8 + 1, max(at[k] for k in _DATA_FIELDS) // 8 + 1
+    model_words, data_words = (
+        max(at[k] for k in _MODEL_FIELDS) // 8 + 1,
+        max(at[k] for k in _DATA_FIELDS) // 8 + 1,
+    )
 
     @intrinsic
     def as_doubles(typingctx, address):

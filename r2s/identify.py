@@ -39,7 +39,9 @@ class Search(Protocol):
 
     def __call__(
         self, residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray, report: Callable[[dict], None]
-    ) -> SearchResult: ...
+    ) -> SearchResult:
+        """Search from `start` (P,) on the unit cube."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,9 @@ def identify(
     space = parameter_space(robot, nominal, bounds)
     if unknown := set(prior) - set(space.blocks):
         raise UserError(f"prior: {sorted(unknown)} is not searched; bounds name {', '.join(space.blocks)}")
-    data = make_residual(robot, space, recording, window_s=window_s, stride=stride, cutoff_hz=cutoff_hz, nthread=nthread)
+    data = make_residual(
+        robot, space, recording, window_s=window_s, stride=stride, cutoff_hz=cutoff_hz, nthread=nthread
+    )
     weigh = Weighted(data, prior)
     began, history = time.perf_counter(), []
 
@@ -111,7 +115,9 @@ def identify(
         result = search(weigh, u, told)
         u = result.u
     if breakaway and isinstance(data, ReplayResidual):
-        edges = scan_breakaway(robot, space.dynamics(space.from_unit(u)), recording, breakaway, window_s, stride, nthread, told)
+        edges = scan_breakaway(
+            robot, space.dynamics(space.from_unit(u)), recording, breakaway, window_s, stride, nthread, told
+        )
         data.space = space = replace(space, nominal=replace(nominal, breakaway=edges))
         result = searches[-1](weigh, u, told)
         u = result.u
@@ -154,7 +160,15 @@ def scan_breakaway(
         own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
         x = trials[np.arange(len(x)), own.argmin(1)]
         step /= 1 if k == 0 else 2.5
-        report({"pass": k + 1, "evaluations": data.candidates, "done": k + 1, "total": passes, "search": "breakaway"})
+        report(
+            {
+                "pass": k + 1,
+                "evaluations": data.candidates,
+                "done": k + 1,
+                "total": passes,
+                "search": "breakaway",
+            }
+        )
     return x.reshape(2, robot.n).T
 
 

@@ -195,7 +195,12 @@ def save_parameters(
         source: where it came from (recording, search, run), kept as it is.
     """
     fixed = space.nominal
-    document: dict[str, Any] = {"robot": robot.name, "joints": robot.n, "source": dict(source), "parameters": {}}
+    document: dict[str, Any] = {
+        "robot": robot.name,
+        "joints": robot.n,
+        "source": dict(source),
+        "parameters": {},
+    }
     for name in space.blocks:
         rows = {
             "value": space.block(x, name),

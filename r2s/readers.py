@@ -63,16 +63,12 @@ def read(
 
 
 def _recording(table: Table, torque, columns, n_joints, max_gap_s, period, name) -> Recording:
-    notes = {
-        k: v.item() for k, v in table.items() if v.ndim == 0
-    }  # what `Recording.save` says about the rows
+    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # what `Recording.save` says about the rows
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(torque, notes.get("torque"))
     found = {field: _find(table, field, spec, torque) for field, spec in _specs(columns).items()}
     arrays = {
-        field: _vector(table, names, n_joints, field)
-        if field in ("q", "dq", "tau")
-        else _scalar(table, names)
+        field: _vector(table, names, n_joints, field) if field in ("q", "dq", "tau") else _scalar(table, names)
         for field, names in found.items()
         if names
     }
@@ -93,9 +89,7 @@ def _agreed_torque(told: str | None, stored) -> str:
     if not isinstance(stored, str):
         return declared_torque(told)
     if told not in (None, "", "???", declared_torque(stored)):
-        raise UserError(
-            f"the file declares torque={stored}, but data.torque={declared_torque(told)} was asked for"
-        )
+        raise UserError(f"the file declares torque={stored}, but data.torque={declared_torque(told)} was asked for")
     return stored
 
 
@@ -250,9 +244,7 @@ def _load_npz(path: Path) -> Table:
             except ValueError as error:
                 if "allow_pickle" not in str(error):
                     raise
-                raise UserError(
-                    f"{path}: '{name}' is pickled, which is never loaded; save plain arrays"
-                ) from None
+                raise UserError(f"{path}: '{name}' is pickled, which is never loaded; save plain arrays") from None
     return table
 
 

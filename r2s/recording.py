@@ -71,9 +71,7 @@ class Recording:
         index = self.trajectory.astype(np.int64)
         if not np.array_equal(index, self.trajectory):
             row = int(np.flatnonzero(index != self.trajectory)[0])
-            raise UserError(
-                f"trajectory must hold whole numbers; it is {self.trajectory[row]:g} at row {row}"
-            )
+            raise UserError(f"trajectory must hold whole numbers; it is {self.trajectory[row]:g} at row {row}")
         object.__setattr__(self, "trajectory", index)
         seen = set()
         for stretch in self.stretches:
@@ -165,9 +163,7 @@ class Recording:
                 x = getattr(self, field)[s]
                 columns[field].append(np.stack([np.interp(grid, t, column) for column in x.T], axis=1))
         if not columns["t"]:
-            raise UserError(
-                f"no trajectory is as long as dt={dt:g} s; the recording lasts {self.duration:g} s"
-            )
+            raise UserError(f"no trajectory is as long as dt={dt:g} s; the recording lasts {self.duration:g} s")
         return replace(self, **{field: np.concatenate(parts) for field, parts in columns.items()})  # type: ignore[arg-type]
 
     def smooth(self, cutoff_hz: float) -> "Recording":

@@ -132,7 +132,7 @@ class ReplayResidual:
         return (self(x).reshape(len(x), -1, self._target.shape[-1]) ** 2).mean(1)
 
     def scale(self, x: np.ndarray) -> np.ndarray:
-        """Return (n,) mrad: what counts as one standard deviation of a row; encoders are alike, and a window is one."""
+        """Return (n,) mrad: one standard deviation of a row; encoders are alike, and a window counts as one."""
         return np.full(self._target.shape[-1], 0.2 * np.sqrt(self._target.shape[1]))
 
     def error(self, x: np.ndarray) -> np.ndarray:

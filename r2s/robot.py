@@ -22,7 +22,7 @@ class Robot:
 
     Attributes:
         name: the model's name.
-        xml: its cleaned MJCF.
+        mjcf: its file.
         q_min, q_max: (n,) rad. dq_max: (n,) rad/s. ddq_max: (n,) rad/s^2.
         tau_max: (n,) Nm. dtau_max: (n,) Nm/s.
         q_home: (n,) rad, where episodes and excitations start.
@@ -31,7 +31,7 @@ class Robot:
     """
 
     name: str
-    xml: str
+    mjcf: Path
     q_min: np.ndarray
     q_max: np.ndarray
     dq_max: np.ndarray
@@ -55,7 +55,15 @@ class Robot:
             user: width of `jnt_user`, where the friction law keeps its parameters (r2s/friction.py).
             dt: time step, s.
         """
-        spec = mujoco.MjSpec.from_string(self.xml)
+        spec = mujoco.MjSpec.from_file(str(self.mjcf))
+        spec.compile()  # gives the joints their ids
+        for item in [*spec.actuators, *spec.sensors, *spec.keys]:
+            spec.delete(item)
+        unit = np.degrees(1.0) if spec.compiler.degree else 1.0
+        for joint in spec.joints:
+            joint.range = unit * np.array([self.q_min[joint.id], self.q_max[joint.id]])
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         spec.nuser_jnt = user
         spec.option.timestep = dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -110,7 +118,7 @@ def load_robot(
     high = per_joint("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.pi))
     torque = per_joint("tau_max", tau_max, _torque_limits(model))
     if not np.all(torque > 0):
-        joints = [model.joint(i).name for i in np.flatnonzero(~(torque > 0))]
+        joints = [model.joint(i).name or f"joint {i + 1}" for i in np.flatnonzero(~(torque > 0))]
         raise UserError(
             f"robot.tau_max: {path.name} gives no torque limit for {choices(joints)}; set robot.tau_max=[...]"
         )
@@ -120,20 +128,13 @@ def load_robot(
         raise UserError(
             f"robot.q_home: joint {joint + 1} at {home[joint]:.3f} rad, allowed {low[joint]:.3f} to {high[joint]:.3f}"
         )
-    for item in [*spec.actuators, *spec.sensors, *spec.keys]:
-        spec.delete(item)
-    for joint in spec.joints:
-        joint.range = [low[model.joint(joint.name).id], high[model.joint(joint.name).id]]
-        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    spec.compile()
     rotation = np.zeros((n, 3, 3))
     for i, body in enumerate(model.jnt_bodyid):
         mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])
     principal = model.body_inertia[model.jnt_bodyid]
     return Robot(
         name=spec.modelname or path.stem,
-        xml=spec.to_xml(),
+        mjcf=path.resolve(),
         q_min=low,
         q_max=high,
         dq_max=per_joint("dq_max", dq_max, np.ones(n)),
@@ -151,7 +152,9 @@ def _check_serial(model: mujoco.MjModel, path: Path) -> None:
     for i in range(model.njnt):
         if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_HINGE:
             kind = mujoco.mjtJoint(int(model.jnt_type[i])).name
-            raise UserError(f"robot.mjcf: {path.name}: joint '{model.joint(i).name}' is {kind}; only hinges are allowed")
+            raise UserError(
+                f"robot.mjcf: {path.name}: joint '{model.joint(i).name}' is {kind}; only hinges are allowed"
+            )
     if model.njnt == 0:
         raise UserError(f"robot.mjcf: {path.name} has no joints")
     for previous, body in zip(model.jnt_bodyid[:-1], model.jnt_bodyid[1:], strict=True):

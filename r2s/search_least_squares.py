@@ -36,7 +36,13 @@ def least_squares_search(*, max_evaluations: int = 40, ftol: float = 1e-6) -> Se
             return ((r[1:] - r[0]) / step[:, None]).T
 
         solution = least_squares(
-            fun, inside, jac, bounds=(np.zeros(p), np.ones(p)), max_nfev=max_evaluations, ftol=ftol, x_scale="jac"
+            fun,
+            inside,
+            jac,
+            bounds=(np.zeros(p), np.ones(p)),
+            max_nfev=max_evaluations,
+            ftol=ftol,
+            x_scale="jac",
         )
         return SearchResult(solution.x, solution.jac, solution.fun)
 

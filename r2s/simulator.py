@@ -73,7 +73,6 @@ class Simulator:
         axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
         quaternions = _quaternions(axes)
 
-
         def spread(a: np.ndarray) -> np.ndarray:
             return np.repeat(a, repeat, axis=0) if a.ndim == 3 and repeat > 1 else a
 

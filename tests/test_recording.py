@@ -265,9 +265,7 @@ def test_gaz2019_splits_by_phase():
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
 @pytest.mark.parametrize("joint", ["{name}{j}", "{name}_{j}", "{name}[{i}]", "{name}_{i}"])
-@pytest.mark.parametrize(
-    ("torque", "tau"), [("measured", "tau_J"), ("commanded", "tau_J_d"), ("measured", "tau")]
-)
+@pytest.mark.parametrize(("torque", "tau"), [("measured", "tau_J"), ("commanded", "tau_J_d"), ("measured", "tau")])
 def test_every_format_reads_back_the_same(tmp_path, suffix, joint, torque, tau):
     r = sine(jittered_time(300), n=7, torque=torque, name="log", trajectory=np.repeat([0, 1], 150))
     path = write(tmp_path / f"log{suffix}", columns_of(r, tau, joint))
@@ -278,16 +276,12 @@ def test_two_dimensional_columns(tmp_path):
     r = sine(jittered_time(300), name="log")
     arrays = {"t": r.t, "q": r.q, "dq": r.dq, "tau_J": r.tau}
     assert_same(read(write(tmp_path / "log.npz", arrays), torque="measured"), r)
-    assert_same(
-        read(write(tmp_path / "log.parquet", {k: list(v) for k, v in arrays.items()}), torque="measured"), r
-    )
+    assert_same(read(write(tmp_path / "log.parquet", {k: list(v) for k, v in arrays.items()}), torque="measured"), r)
 
 
 @pytest.mark.parametrize("period", [None, 13.33])
 def test_a_saved_recording_comes_back_as_it_was(tmp_path, period):
-    t = np.concatenate(
-        [jittered_time(200), 40 + jittered_time(200)]
-    )  # a gap inside trajectory 3 stays inside
+    t = np.concatenate([jittered_time(200), 40 + jittered_time(200)])  # a gap inside trajectory 3 stays inside
     r = sine(t, torque="commanded", trajectory=np.full(400, 3), period=period, name="a name")
     path = tmp_path / "saved.npz"
     r.save(path)

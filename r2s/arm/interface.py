@@ -1,0 +1,106 @@
+"""What r2s needs of an arm, real or not: be placed, be read, take one torque per 1 kHz cycle, stop.
+
+The convention is libfranka's: a command excludes gravity and the arm adds its own compensation of it. A
+panda_py `control(callback)` loop and pylibfranka's readOnce/writeOnce both fit: `read` is the state the cycle
+came with, `command` ends the cycle and waits for the next.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from r2s.robot import SIM_DT, Robot
+
+RATE_TOLERANCE = 1e-3  # Nm: a command that was limited to the allowed step in another precision still passes
+
+
+class ArmStopped(RuntimeError):  # noqa: N818 (an arm that stops is not a bug)
+    """The arm ended the motion, for the reason in the message; it moves again after the next `move_to`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmState:
+    """One 1 kHz sample of n joints.
+
+    Attributes:
+        t: s, since the motion began.
+        q, dq: (n,) rad, rad/s, as the arm measures them.
+        tau_J: (n,) Nm, link-side torque sensor: contains gravity, hides most motor friction.
+        tau_J_d: (n,) Nm, the last command: without gravity.
+
+    """
+
+    t: float
+    q: np.ndarray
+    dq: np.ndarray
+    tau_J: np.ndarray  # noqa: N815 (libfranka's name)
+    tau_J_d: np.ndarray  # noqa: N815
+
+
+class Arm(Protocol):
+    """A torque-controlled arm. One motion is `move_to`, then `read` and `command` in turn, then `stop`."""
+
+    robot: Robot
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Bring the arm to rest at q (n,) rad before a motion, clear a stop, and return its state."""
+        ...
+
+    def read(self) -> ArmState:
+        """Return the state of the current cycle; the same one until the next `command`."""
+        ...
+
+    def command(self, tau: np.ndarray) -> None:
+        """Send tau (n,) Nm WITHOUT gravity for one cycle, and wait for the next.
+
+        Raises:
+            ArmStopped: not finite, beyond tau_max, a step of more than dtau_max * 1 ms from tau_J_d, or a
+            joint that
+                left its position or velocity limits; or the arm has stopped before.
+
+        """
+        ...
+
+    def stop(self) -> None:
+        """End the motion; harmless when it has already ended."""
+        ...
+
+
+class Reflexes:
+    """The checks by which an arm stops itself, for arms that are not hardware; messages name the joint."""
+
+    def __init__(self, robot: Robot, dt: float = SIM_DT):
+        self.robot = robot
+        self._step = robot.dtau_max * dt + RATE_TOLERANCE
+
+    def command(self, tau: np.ndarray, tau_J_d: np.ndarray) -> None:
+        """Raise ArmStopped if the arm would not take tau (n,) Nm after the command tau_J_d (n,) Nm."""
+        r = self.robot
+        if tau.shape != r.tau_max.shape:
+            raise ArmStopped(f"the command has shape {tau.shape}, the arm has {r.n} joints")
+        if (np.abs(tau) <= r.tau_max).all() and (np.abs(tau - tau_J_d) <= self._step).all():  # NaN fails both
+            return
+        if not np.isfinite(tau).all():
+            i = int(np.argmin(np.isfinite(tau)))
+            raise ArmStopped(f"joint {i + 1}: commanded torque is {tau[i]}, must be finite")
+        if (np.abs(tau) > r.tau_max).any():
+            i = int(np.argmax(np.abs(tau) / r.tau_max))
+            raise ArmStopped(f"joint {i + 1}: commanded torque {tau[i]:.3f} Nm, allowed +-{r.tau_max[i]:g} Nm")
+        i = int(np.argmax(np.abs(tau - tau_J_d) / self._step))
+        raise ArmStopped(
+            f"joint {i + 1}: commanded torque steps by {tau[i] - tau_J_d[i]:+.3f} Nm in one cycle, allowed "
+            f"+-{r.dtau_max[i] * SIM_DT:g} Nm (dtau_max {r.dtau_max[i]:g} Nm/s)"
+        )
+
+    def state(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Raise ArmStopped if q, dq (n,) rad, rad/s are outside the arm's limits."""
+        r = self.robot
+        if (q >= r.q_min).all() and (q <= r.q_max).all() and (np.abs(dq) <= r.dq_max).all():
+            return
+        out = np.maximum(r.q_min - q, q - r.q_max)
+        if not (out <= 0).all():
+            i = int(np.argmax(out))
+            raise ArmStopped(f"joint {i + 1}: position {q[i]:.4f} rad, allowed {r.q_min[i]:g} to {r.q_max[i]:g} rad")
+        i = int(np.argmax(np.abs(dq) / r.dq_max))
+        raise ArmStopped(f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, allowed +-{r.dq_max[i]:g} rad/s")

@@ -1,0 +1,61 @@
+"""An arm of known truth behind the arm interface: the simulator with given dynamics and sensor noise."""
+
+import numpy as np
+
+from r2s.arm.interface import ArmState, Reflexes
+from r2s.robot import SIM_DT, Robot
+from r2s.simulator import Dynamics, Simulator
+
+
+class SimulatedArm:
+    """MuJoCo with the friction law of r2s/friction.py, for identification against a known truth.
+
+    Args:
+        robot, dynamics: the arm and its truth.
+        position_noise, velocity_noise: standard deviation of q, rad, and dq, rad/s, white.
+        seed: of the noise.
+    """
+
+    def __init__(
+        self, robot: Robot, dynamics: Dynamics, *, position_noise: float, velocity_noise: float, seed: int = 0
+    ):
+        self.robot = robot
+        self._sim = Simulator(robot, dynamics, 1, 1)
+        self._noise = position_noise, velocity_noise
+        self._rng = np.random.default_rng(seed)
+        self._reflexes = Reflexes(robot)
+        self._cycle, self._last = 0, np.zeros(robot.n)
+        self._state = self.move_to(robot.q_home)
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Place the arm at rest at q (n,) rad; the clock starts again."""
+        self._sim.reset(np.asarray(q, dtype=float)[None], np.zeros((1, self.robot.n)))
+        self._cycle, self._last = 0, np.zeros(self.robot.n)
+        return self._sense()
+
+    def read(self) -> ArmState:
+        """Return the state of this cycle."""
+        return self._state
+
+    def command(self, tau: np.ndarray) -> None:
+        """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as the real arm's reflexes would."""
+        self._reflexes.command(tau, self._last)
+        self._last = np.array(tau, dtype=float)
+        self._sim.rollout(self._last[None, None])
+        self._reflexes.state(self._sim.q[0], self._sim.dq[0])
+        self._cycle += 1
+        self._sense()
+
+    def stop(self) -> None:
+        """End the motion: the arm stands where it is, without command."""
+        self._sim.reset(self._sim.q.copy(), np.zeros((1, self.robot.n)))
+        self._last = np.zeros(self.robot.n)
+        self._sense()
+
+    def _sense(self) -> ArmState:
+        n = self.robot.n
+        q = self._sim.q[0] + self._noise[0] * self._rng.normal(size=n)
+        dq = self._sim.dq[0] + self._noise[1] * self._rng.normal(size=n)
+        # gravity is not simulated here, so this "sensor" has only what the command says: do not record it as measured
+        self._state = ArmState(t=self._cycle * SIM_DT, q=q, dq=dq, tau_J=self._last.copy(), tau_J_d=self._last.copy())
+        return self._state

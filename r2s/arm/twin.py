@@ -1,0 +1,310 @@
+"""The hidden twin: the stand-in for a real arm, with everything in it that the trained simulator lacks.
+
+Another engine (DART), friction of another family (LuGre: bristles, Stribeck, load and direction dependence,
+breakaway), torque offsets, wrong masses, centres and tensors under a gravity compensation that believes the
+nominal ones, a delayed and lagging torque, cable drag, noise and quantisation. `seed` draws a robot; nothing
+but this file reads what was drawn. Seeds 0-9 are for development; seeds of 100 and above are for judging.
+
+One cycle: the command goes through delay and lag; the friction of the coming step is solved implicitly
+together with the coupled joint velocities; DART takes the step with that friction linearised about the
+solution; sensors are read.
+
+Friction, per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), bristle z rad, h the time step:
+    dz/dt = v - s0 |v| z / g(v),   f = s0 z + s1(v) dz/dt + s2 v,   s1(v) = s1 exp(-(v / vd)^2)
+    g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c one value per direction
+"""
+
+import numpy as np
+from numba import njit
+
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.engines.dart import DartEngine
+from r2s.robot import SIM_DT, Robot
+
+# Rows of the parameters (rows, n) ...
+C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
+DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE = range(9, 17)
+# ... and of the state (rows, n)
+Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_FILTERED, Q_SEEN, TAU_SEEN = range(11)
+
+DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, or each reversal would kick
+ENCODER = 2e-5  # rad
+NOISE_BLOCK = 1000  # cycles of noise drawn at once
+MASS_EVERY = 4  # cycles between mass matrices for the implicit solve; DART itself always has the current one
+STOP_MARGIN = 0.1  # rad from the position limits, where the arm stops itself, to the mechanical stops
+
+
+class Twin:
+    """An `Arm` (r2s/arm/interface.py) of which only the seed is known.
+
+    The same seed and the same calls give bit-identical states. Noise restarts at every `move_to`, from a
+    stream of its own for each episode: the k-th episode of a twin has the same noise whatever the episodes
+    before it did, so an evaluation on a fresh twin is reproducible. Time and bristles restart too; the robot
+    drawn stays.
+    """
+
+    def __init__(self, robot: Robot, seed: int):
+        self.robot = robot
+        self._seed = int(seed)
+        rng = np.random.default_rng([self._seed, 0])
+        masses, coms, inertias = _draw_links(robot, rng)
+        self._engine = DartEngine(
+            robot, gravity=True, masses=masses, coms=coms, inertias=inertias, stop_margin=STOP_MARGIN
+        )
+        self._nominal = DartEngine(robot, gravity=True)
+        at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
+        inertia = 1 / np.diag(np.linalg.inv(self._nominal.mass_matrix(robot.q_home)))
+        self._hidden = _draw_joints(robot, rng, inertia, at_home[0] - at_home[1])
+        delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles
+        lag = rng.uniform(1e-3, 3e-3)  # s
+        filter_hz = rng.uniform(60.0, 120.0)
+        self._delay, self._lag = delay, -np.expm1(-SIM_DT / lag)
+        self._dq_filter = -np.expm1(-2 * np.pi * filter_hz * SIM_DT)
+        self._line = np.zeros((int(delay) + 2, robot.n))
+        self._state = np.zeros((11, robot.n))
+        self._reflexes = Reflexes(robot)
+        self._episode = 0
+        self._stopped: str | None = "no motion was started; call move_to first"
+        self._start(robot.q_home)
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Place the arm at rest at q (n,) rad; bristles carry what gravity compensation leaves."""
+        q = np.array(q, dtype=float)
+        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
+            raise ArmStopped(f"move_to needs {self.robot.n} finite joint angles; it got {q}")
+        self._reflexes.state(q, np.zeros(self.robot.n))
+        self._start(q)
+        self._episode += 1
+        self._stopped = None
+        return self.read()
+
+    def read(self) -> ArmState:
+        """Return the sensors' view of the current cycle."""
+        s = self._state
+        return ArmState(
+            self._cycle * SIM_DT,
+            s[Q_SEEN].copy(),
+            s[DQ_FILTERED].copy(),
+            s[TAU_SEEN].copy(),
+            self._tau_J_d.copy(),
+        )
+
+    def command(self, tau: np.ndarray) -> None:
+        """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
+        if self._stopped is not None:
+            raise ArmStopped(f"the arm is stopped: {self._stopped}")
+        tau = np.array(tau, dtype=float)
+        try:
+            self._reflexes.command(tau, self._tau_J_d)
+            self._advance(tau)
+            self._reflexes.state(self._q, self._dq)
+        except ArmStopped as reason:
+            self._stopped = str(reason)
+            raise
+
+    def stop(self) -> None:
+        """End the motion; `command` is refused until the next `move_to`."""
+        if self._stopped is None:
+            self._stopped = "stop was called"
+
+    def _start(self, q: np.ndarray) -> None:
+        n = self.robot.n
+        self._rng = np.random.default_rng([self._seed, 1, self._episode])
+        self._cycle = 0
+        self._q, self._dq, self._tau_J_d = q, np.zeros(n), np.zeros(n)
+        self._engine.reset(q, self._dq)
+        self._mass = self._engine.mass_matrix(q)
+        self._line[:] = 0
+        gravity = self._nominal.gravity_torque(q)
+        _rest(self._hidden, self._state, q, gravity, self._engine.gravity_torque(q))
+        self._sense(before=self._dq)
+
+    def _advance(self, tau: np.ndarray) -> None:
+        if self._cycle % MASS_EVERY == 0:
+            self._mass = self._engine.mass_matrix(self._q)
+        gravity = self._nominal.gravity_torque(self._q)
+        passive, damping = _drive(
+            self._hidden, self._state, self._line, self._mass, tau, self._q, self._dq, gravity,
+            self._cycle, self._delay, self._lag, SIM_DT,
+        )  # fmt: skip
+        before = self._dq
+        self._q, self._dq = self._engine.step(self._state[MOTOR], passive, damping)
+        self._tau_J_d = tau
+        self._cycle += 1
+        self._sense(before)
+
+    def _sense(self, before: np.ndarray) -> None:
+        row = self._cycle % NOISE_BLOCK
+        if row == 0:
+            self._noise = self._rng.standard_normal((NOISE_BLOCK, 3, self.robot.n))
+        _sense(
+            self._hidden, self._state, self._noise[row], self._q, self._dq, before, self._mass,
+            self._dq_filter, SIM_DT,
+        )  # fmt: skip
+
+
+def _draw_links(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return true masses, centres and tensors; U: uniform."""
+    model = robot.model(gravity=True)
+    n, bodies = robot.n, model.jnt_bodyid
+    small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # arms smaller than a Panda's wrist
+    masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
+    coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
+    scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
+    return masses, coms, robot.inertia * scale[:, None, None]
+
+
+def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
+    """Return the parameters (rows, n).
+
+    Args:
+        robot: the arm.
+        rng: the stream to draw from.
+        inertia: (n,) kg m^2, what each joint feels at home with the others free.
+        unbalanced: (n,) Nm, what the gravity compensation leaves at home.
+
+    """
+    n = robot.n
+    level, offset_range, drag_max, noise_max = _magnitudes(robot)
+    p = np.empty((17, n))
+    level = level * rng.uniform(0.7, 1.3, n)
+    coulomb = 0.6 * level  # the rest of the level comes with speed
+    lean = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
+    p[C_NEG], p[C_POS] = coulomb - lean, coulomb + lean
+    p[BREAK] = rng.uniform(1.1, 1.5, n)  # of the Coulomb level
+    p[MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of joint load
+    p[V_STRIBECK] = rng.uniform(0.05, 0.15, n)
+    p[S0] = p[BREAK] * coulomb / rng.uniform(3e-4, 8e-4, n)  # breaks away after U(0.3, 0.8) mrad
+    p[S1] = 2 * rng.uniform(0.2, 0.4, n) * np.sqrt(p[S0] * inertia)  # damping ratio of the bristles
+    p[S2] = 0.4 * level * rng.uniform(0.7, 1.3, n)
+    p[OFFSET] = rng.uniform(offset_range[:, 0], offset_range[:, 1]) * rng.choice([-1, 1], n)
+    # Table I is what is left of gravity and offset together; an arm that drifts at home would be recalibrated
+    hold = 0.7 * coulomb
+    p[OFFSET] = np.clip(p[OFFSET], -hold - unbalanced, hold - unbalanced)
+    p[DRAG_OWN] = drag_max * rng.uniform(0.15, 0.7, n)
+    p[DRAG_NEXT] = drag_max * rng.uniform(0.0, 0.3, n)  # a cable along two joints
+    p[DRAG_WAVES] = rng.uniform(0.7, 2.0, n)  # rad per rad
+    p[DRAG_PHASE] = rng.uniform(-np.pi, np.pi, n)
+    p[NOISE_Q] = rng.uniform(0.5e-5, 1.5e-5, n)
+    p[NOISE_DQ] = rng.uniform(2e-3, 4e-3, n)  # before the filter
+    p[NOISE_TAU] = noise_max * rng.uniform(0.5, 1.0, n)
+    p[ARMATURE] = robot.model(gravity=False).dof_armature
+    return p
+
+
+def _magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return friction level at speed, range of |offset| (n, 2), largest cable drag and sensor noise, Nm.
+
+    A Panda has the size of the paper's Tables I and IV; other arms get it in proportion to their torque
+    limits.
+    """
+    big = robot.tau_max >= 40
+    if robot.n == 7 and np.allclose(robot.tau_max, [87] * 4 + [12] * 3):
+        level = 0.5 * np.array([3.40, 1.98, 2.51, 2.44, 2.60, 1.19, 1.55])  # phi1 / 2, Table IV NEW
+    else:
+        level = np.minimum(0.05 * robot.tau_max, 0.45 * robot.tau_max**0.25)
+    small = np.minimum(1.0, robot.tau_max / 12)
+    offset = np.where(big[:, None], [0.05, 0.7], small[:, None] * [0.01, 0.08])
+    return level, offset, np.where(big, 0.3, 0.08 * small), np.where(big, 0.3, 0.1 * small)
+
+
+@njit(cache=True)
+def _stribeck(p, z, v, load, i):
+    """Return the friction level g(v), Nm; the direction is the bristle's."""
+    coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
+    fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
+    return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
+
+
+@njit(cache=True)
+def _drag(p, q, i):
+    wave = np.sin(p[DRAG_WAVES, i] * q[i] + p[DRAG_PHASE, i])
+    return p[DRAG_OWN, i] * wave + p[DRAG_NEXT, i] * np.sin(q[(i + 1) % len(q)] - p[DRAG_PHASE, i])
+
+
+@njit(cache=True)
+def _rest(p, s, q, believed, true):
+    """Set the state of an arm at rest: bristles carry what `believed` leaves of the `true` gravity torque."""
+    s[:] = 0
+    for i in range(len(q)):
+        left = believed[i] + p[OFFSET, i] + _drag(p, q, i)
+        level = 0.95 * _stribeck(p, left - true[i], 0.0, believed[i], i)
+        s[FRICTION, i] = min(max(left - true[i], -level), level)
+        s[Z, i] = s[FRICTION, i] / p[S0, i]
+        s[DRIVE, i] = left
+        s[LEVEL, i] = np.inf
+        s[BIAS, i] = true[i]
+
+
+@njit(cache=True)
+def _drive(p, s, line, mass, tau, q, v, gravity, cycle, delay, lag, h):
+    """Take a command into the joints; return passive torque and implicit damping (n,) for the engine's step.
+
+    The coupled implicit equation of the step, mass (w - v) / h + bias + f(w) = drive, is solved for the
+    coming velocity w joint by joint (Gauss-Seidel), each exactly: with the bristle's backward Euler step
+    z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is a quadratic with one root of the right sign.
+    """
+    n, slots = len(tau), len(line)
+    passive, damping = np.empty(n), np.empty(n)
+    whole = int(delay)
+    late = delay - whole
+    line[cycle % slots] = tau
+    newer, older = (cycle - whole) % slots, (cycle - whole - 1) % slots
+    w = s[V_GUESS]
+    for i in range(n):
+        delayed = (1 - late) * line[newer, i] + late * line[older, i]
+        s[MOTOR, i] += lag * (delayed - s[MOTOR, i])
+        passive[i] = gravity[i] + p[OFFSET, i] + _drag(p, q, i)
+        s[DRIVE, i] = s[MOTOR, i] + passive[i]
+        s[LEVEL, i] = _stribeck(p, s[Z, i], v[i], gravity[i], i)
+        limit = s[LEVEL, i] / p[S0, i]
+        s[Z, i] = min(max(s[Z, i], -limit), limit)
+        damping[i] = p[S1, i] * np.exp(-((v[i] / DQ_BRISTLE) ** 2)) / h  # for now: s1 / h
+    for _ in range(50):
+        change = 0.0
+        for i in range(n):
+            free = s[DRIVE, i] - s[BIAS, i] + mass[i, i] / h * v[i]
+            for j in range(n):
+                if j != i:
+                    free -= mass[i, j] / h * (w[j] - v[j])
+            stiff, z, k = p[S0, i] + damping[i], s[Z, i], h * p[S0, i] / s[LEVEL, i]
+            a = mass[i, i] / h + p[S2, i]
+            rest = free + damping[i] * z - stiff * z  # what is left at w = 0 tells the direction
+            sign = 1.0 if rest >= 0 else -1.0
+            b = a + stiff * h - sign * (free + damping[i] * z) * k
+            root = np.sqrt(b * b + 4 * a * k * abs(rest))
+            speed = 2 * abs(rest) / (b + root) if b > 0 else (root - b) / (2 * a * k)
+            change = max(change, abs(sign * speed - w[i]))
+            w[i] = sign * speed
+        if change < 1e-9:
+            break
+    for i in range(n):
+        stiff, z, k = p[S0, i] + damping[i], s[Z, i], h * p[S0, i] / s[LEVEL, i]
+        grow = 1 + k * abs(w[i])
+        sign = 1.0 if w[i] >= 0 else -1.0
+        friction = stiff * (z + h * w[i]) / grow - damping[i] * z + p[S2, i] * w[i]
+        slope = stiff * (h - z * k * sign) / (grow * grow) + p[S2, i]
+        s[FRICTION, i], s[SLOPE, i] = friction, slope
+        damping[i] = slope
+        passive[i] -= friction - slope * w[i]
+    return passive, damping
+
+
+@njit(cache=True)
+def _sense(p, s, noise, q, v, before, mass, dq_filter, h):
+    """Finish the step that ended at q, v (n,): bristles, link torque, remaining bias, sensors."""
+    n = len(q)
+    for i in range(n):
+        s[FRICTION, i] += s[SLOPE, i] * (v[i] - s[V_GUESS, i])
+        s[Z, i] = (s[Z, i] + h * v[i]) / (1 + h * p[S0, i] / s[LEVEL, i] * abs(v[i]))
+        link = s[DRIVE, i] - s[FRICTION, i]
+        inertial = 0.0
+        for j in range(n):
+            inertial += mass[i, j] * (v[j] - before[j]) / h
+        s[BIAS, i] = link - inertial
+        s[Q_SEEN, i] = ENCODER * np.round((q[i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
+        s[DQ_FILTERED, i] += dq_filter * (v[i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_FILTERED, i])
+        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of the sensor
+        s[TAU_SEEN, i] = link - rotor + p[NOISE_TAU, i] * noise[2, i]
+    for i in range(n):
+        s[V_GUESS, i] = v[i]

@@ -1,0 +1,244 @@
+"""The arm in DART, set up as Gazebo's physics plugin does: the second engine of Sim2Sim, the twin's body.
+
+Semi-implicit Euler, joint damping implicit, position limits hard, Coulomb friction exact. With the settings
+below DART and Gazebo's own plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
+"""
+
+from types import ModuleType
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.robot import SIM_DT, Robot
+
+
+class DartEngine:
+    """One arm without contacts. A command lasts one step and is clipped to the torque limits.
+
+    Args:
+        robot: the arm; its MJCF is the one description of kinematics, inertia, damping and limits.
+        gravity: False is libfranka's convention (the arm compensates it).
+        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in
+            link axes; each replaces the file's values for the n moving links.
+        dt: time step, s.
+        stop_margin: rad, how far outside the position limits the hard stops are.
+
+    Velocity limits are left to whoever watches the arm: MuJoCo has none, and an engine that silently enforces
+    them hides that a policy breaks them.
+
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        gravity: bool,
+        masses: np.ndarray | None = None,
+        coms: np.ndarray | None = None,
+        inertias: np.ndarray | None = None,
+        dt: float = SIM_DT,
+        stop_margin: float = 0.0,
+    ):
+        dart = _dartpy()
+        model = robot.model(gravity=gravity, dt=dt)
+        n = robot.n
+        bodies = model.jnt_bodyid
+        links = _Links(model)
+        links.override(bodies, _shaped("masses", masses, (n,)), _shaped("coms", coms, (n, 3)), inertias, n)
+        self.robot = robot
+        # DART has no armature. Damping A/h with the torque (A/h) v put back is the same thing exactly: the
+        # implicit step solves (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
+        self._armature = model.dof_armature.copy()
+        self._damping = model.dof_damping + self._armature / dt
+        self._counter = self._armature / dt if self._armature.any() else None
+        self._low, self._high = -robot.tau_max, robot.tau_max
+        self._skeleton = dart.dynamics.Skeleton(robot.name)
+        self._joints = []
+        parent: Any = None
+        for i in range(n):
+            joint, parent = self._add_link(dart, model, links, i, parent)
+            joint.setPositionLowerLimit(0, float(robot.q_min[i]) - stop_margin)
+            joint.setPositionUpperLimit(0, float(robot.q_max[i]) + stop_margin)
+            self._joints.append(joint)
+        site = model.site(robot.ee_site).id
+        anchor, pose = links.moving_parent(model.site_bodyid[site])
+        if anchor != bodies[-1]:
+            raise UserError(f"robot.ee_site: '{robot.ee_site}' does not sit on the arm's last link")
+        self._tip = parent
+        self._ee = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
+        self._world = dart.simulation.World()
+        self._world.setTimeStep(dt)
+        self._world.setGravity(model.opt.gravity)
+        self._world.addSkeleton(self._skeleton)
+        _as_gazebo(dart, self._world)
+
+    def _add_link(self, dart: ModuleType, model: mujoco.MjModel, links: "_Links", i: int, parent):
+        body = int(model.jnt_bodyid[i])
+        anchor, pose = links.moving_parent(model.body_parentid[body])
+        if parent is None and anchor != 0:
+            raise UserError(f"robot.mjcf: link '{model.body(body).name}' does not hang on a fixed base")
+        to_joint = _pose(model.jnt_pos[i], None)
+        zero = _pose(None, _about(model.jnt_axis[i], -model.qpos0[i]))  # the file's pose is the one at qpos0
+        properties = dart.dynamics.RevoluteJointProperties()
+        properties.mName = model.joint(i).name or f"joint{i + 1}"
+        properties.mAxis = model.jnt_axis[i]
+        properties.mT_ParentBodyToJoint = _isometry(dart, pose @ links.local[body] @ to_joint @ zero)
+        properties.mT_ChildBodyToJoint = _isometry(dart, to_joint)
+        joint, link = self._skeleton.createRevoluteJointAndBodyNodePair(parent, properties)
+        link.setName(model.body(body).name or f"link{i + 1}")
+        mass, com, inertia = links.lumped(body)
+        if mass <= 0:
+            raise UserError(f"robot.mjcf: link '{model.body(body).name}' has no mass")
+        link.setInertia(dart.dynamics.Inertia(mass, com, inertia))
+        joint.setDampingCoefficient(0, float(self._damping[i]))
+        joint.setCoulombFriction(0, float(model.dof_frictionloss[i]))
+        joint.setSpringStiffness(0, float(model.jnt_stiffness[i]))
+        joint.setRestPosition(0, float(model.qpos_spring[i]))
+        joint.setLimitEnforcement(True)  # dartpy leaves it off
+        return joint, link
+
+    def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Put the arm at q, dq (n,) rad, rad/s."""
+        self._skeleton.resetCommands()
+        self._skeleton.clearInternalForces()
+        self._skeleton.setPositions(q)
+        self._skeleton.setVelocities(dq)
+
+    def step(
+        self, tau: np.ndarray, passive: np.ndarray | None = None, damping: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Advance one time step; return the new (q, dq), (n,) rad, rad/s.
+
+        Args:
+            tau: (n,) Nm, the command; clipped to the torque limits.
+            passive: (n,) Nm, a joint torque that no limit clips: friction, offsets.
+            damping: (n,) Nm s/rad, implicit damping for this step, beside the file's.
+
+        """
+        drive = np.minimum(np.maximum(tau, self._low), self._high)
+        if passive is not None:
+            drive += passive
+        if self._counter is not None:
+            drive += self._counter * self._skeleton.getVelocities()
+        if damping is not None:
+            for joint, d in zip(self._joints, (self._damping + damping).tolist(), strict=True):
+                joint.setDampingCoefficient(0, d)
+        self._skeleton.setCommands(drive)
+        self._world.step()
+        return self._skeleton.getPositions(), self._skeleton.getVelocities()
+
+    def ee(self) -> np.ndarray:
+        """Return (3,) m, the end effector in the base frame."""
+        pose = self._tip.getWorldTransform()
+        return pose.rotation() @ self._ee + pose.translation()
+
+    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        """Return (n, n) kg m^2 at q (n,), armature included; the arm stays where it is."""
+        return self._at(q, self._skeleton.getMassMatrix) + np.diag(self._armature)
+
+    def gravity_torque(self, q: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm that holds the arm against gravity at q (n,); the arm stays where it is."""
+        return self._at(q, self._skeleton.getGravityForces)
+
+    def _at(self, q, query):
+        here = self._skeleton.getPositions()
+        self._skeleton.setPositions(q)
+        result = query()
+        self._skeleton.setPositions(here)
+        return result
+
+
+class _Links:
+    """Masses, centres and tensors of all bodies, and where welded bodies sit on the moving ones."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self.model = model
+        self.mass, self.com = model.body_mass.copy(), model.body_ipos.copy()
+        axes = [_rotation(quat) for quat in model.body_iquat]
+        self.inertia = np.array([r * d @ r.T for r, d in zip(axes, model.body_inertia, strict=True)])
+        poses = zip(model.body_pos, model.body_quat, strict=True)
+        self.local = [_pose(position, _rotation(quat)) for position, quat in poses]
+
+    def override(self, bodies, masses, coms, inertias, n) -> None:
+        if masses is not None:
+            self.mass[bodies] = masses
+        if coms is not None:
+            self.com[bodies] = coms
+        if (inertias := _shaped("inertias", inertias, (n, 3, 3))) is not None:
+            self.inertia[bodies] = inertias
+
+    def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
+        """Return the nearest body with a joint at or above `body` (0: the world), body's pose in it."""
+        pose = np.eye(4)
+        while body and self.model.body_dofnum[body] == 0:
+            pose = self.local[body] @ pose
+            body = int(self.model.body_parentid[body])
+        return body, pose
+
+    def lumped(self, body: int) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return mass, centre and tensor about it of `body` with everything welded to it."""
+        parts = [(self.mass[body], self.com[body], self.inertia[body])]
+        for other in range(1, self.model.nbody):
+            anchor, pose = self.moving_parent(other)
+            if other != body and anchor == body and self.mass[other] > 0:
+                r = pose[:3, :3]
+                parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
+        mass = sum(m for m, _, _ in parts)
+        if len(parts) == 1 or mass == 0:
+            return float(mass), parts[0][1], parts[0][2]
+        com = sum(m * c for m, c, _ in parts) / mass
+        steiner = [m * ((c - com) @ (c - com) * np.eye(3) - np.outer(c - com, c - com)) for m, c, _ in parts]
+        return float(mass), com, sum(i for _, _, i in parts) + sum(steiner)
+
+
+def _dartpy() -> ModuleType:
+    try:
+        import dartpy
+    except ImportError as error:
+        raise UserError(f"the DART engine needs dartpy ({error}): pip install dartpy") from None
+    return dartpy
+
+
+def _as_gazebo(dart: ModuleType, world) -> None:
+    """Set what dartpy 6.20 does otherwise than Gazebo's plugin."""
+    # process-wide: else a joint beyond its limit is pushed back at up to 10 rad/s
+    dart.constraint.JointConstraint.setMaxErrorReductionVelocity(0.0)
+    options = dart.simulation.DeactivationOptions()
+    options.mEnabled = False
+    world.setDeactivationOptions(options)
+
+
+def _shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
+    if value is not None and np.shape(value) != shape:
+        raise UserError(f"{name} must be {shape}; it is {np.shape(value)}")
+    return value
+
+
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _about(axis: np.ndarray, angle: float) -> np.ndarray:
+    quat = np.empty(4)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    return _rotation(quat)
+
+
+def _pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
+    pose = np.eye(4)
+    if position is not None:
+        pose[:3, 3] = position
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    return pose
+
+
+def _isometry(dart: ModuleType, pose: np.ndarray):
+    isometry = dart.math.Isometry3()
+    isometry.set_rotation(pose[:3, :3])
+    isometry.set_translation(pose[:3, 3])
+    return isometry

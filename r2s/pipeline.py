@@ -1,0 +1,91 @@
+"""The whole chain on one machine: each step is a command that can be run by itself, in a run folder of its own."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Thread
+
+from r2s.errors import UserError
+
+OWN = (
+    "stage=",
+    "name=",
+    "pipeline.",
+    "budget.",
+    "threads=",
+    "root=",
+)  # what the chain sets for its steps itself
+
+
+def run_step(commands: dict[str, Sequence[str]]) -> None:
+    """Run commands side by side and pass on what they print, each line under its label.
+
+    Raises:
+        UserError: one of them failed; the others are stopped.
+    """
+    running: dict[str, subprocess.Popen] = {}
+    last: dict[str, str] = {}
+
+    def relay(label: str, process: subprocess.Popen) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip():
+                last[label] = line.strip()
+            print(f"  {label:<10} | {line.rstrip()}", file=sys.stderr, flush=True)
+
+    threads = []
+    try:
+        for label, command in commands.items():
+            print(f"  {label:<10} $ python run.py {' '.join(command[2:])}", file=sys.stderr, flush=True)
+            piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+            process = subprocess.Popen(command, **piped, env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "110"})  # type: ignore[call-overload]
+            running[label] = process
+            threads.append(Thread(target=relay, args=(label, process), daemon=True))
+            threads[-1].start()
+        for label, process in running.items():
+            if process.wait() != 0:
+                threads[list(running).index(label)].join()
+                raise UserError(
+                    f"{label} failed with exit status {process.returncode}: {last.get(label, 'no output')}"
+                )
+    finally:
+        for process in running.values():
+            if process.poll() is None:
+                process.terminate()
+        for thread in threads:
+            thread.join(timeout=5)
+
+
+def run_chain(
+    program: Sequence[str], root: Path, name: str, overrides: Sequence[str], train_minutes: float | None
+) -> tuple[Path, dict[str, Path], dict[str, Path]]:
+    """Identify on the arm, train on the identified and on the nominal model, take both policies to the arm.
+
+    The two trainings have the same recipe, time and machine, so that what differs on the arm is the model.
+
+    Args:
+        program: the interpreter and run.py. root: of run folders. name: of this chain; its steps are named after it.
+        overrides: what the user typed; handed on to every step.
+        train_minutes: of each training; None leaves `budget` to the overrides.
+
+    Returns:
+        The run folders: identification, {label: training}, {label: transfer}.
+    """
+    theirs = [o for o in overrides if not o.startswith(OWN)]
+    half = f"threads={max(1, (os.cpu_count() or 2) // 2)}"
+    budget = (
+        [f"budget.minutes={train_minutes}"] if train_minutes else [o for o in overrides if o.startswith("budget.")]
+    )
+    common = [*program, *theirs, f"root={root}"]
+    identified = root / "identify" / name
+    print("1/3 record the arm and identify it", file=sys.stderr)
+    run_step({"identify": [*common, "stage=identify", f"name={name}"]})
+    models = {"identified": [f"calibration={identified}"], "nominal": ["friction=gaz2019", "inertia=nominal"]}
+    print("2/3 train on both models, side by side", file=sys.stderr)
+    run_step({k: [*common, "stage=train", f"name={name}_{k}", half, *budget, *m] for k, m in models.items()})
+    trained = {k: root / "train" / f"{name}_{k}" for k in models}
+    print("3/3 take both policies to the arm", file=sys.stderr)
+    run_step({k: [*common, "stage=transfer", f"name={name}_{k}", half, f"policy={trained[k]}"] for k in models})
+    return identified, trained, {k: root / "transfer" / f"{name}_{k}" for k in models}

@@ -1,0 +1,62 @@
+"""The paper's reward, eq. (2), and the curriculum that leads to it.
+
+A reward is a weighted sum of terms. The replay buffer keeps the terms, so that when the curriculum moves its weights
+every stored transition is worth what the present weights say.
+"""
+
+import numpy as np
+
+K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
+PRECISION_M = 0.03  # length of the bonus: within it, closer still pays
+TERMS = ("distance", "smoothness", "precision")
+
+
+def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Return (m, 3): the two halves of eq. (2), which add up to it, and a bonus for precision.
+
+    distance    -k1 d, with d the distance over the initial one
+    smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
+    precision   1 - tanh(distance / 3 cm)
+
+    Args:
+        distance, distance0: (m,) m, now and at the start of the episode.
+        dq: (m, n) rad/s.
+        ddq: (m, n) rad/s^2, mean over the last control period.
+    """
+    d = distance / distance0
+    speed = np.tanh(np.abs(dq)).sum(-1)
+    jerkiness = np.tanh(np.abs(ddq)).sum(-1)
+    smoothness = -K2 * speed - K3 * jerkiness / np.abs(K4 - np.minimum(1.0, d)) - K5 * jerkiness / (K6 + d)
+    return np.stack([-K1 * d, smoothness, 1.0 - np.tanh(distance / PRECISION_M)], -1)
+
+
+PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
+
+
+def curriculum(
+    progress: float,
+    *,
+    smoothness: tuple[float, float],
+    precision: tuple[float, float],
+    anneal: tuple[float, float],
+) -> np.ndarray:
+    """Return the (3,) weights at `progress` in [0, 1] of the training budget.
+
+    Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
+    with light smoothness and a bonus for precision, then moves linearly towards eq. (2) between the two `anneal`
+    fractions of the budget. reward=paper is the same with both pairs constant (1 and 0).
+
+    Args:
+        progress: fraction of the budget spent.
+        smoothness, precision: weights before and after.
+        anneal: fractions of the budget where the change starts and ends.
+    """
+    start, end = anneal
+    at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
+    return np.array(
+        [
+            1.0,
+            smoothness[0] + at * (smoothness[1] - smoothness[0]),
+            precision[0] + at * (precision[1] - precision[0]),
+        ]
+    )

@@ -1,0 +1,222 @@
+"""Run folders: runs/<stage>/<name>/ with the config, who ran what where, tables that grow, and the last word.
+
+meta.json says `running` from the first moment, so a killed run is seen for what it was.
+"""
+
+import csv
+import hashlib
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Self
+
+from r2s.errors import UserError
+
+PACKAGES = (
+    "mujoco",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "hydra-core",
+    "pymoo",
+    "dartpy",
+    "numba",
+    "numpy",
+    "scipy",
+)
+
+
+class Run:
+    """One run folder, open while its stage runs: `with Run(...) as run`.
+
+    Args:
+        root: where run folders live. stage, name: runs/<stage>/<name>; the name gets a number where it is taken.
+        config: the composed config as YAML. overrides: what the user typed.
+        seed: of the run. threads: as asked for.
+        inputs: files it reads, for their sha256. parents: run folders it starts from.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        stage: str,
+        name: str | None,
+        *,
+        config: str,
+        overrides: Iterable[str],
+        seed: int,
+        threads: int,
+        inputs: Iterable[str | Path] = (),
+        parents: Iterable[str | Path] = (),
+    ):
+        overrides = list(overrides)
+        self.folder = _make_folder(root / stage, name or default_name(overrides))
+        self._began = time.time()
+        self._tables: dict[str, Any] = {}
+        self._meta = {
+            "status": "running",
+            "stage": stage,
+            "start": datetime.now().astimezone().isoformat(timespec="seconds"),
+            "wall_clock_s": 0.0,
+            "seed": seed,
+            "threads": threads or os.cpu_count(),
+            "git": _git(),
+            "packages": {p: _version(p) for p in PACKAGES} | {"python": platform.python_version()},
+            "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "system": platform.platform(terse=True)},
+            "inputs": {str(p): sha256(p) for p in inputs},
+            "parents": [str(p) for p in parents],
+        }
+        (self.folder / "config.yaml").write_text(config)
+        (self.folder / "overrides.yaml").write_text("".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n")
+        self._write_meta()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        for _, file in self._tables.values():
+            file.close()
+        self._meta["wall_clock_s"] = round(time.time() - self._began, 3)
+        self._meta["status"] = "done" if kind is None else "failed"
+        if error is not None:
+            self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
+        self._write_meta()
+
+    def figure(self, name: str) -> Path:
+        """Return the path of a figure, figures/<name>.png."""
+        (self.folder / "figures").mkdir(exist_ok=True)
+        return self.folder / "figures" / f"{name}.png"
+
+    def log(self, table: str, row: Mapping[str, Any]) -> None:
+        """Append a row to <table>.csv; the first row sets the columns."""
+        if table not in self._tables:
+            file = open(self.folder / f"{table}.csv", "w", newline="")  # noqa: SIM115 (closed in __exit__)
+            writer = csv.DictWriter(file, list(row))
+            writer.writeheader()
+            self._tables[table] = writer, file
+        writer, file = self._tables[table]
+        writer.writerow({k: f"{v:.7g}" if isinstance(v, float) else v for k, v in row.items()})
+        file.flush()
+
+    def summary(self, document: Mapping[str, Any]) -> None:
+        """Write summary.json, the last word."""
+        write_json(self.folder / "summary.json", document)
+
+    def _write_meta(self) -> None:
+        write_json(self.folder / "meta.json", self._meta)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write JSON so that the name appears only once the file is whole."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(document, indent=1) + "\n")
+    os.replace(part, path)
+
+
+def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
+    """Return the summary.json of a run folder; `what` names it in the UserError when there is none."""
+    path = Path(folder) / "summary.json"
+    if not path.is_file():
+        raise UserError(f"{what}: {folder} is no finished run folder (it has no summary.json)")
+    return json.loads(path.read_text())
+
+
+def default_name(overrides: Iterable[str]) -> str:
+    """Return a name made of the time and the overrides, fit for a folder."""
+    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=")))
+    readable = re.sub(r"[^A-Za-z0-9=,.+-]+", "_", typed)[:80].strip("_,")
+    return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
+
+
+def sha256(path: str | Path) -> str:
+    """Return the hex digest of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _make_folder(parent: Path, name: str) -> Path:
+    if not re.fullmatch(r"[^/\\]+", name):
+        raise UserError(f"name: '{name}' cannot be a folder's name")
+    parent.mkdir(parents=True, exist_ok=True)
+    for k in range(1, 1000):
+        folder = parent / (name if k == 1 else f"{name}_{k}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise UserError(f"name: {parent / name} and its numbered followers are all taken")
+
+
+def _git() -> dict[str, Any]:
+    root = Path(__file__).parent.parent
+
+    def ask(*words: str) -> str | None:
+        try:
+            done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    changes = ask("status", "--porcelain")
+    return {"commit": ask("rev-parse", "HEAD"), "dirty": None if changes is None else bool(changes)}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _cpu() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+class Progress:
+    """A line that says how far, how fast, how long still; rewritten on a terminal, now and then elsewhere."""
+
+    def __init__(self, label: str, every_s: float = 10.0):
+        self._label, self._began, self._shown = label, time.perf_counter(), 0.0
+        self._live = sys.stderr.isatty()
+        self._every = 0.2 if self._live else every_s
+        self._width = 0
+
+    def __call__(self, share: float, text: str = "") -> None:
+        """Show that `share` of the work is done, with a rate or result in `text`."""
+        now = time.perf_counter()
+        if now - self._shown < self._every:
+            return
+        self._shown = now
+        elapsed = now - self._began
+        left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
+        line = f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}".rstrip()
+        if self._live:
+            self._width = max(self._width, len(line))
+            print("\r" + line.ljust(self._width)[:180], end="", file=sys.stderr, flush=True)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+    def close(self, text: str = "") -> None:
+        """End the line with what came of it."""
+        line = f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}".rstrip()
+        print(("\r" + line.ljust(self._width)) if self._live else line, file=sys.stderr, flush=True)
+
+
+def clock(seconds: float) -> str:
+    """Return m:ss."""
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -1,0 +1,139 @@
+"""What a stage leaves to look at: figures/*.png, recording.rrd and report.md of its run folder."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from r2s import report
+from r2s.evaluate import Episodes
+from r2s.friction import friction_torque
+from r2s.identify import Identified
+from r2s.parameters import parameter_space
+from r2s.recording import Recording
+from r2s.residual import TorqueResidual, cut_windows, replay
+from r2s.robot import Robot
+from r2s.runs import Run
+from r2s.simulator import Dynamics
+from r2s.viewer import Episode, Overlay, write_recording
+
+SHOWN = 4  # episodes, as in the paper's figures
+
+
+def identification(
+    run: Run,
+    robot: Robot,
+    nominal: Dynamics,
+    found: Identified,
+    validation: Recording,
+    summary: Mapping,
+    *,
+    window_s: float,
+    cutoff_hz: float,
+) -> None:
+    """Draw torque and position before and after, friction over the data, convergence; all on validation motion."""
+    space = parameter_space(robot, nominal, {"offset": [-1.0, 1.0]})
+    torque = TorqueResidual(robot, space, validation, cutoff_hz=cutoff_hz)
+    motion, both = torque.motion, {"nominal": nominal, "identified": found.dynamics}
+    predicted = {label: torque.predict(d) for label, d in both.items()}
+    kind = "link-side torque" if validation.torque == "measured" else "commanded torque"
+    title = f"{kind} of validation motion, low-pass {cutoff_hz:g} Hz"
+    pictures = [report.torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)]
+    if validation.torque == "commanded":
+        windows = cut_windows(validation, max(window_s, 0.5) if validation.duration > 1.0 else window_s)
+        replays = {label: replay(robot, d, windows) for label, d in both.items()}
+        pictures.append(report.position_figure(run.figure("position"), windows.q, replays))
+    rigid = predicted["identified"] - friction_torque(motion.dq, found.dynamics.phi)
+    visited = np.quantile(np.abs(motion.dq), 0.995, axis=0)
+    cloud = motion.dq, motion.tau - rigid
+    pictures.append(report.friction_figure(run.figure("friction"), both, visited, cloud))
+    pictures.append(report.convergence_figure(run.figure("convergence"), found.history))
+    np.savez_compressed(run.folder / "torque.npz", t=motion.t, measured=motion.tau, **predicted)
+    overlay = Overlay(motion.t, motion.tau, predicted)
+    named = {p.stem: p for p in pictures if p.stem in ("friction", "convergence")}
+    write_recording(run.folder / "recording.rrd", robot, overlays={kind: overlay}, figures=named)
+    tables = report.identification_tables(robot, found, summary)
+    sections: dict[str, Sequence] = {
+        f"Identification of {robot.name}": [f"Recording: {validation.name}; torque: {kind}."]
+    }
+    sections |= {title: [table] for title, table in tables.items()}
+    report.report_markdown(run.folder / "report.md", sections | {"Figures": pictures})
+
+
+def training(run: Run, robot: Robot) -> None:
+    """Draw the learning curves."""
+    curves = {run.folder.name: pd.read_csv(run.folder / "evaluations.csv")}
+    learning = report.learning_figure(run.figure("learning"), curves)
+    write_recording(run.folder / "recording.rrd", robot, curves=curves, figures={"learning": learning})
+
+
+def transfer(run: Run, robot: Robot, episodes: Mapping[str, Episodes]) -> None:
+    """Draw distance over time for four goals, and record the arms reaching for them, side by side."""
+    shown = {label: first(e) for label, e in episodes.items()}
+    for label, e in shown.items():
+        np.savez_compressed(run.folder / f"episodes_{label}.npz", **stack(e))
+    report.reach_figure(run.figure("reach"), shown)
+    write_recording(run.folder / "recording.rrd", robot, episodes=shown)
+
+
+def comparison(run: Run, robot: Robot, folders: Sequence[str]) -> None:
+    """Draw the learning curves of several runs together, and their last evaluations as a CSV."""
+    curves = {Path(f).name: pd.read_csv(Path(f) / "evaluations.csv") for f in folders}
+    pd.DataFrame({name: c.iloc[-1] for name, c in curves.items()}).T.to_csv(
+        run.folder / "last.csv", index_label="run"
+    )
+    learning = report.learning_figure(run.figure("learning"), curves)
+    write_recording(run.folder / "recording.rrd", robot, curves=curves, figures={"learning": learning})
+
+
+def pipeline(
+    run: Run,
+    robot: Robot,
+    identified: Path,
+    trained: Mapping[str, Path],
+    transferred: Mapping[str, Path],
+    rows: Mapping,
+) -> None:
+    """Put the whole chain into one recording and one report."""
+    episodes = {}
+    for label, folder in transferred.items():
+        for path in sorted(folder.glob("episodes_*.npz")):
+            where = path.stem.removeprefix("episodes_")
+            if where != "mujoco" or label == "identified":
+                episodes[f"{where}, {label} model"] = unstack(path)
+    curves = {label: pd.read_csv(folder / "evaluations.csv") for label, folder in trained.items()}
+    with np.load(identified / "torque.npz") as saved:
+        predicted = {k: saved[k] for k in ("nominal", "identified")}
+        overlay = Overlay(saved["t"], saved["measured"], predicted)
+    title = "torque of validation motion"
+    learning = report.learning_figure(run.figure("learning"), curves)
+    torque = report.torque_figure(run.figure("torque"), overlay.t, overlay.measured, predicted, title)
+    pictures = [torque, learning, report.reach_figure(run.figure("reach"), episodes)]
+    overlays = {"real against simulated torque": overlay}
+    seen = {"episodes": episodes, "overlays": overlays, "curves": curves, "figures": {"learning": learning}}
+    write_recording(run.folder / "recording.rrd", robot, **seen)
+    links = [f"Steps: {', '.join(str(p) for p in (identified, *trained.values(), *transferred.values()))}."]
+    sections = {
+        f"From a recording to a policy: {run.folder.name}": [report.reach_rows(rows), *links],
+        "Figures": pictures,
+    }
+    report.report_markdown(run.folder / "report.md", sections)
+
+
+def first(episodes: Episodes) -> list[Episode]:
+    """Return the first few episodes, one by one."""
+    e = episodes
+    return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i]) for i in range(min(SHOWN, len(e.goal)))]
+
+
+def stack(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+    """Return arrays to save: t (T,) and the rest with a leading episode axis."""
+    rest = {k: np.stack([getattr(e, k) for e in episodes]) for k in ("q", "ee", "goal", "tau")}
+    return {"t": episodes[0].t, **rest}
+
+
+def unstack(path: Path) -> list[Episode]:
+    """Return the episodes that `stack` saved."""
+    with np.load(path) as s:
+        return [Episode(s["t"], *(s[k][i] for k in ("q", "ee", "goal", "tau"))) for i in range(len(s["goal"]))]

@@ -1,0 +1,164 @@
+"""Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
+
+The losses are those of `torchrl.objectives.TQCLoss`, which the tests hold this file to (values and gradients, 1e-5).
+Two things are written differently because two cores have to do: the critics are one batched network instead of a
+vmap, and the quantile loss goes by prefix sums over the sorted targets instead of all pairs.
+
+An algorithm is a class with four verbs: `explore`, `update`, `policy`, `state_dict`/`load_state_dict`. DDPG, SAC and
+TD3 are to be files beside this one; r2s/train.py does not know which it runs.
+"""
+
+import copy
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from r2s.networks import Actor, Critics, Normalizer, Policy, sample_tanh
+
+
+class TQC(nn.Module):
+    """Learner of a stochastic policy.
+
+    Args:
+        scale: mean and standard deviation (d,) that normalise an observation.
+        torque: (n,) Nm, what an action of 1 asks for; goes into the policy.
+        hidden: units per layer, of actor and critics.
+        n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
+        gamma: discount. tau: step of the target critics. lr: of Adam, for all. alpha_init: first temperature.
+        target_entropy: None is minus the number of joints.
+    """
+
+    def __init__(
+        self,
+        scale: tuple[Tensor, Tensor],
+        torque: Tensor,
+        *,
+        hidden: tuple[int, ...] = (256, 256),
+        n_critics: int = 2,
+        n_quantiles: int = 25,
+        drop_per_critic: int = 2,
+        gamma: float = 0.98,
+        tau: float = 0.005,
+        lr: float = 5e-4,
+        alpha_init: float = 0.01,
+        target_entropy: float | None = None,
+    ):
+        super().__init__()
+        obs_dim, act_dim = len(scale[0]), len(torque)
+        self.normalizer = Normalizer(*scale)
+        self.actor = Actor(obs_dim, act_dim, tuple(hidden))
+        self.critics = Critics(obs_dim, act_dim, tuple(hidden), n_critics, n_quantiles)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
+        self.register_buffer("torque", torque.float())
+        self.gamma, self.tau = gamma, tau
+        self.keep = n_critics * (n_quantiles - drop_per_critic)
+        self.target_entropy = -float(act_dim) if target_entropy is None else target_entropy
+        self._learned = [*self.actor.parameters(), *self.critics.parameters(), self.log_alpha]
+        self.optimizer = torch.optim.Adam(self._learned, lr=lr, fused=True)
+
+    @property
+    def policy(self) -> Policy:
+        """The deterministic policy, sharing this learner's weights."""
+        return Policy(self.normalizer, self.actor, self.torque)
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """Return sampled actions (B, n) for observations (B, d)."""
+        loc, scale = self.actor(self.normalizer(observation))
+        return torch.tanh(loc + scale * torch.randn_like(loc))
+
+    def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+        """Return critic, actor and alpha losses of a batch.
+
+        Args:
+            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
+            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
+        """
+        alpha = self.log_alpha.exp().detach()
+        with torch.no_grad():
+            next_action, next_log_prob = sample_tanh(*self.actor(batch["next_observation"]), noise[0])
+            atoms = self.targets(batch["next_observation"], next_action).transpose(0, 1).flatten(1)
+            atoms = atoms.sort(-1).values[:, : self.keep] - (alpha * next_log_prob)[:, None]
+            live = self.gamma * (1.0 - batch["terminated"])
+            target = batch["reward"][:, None] + live[:, None] * atoms
+        quantiles = self.critics(batch["observation"], batch["action"])
+        critic = QuantileHuber.apply(quantiles, target)
+
+        action, log_prob = sample_tanh(*self.actor(batch["observation"]), noise[1])
+        # the actor's gradient goes through the critics, not into them
+        for parameter in self.critics.parameters():
+            parameter.requires_grad_(False)
+        value = self.critics(batch["observation"], action).mean((0, 2))
+        for parameter in self.critics.parameters():
+            parameter.requires_grad_(True)
+        actor = (alpha * log_prob - value).mean()
+        temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
+        return {
+            "loss_critic": critic,
+            "loss_actor": actor,
+            "loss_alpha": temperature,
+            "entropy": -log_prob.mean(),
+        }
+
+    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
+        batch = dict(batch)
+        for key in ("observation", "next_observation"):
+            batch[key] = self.normalizer(batch[key])
+        shape = batch["action"].shape
+        out = self.losses(batch, (torch.randn(shape), torch.randn(shape)))
+        (out["loss_critic"] + out["loss_actor"] + out["loss_alpha"]).backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.targets.parameters()), list(self.critics.parameters()), self.tau)
+        return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
+
+
+class QuantileHuber(torch.autograd.Function):
+    """Quantile Huber loss of quantiles (C, B, N) against sorted targets (B, M), as TQCLoss: sum over C of the mean.
+
+    With delta = y_j - theta_i, the loss of a pair is |tau_i - [delta < 0]| huber(delta) and its derivative by theta
+    |tau_i - [delta < 0]| clip(-delta, -1, 1). The targets are sorted, so the pairs of one theta fall into four runs
+    (delta below -1, to 0, to 1, above), and prefix sums of y and y^2 give the sums over each run exactly: three
+    searches instead of N M pairs.
+    """
+
+    @staticmethod
+    def forward(ctx, quantiles: Tensor, target: Tensor) -> Tensor:
+        """Return the scalar loss; the gradient is worked out here and kept."""
+        count, b, n = quantiles.shape
+        m = target.shape[-1]
+        # sums of squares cancel in single precision: centre the targets of each row, sum in double
+        centre = target.mean(-1, keepdim=True)
+        y = (target - centre).double()
+        theta = quantiles.transpose(0, 1).reshape(b, -1).double() - centre
+        zero = y.new_zeros(b, 1)
+        first = torch.cat([zero, y.cumsum(-1)], -1)
+        second = torch.cat([zero, y.square().cumsum(-1)], -1)
+        low = torch.searchsorted(y, theta - 1.0)
+        mid = torch.searchsorted(y, theta)
+        high = torch.searchsorted(y, theta + 1.0, right=True)
+        s_low, s_mid, s_high = (first.gather(-1, k) for k in (low, mid, high))
+        q_low, q_mid, q_high = (second.gather(-1, k) for k in (low, mid, high))
+
+        def square(k: Tensor, s: Tensor, q: Tensor) -> Tensor:  # sum of (y - theta)^2 / 2 over k targets
+            return 0.5 * (q - 2.0 * theta * s + k * theta.square())
+
+        under = low * (theta - 0.5) - s_low + square(mid - low, s_mid - s_low, q_mid - q_low)
+        over = square(high - mid, s_high - s_mid, q_high - q_mid)
+        over = over + (first[:, -1:] - s_high) - (m - high) * (theta + 0.5)
+        d_under = low + (mid - low) * theta - (s_mid - s_low)
+        d_over = (high - mid) * theta - (s_high - s_mid) - (m - high)
+        fraction = ((torch.arange(n, dtype=y.dtype) + 0.5) / n).repeat(count)
+        loss = ((1.0 - fraction) * under + fraction * over).sum() / (n * m * b)
+        gradient = ((1.0 - fraction) * d_under + fraction * d_over) / (n * m * b)
+        ctx.save_for_backward(gradient.reshape(b, count, n).transpose(0, 1).to(quantiles.dtype))
+        return loss.to(quantiles.dtype)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        """Return the kept gradient times what comes from above."""
+        return ctx.saved_tensors[0] * grad, None

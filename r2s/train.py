@@ -1,0 +1,129 @@
+"""The training loop, the same for every algorithm: act, step all arms, store, update, now and then evaluate.
+
+The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows what is spent.
+With env_steps alone a seed gives the same run, bit for bit at a fixed number of threads; minutes make the curriculum
+follow the clock.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler
+
+from r2s.env import ReachEnv
+from r2s.evaluate import Episodes, measures
+from r2s.networks import Policy
+from r2s.tqc import TQC
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When training ends: minutes of wall clock, env_steps, or whichever of both comes first."""
+
+    minutes: float | None
+    env_steps: int | None
+
+    def spent(self, seconds: float, env_steps: int) -> float:
+        """Return the fraction spent; 1 and above is the end."""
+        time_share = seconds / (60.0 * self.minutes) if self.minutes else 0.0
+        step_share = env_steps / self.env_steps if self.env_steps else 0.0
+        return max(time_share, step_share)
+
+
+def train(
+    env: ReachEnv,
+    algo: TQC,
+    evaluate: Callable[[Policy], Episodes],
+    weights: Callable[[float], np.ndarray],
+    *,
+    budget: Budget,
+    batch_size: int = 256,
+    learning_starts: int = 3200,
+    updates_per_step: int = 1,
+    replay_size: int = 1_000_000,
+    eval_env_steps: int = 80_000,
+    log: Callable[[dict], None] = lambda row: None,
+    evaluated: Callable[[dict], None] = lambda row: None,
+    progress: Callable[[float, dict], None] = lambda share, row: None,
+) -> None:
+    """Train `algo` in place.
+
+    Args:
+        env: arms to learn on.
+        algo: a learner (r2s/tqc.py).
+        evaluate: policy -> Episodes (r2s/evaluate.py).
+        weights: fraction of the budget -> (3,) weights of the reward terms (r2s/rewards.py).
+        budget: when to stop.
+        batch_size: transitions per update. updates_per_step: per step of all arms.
+        learning_starts: environment steps of uniform random actions.
+        replay_size: transitions kept.
+        eval_env_steps: environment steps between two evaluations; one more comes at the end.
+        log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
+        progress: gets the fraction spent and what is worth showing, every step.
+    """
+    began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(replay_size), sampler=RandomSampler(), batch_size=batch_size
+    )
+    state = env.reset()
+    row: dict = {}
+    shown: dict = {}
+
+    def evaluation() -> dict:
+        out = measures(evaluate(algo.policy))
+        return {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began} | out
+
+    while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
+        env.weights = weights(spent)
+        warm = env_steps >= learning_starts
+        state["action"] = algo.explore(state["observation"]) if warm else env.action_spec.rand()
+        step, state_next = env.step_and_maybe_reset(state)
+        replay.extend(_transition(step))
+        state = state_next
+        env_steps += env.sim.nsim
+        if env_steps < learning_starts:
+            continue
+        price = torch.from_numpy(env.weights.astype(np.float32))
+        for _ in range(updates_per_step):
+            batch = replay.sample()
+            batch["reward"] = batch["reward_terms"] @ price
+            row = algo.update(batch)
+            updates += 1
+        if updates % 1000 < updates_per_step:
+            _check(row, updates)
+            numbers = {k: float(v) for k, v in row.items()}
+            head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}
+            log(head | numbers | {f"weight_{i}": float(w) for i, w in enumerate(env.weights)})
+        if env_steps >= next_eval:
+            next_eval += eval_env_steps
+            shown = evaluation()
+            evaluated(shown)
+        progress(spent, {"env_steps": env_steps, "updates": updates} | shown)
+    evaluated(evaluation())
+
+
+def _transition(step) -> dict:
+    """Return what an update needs of a step, flat."""
+    from tensordict import TensorDict
+
+    after = step["next"]
+    return TensorDict(
+        {
+            "observation": step["observation"],
+            "action": step["action"],
+            "next_observation": after["observation"],
+            "reward_terms": after["reward_terms"],
+            "terminated": after["terminated"][:, 0].float(),
+        },
+        batch_size=step.batch_size,
+    )
+
+
+def _check(row: dict, updates: int) -> None:
+    for name, value in row.items():
+        if not torch.isfinite(value):
+            raise FloatingPointError(f"{name} is {float(value)} at update {updates}")

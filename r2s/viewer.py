@@ -1,0 +1,424 @@
+"""One rerun recording to look at: arms moving side by side, torques, learning curves, and their layout.
+
+Everything is one file, because two recordings do not share a timeline: a comparison has an entity per label.
+`rerun FILE` opens it with the arms playing. Episodes and torque overlays are on the timeline `time`, learning
+curves on `env_steps` and `wall_clock`; every view shows the timeline picked at the bottom of the viewer.
+"""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pandas as pd
+import rerun as rr
+import rerun.blueprint as rrb
+
+from r2s.robot import Robot
+
+FRAMES_HZ = 50.0
+PAUSE = 0.5  # s between two episodes
+OVERLAY_HZ = 100.0
+OVERLAY_OPENS = 15.0  # s of an overlay that its plots open on: more is a solid band
+SPACING = 0.95  # m between two arms
+WIDTH = 1.6  # of a plot's line
+GOAL_RADIUS = 0.025  # m
+GOAL = "#ff5252"
+KNOWN = {"measured": "#9aa0a6", "nominal": "#f28e2b", "identified": "#3b8fe0"}
+OTHERS = ("#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#3fb8b0", "#b0745a")
+LEARNING = "learning"
+CURVES = {
+    "success_5cm": "success at 5 cm",
+    "success_2cm": "success at 2 cm",
+    "success_1cm": "success at 1 cm",
+    "success_5mm": "success at 5 mm",
+    "distance_median_m": "median distance, m",
+    "return_paper": "return (paper)",
+}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of one arm, simulated or real; positions are in the base frame of the arm."""
+
+    t: np.ndarray
+    """(T,) s."""
+    q: np.ndarray
+    """(T, n) rad."""
+    ee: np.ndarray
+    """(T, 3) m."""
+    goal: np.ndarray
+    """(3,) m."""
+    tau: np.ndarray
+    """(T, n) Nm, the command."""
+
+    @property
+    def distance(self) -> np.ndarray:
+        """(T,) m from the end effector to the goal."""
+        return np.linalg.norm(self.ee - self.goal, axis=-1)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first row to the last."""
+        return float(self.t[-1] - self.t[0])
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Real against simulated torque: t (T,) s, measured (T, n) Nm, predicted {label: (T, n) Nm}."""
+
+    t: np.ndarray
+    measured: np.ndarray
+    predicted: dict[str, np.ndarray]
+
+
+def colours(labels: Iterable[str]) -> dict[str, str]:
+    """Return {label: "#rrggbb"}, legible on white and on black.
+
+    measured, nominal and identified (also as a part of a label: "twin, nominal") have their own everywhere;
+    the others take theirs in order.
+    """
+    found: dict[str, str] = {}
+    others = 0
+    for label in dict.fromkeys(labels):
+        meant = next((colour for word, colour in KNOWN.items() if word in label), None)
+        if meant is None or meant in found.values():
+            meant = OTHERS[others % len(OTHERS)]
+            others += 1
+        found[label] = meant
+    return found
+
+
+def write_recording(
+    path: str | os.PathLike,
+    robot: Robot,
+    *,
+    episodes: Mapping[str, Sequence[Episode]] | None = None,
+    overlays: Mapping[str, Overlay] | None = None,
+    curves: Mapping[str, pd.DataFrame] | None = None,
+    figures: Mapping[str, Path] | None = None,
+) -> Path:
+    """Write `path` (.rrd, there once it is whole) and return it; what is not given is left out of the layout.
+
+    `episodes` {label: episodes} become one arm per label, all k-th episodes starting together. `overlays` are
+    a tab of torque plots each. `curves` {run: evaluations.csv} share a tab. `figures` {name: PNG} are a tab
+    each: what has no time axis, such as friction over speed. One named "learning" joins the curves' tab.
+    """
+    path = Path(path)
+    part = path.with_name(f"{path.stem}.part.rrd")
+    episodes = {label: sequence for label, sequence in (episodes or {}).items() if sequence}
+    overlays, curves, figures = overlays or {}, curves or {}, figures or {}
+    stream = rr.RecordingStream(f"r2s {path.absolute().parent.name}")  # the viewer keeps one layout per name
+    try:
+        stream.save(part, default_blueprint=_blueprint(robot, episodes, overlays, curves, figures))
+        _arms(stream, robot, episodes)
+        for label, overlay in overlays.items():
+            _overlay(stream, label, overlay)
+        _learning(stream, curves)
+        for name, picture in figures.items():
+            stream.log(_entity("figures", name), rr.EncodedImage(path=picture), static=True)
+        stream.flush()
+        stream.disconnect()
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _entity(*parts: str) -> str:
+    return rr.new_entity_path(list(parts))
+
+
+def _starts(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
+    """(K + 1,) s on the timeline: where the k-th episodes begin, and the end of the last."""
+    count = max((len(sequence) for sequence in episodes.values()), default=0)
+    longest = [max(s[k].duration for s in episodes.values() if k < len(s)) + PAUSE for k in range(count)]
+    return np.concatenate([[0.0], np.cumsum(longest)])
+
+
+def _clock(t: np.ndarray) -> np.ndarray:
+    """Return (T,) s from zero; a pause in the log, or a clock that starts again, becomes a step of 0.1 s."""
+    steps = np.diff(t)
+    steps = np.where((steps <= 0) | (steps > 0.1), 0.1, steps)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _rgb(colour: str) -> np.ndarray:
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+
+
+def _series(
+    stream: rr.RecordingStream,
+    path: str,
+    index: Sequence[rr.TimeColumn],
+    values: np.ndarray,
+    name: str,
+    colour: str,
+    width: float = WIDTH,
+) -> None:
+    """Send one line of a plot."""
+    stream.log(path, rr.SeriesLines(names=name, colors=_rgb(colour), widths=width), static=True)
+    stream.send_columns(path, indexes=index, columns=rr.Scalars.columns(scalars=values))
+
+
+def _arms(stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]]) -> None:
+    """Send an arm per label, side by side."""
+    stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    palette, starts = colours(episodes), _starts(episodes)
+    for i, (label, sequence) in enumerate(episodes.items()):
+        y = (i - (len(episodes) - 1) / 2) * SPACING
+        stream.log(_entity("arms", label), rr.Transform3D(translation=[0, y, 0]), static=True)
+        _arm(stream, robot, label, sequence, starts, palette[label])
+
+
+def _arm(
+    stream: rr.RecordingStream,
+    robot: Robot,
+    label: str,
+    episodes: Sequence[Episode],
+    starts: np.ndarray,
+    colour: str,
+) -> None:
+    """Send one arm: its links, trail and goals, and its distance and torque plots."""
+    model, base, rgb = robot.model(gravity=False), _entity("arms", label), _rgb(colour)
+    name = rr.Points3D([[0, 0, _height(model)]], radii=0.001, labels=label, colors=rgb, show_labels=True)
+    stream.log(f"{base}/label", name, static=True)
+    for body in _shown_bodies(model):
+        _shapes(stream, model, body, _link(base, model, body), colour)
+    frames = [_every(e.t, FRAMES_HZ) for e in episodes]
+    clocks = [start + e.t[f] - e.t[0] for start, e, f in zip(starts, episodes, frames, strict=False)]
+    _motion(stream, base, model, episodes, frames, clocks, starts, rgb)
+
+    ends = [np.append(clock, clock[-1] + 1 / FRAMES_HZ) for clock in clocks]  # a nan there: no line over the pause
+    index = [rr.TimeColumn("time", duration=np.concatenate(ends))]
+    distance = [np.append(100 * e.distance[f], np.nan) for e, f in zip(episodes, frames, strict=True)]
+    _series(stream, _entity("distance", label), index, np.concatenate(distance), label, colour)
+    for j in range(robot.n):
+        tau = [np.append(e.tau[f, j], np.nan) for e, f in zip(episodes, frames, strict=True)]
+        path = _entity("command", f"joint {j + 1}", label)
+        _series(stream, path, index, np.concatenate(tau), label, colour)
+
+
+def _motion(
+    stream: rr.RecordingStream,
+    base: str,
+    model: mujoco.MjModel,
+    episodes: Sequence[Episode],
+    frames: Sequence[np.ndarray],
+    clocks: Sequence[np.ndarray],
+    starts: np.ndarray,
+    rgb: np.ndarray,
+) -> None:
+    """Send the poses of the links, the trail of the end effector, which grows, and the goals."""
+    index = rr.TimeColumn("time", duration=np.concatenate(clocks))
+    q = np.concatenate([e.q[f] for e, f in zip(episodes, frames, strict=True)])
+    for body, (position, quaternion) in _poses(model, q).items():
+        columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
+        stream.send_columns(_link(base, model, body), indexes=[index], columns=columns)
+
+    trail = [e.ee[[*f[:k:3], row]] for e, f in zip(episodes, frames, strict=True) for k, row in enumerate(f)]
+    stream.log(f"{base}/trail", rr.LineStrips3D.from_fields(colors=rgb, radii=0.005), static=True)
+    stream.send_columns(f"{base}/trail", indexes=[index], columns=rr.LineStrips3D.columns(strips=trail))
+
+    changes = rr.TimeColumn("time", duration=starts[: len(episodes)])
+    goals = rr.Points3D.columns(positions=np.stack([e.goal for e in episodes]))
+    stream.log(f"{base}/goal", rr.Points3D.from_fields(colors=_rgb(GOAL), radii=GOAL_RADIUS), static=True)
+    stream.send_columns(f"{base}/goal", indexes=[changes], columns=goals)
+
+
+def _every(t: np.ndarray, rate: float) -> np.ndarray:
+    """Return the rows of t (T,) s that come closest to `rate` Hz, the first and the last among them."""
+    grid = np.arange(t[0], t[-1], 1 / rate)
+    return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
+
+
+def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Return the geoms that MuJoCo's own viewer shows (groups 0-2); all of them where there are none."""
+    shown = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+    return shown if len(shown) else np.arange(model.ngeom)
+
+
+def _shown_bodies(model: mujoco.MjModel) -> list[int]:
+    return sorted({int(body) for body in model.geom_bodyid[_shown_geoms(model)]})
+
+
+def _link(base: str, model: mujoco.MjModel, body: int) -> str:
+    return base + _entity("links", model.body(body).name or f"body {body}")
+
+
+def _height(model: mujoco.MjModel) -> float:
+    """Return m above the base where the arm's name stands clear of it."""
+    return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
+
+
+def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Return {body: ((T, 3) m, (T, 4) quaternion x y z w)} in the base frame at q (T, n)."""
+    data = mujoco.MjData(model)
+    position, quaternion = np.empty((len(q), model.nbody, 3)), np.empty((len(q), model.nbody, 4))
+    for k, angles in enumerate(q):
+        data.qpos[:] = angles
+        mujoco.mj_kinematics(model, data)
+        position[k], quaternion[k] = data.xpos, np.roll(data.xquat, -1, axis=1)
+    return {body: (position[:, body], quaternion[:, body]) for body in _shown_bodies(model)}
+
+
+def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: str, colour: str) -> None:
+    """Log the geoms of one link in its frame; dark ones (joints) are tinted with the arm's colour."""
+    for geom in _shown_geoms(model)[model.geom_bodyid[_shown_geoms(model)] == body]:
+        rgb = 255 * model.geom_rgba[geom, :3]
+        rgb = _rgb(colour) if rgb.mean() < 100 else rgb
+        shape = _shape(model, int(geom), rgb.astype(np.uint8))
+        if shape is None:
+            continue
+        frame = f"{path}/geom{geom}"
+        quaternion = np.roll(model.geom_quat[geom], -1)
+        stream.log(frame, rr.Transform3D(translation=model.geom_pos[geom], quaternion=quaternion), static=True)
+        stream.log(frame, shape, static=True)
+
+
+def _shape(model: mujoco.MjModel, geom: int, rgb: np.ndarray) -> rr.AsComponents | None:
+    """Return a geom as rerun draws it, in the geom's own frame; None for kinds that arms are not made of."""
+    radius, half, _ = size = model.geom_size[geom]
+    solid = rr.components.FillMode.Solid
+    kind = mujoco.mjtGeom
+    match int(model.geom_type[geom]):
+        case kind.mjGEOM_CAPSULE:
+            below = [[0, 0, -half]]  # rerun's capsule starts at its frame, MuJoCo's is centred on it
+            return rr.Capsules3D(lengths=2 * half, radii=radius, translations=below, colors=rgb, fill_mode=solid)
+        case kind.mjGEOM_CYLINDER:
+            return rr.Cylinders3D(lengths=2 * half, radii=radius, colors=rgb, fill_mode=solid)
+        case kind.mjGEOM_SPHERE:
+            return rr.Ellipsoids3D(radii=[radius], colors=rgb, fill_mode=solid)
+        case kind.mjGEOM_ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=size, colors=rgb, fill_mode=solid)
+        case kind.mjGEOM_BOX:
+            return rr.Boxes3D(half_sizes=size, colors=rgb, fill_mode=solid)
+        case kind.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+            faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
+            return rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=rgb)
+    return None
+
+
+def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
+    """Send measured and predicted torque, one plot per joint, the measured one as a broad band beneath."""
+    clock = _clock(overlay.t)
+    rows = _every(clock, OVERLAY_HZ)
+    index = [rr.TimeColumn("time", duration=clock[rows])]
+    lines = {"measured": overlay.measured, **overlay.predicted}
+    palette = colours(lines)
+    for i, (name, torque) in enumerate(lines.items()):
+        for j in range(torque.shape[1]):
+            path = _entity("torque", label, f"joint {j + 1}", f"{i + 1} {name}")  # drawn in the order of their paths
+            width = 4.0 if name == "measured" else WIDTH
+            _series(stream, path, index, torque[rows, j], name, palette[name], width)
+
+
+def _learning(stream: rr.RecordingStream, curves: Mapping[str, pd.DataFrame]) -> None:
+    """Send the evaluations of training runs, on both of their timelines."""
+    palette = colours(curves)
+    for run, table in curves.items():
+        index = [
+            rr.TimeColumn("env_steps", sequence=table["env_steps"].to_numpy(int)),
+            rr.TimeColumn("wall_clock", duration=table["wall_clock_s"].to_numpy(float)),
+        ]
+        for column in CURVES:
+            if column in table:
+                values = table[column].to_numpy(float)
+                _series(stream, _entity(LEARNING, CURVES[column], run), index, values, run, palette[run])
+
+
+def _blueprint(
+    robot: Robot,
+    episodes: Mapping[str, Sequence[Episode]],
+    overlays: Mapping[str, Overlay],
+    curves: Mapping[str, pd.DataFrame],
+    figures: Mapping[str, Path],
+) -> rrb.Blueprint:
+    """Lay out a tab of arms, one of learning curves, one per overlay and one per figure."""
+    joints = [f"joint {j + 1}" for j in range(robot.n)]
+    tabs: list[rrb.View | rrb.Container] = []
+    if episodes:
+        tabs.append(_arms_tab(len(episodes), joints, float(_starts(episodes)[-1])))
+    if curves:
+        tabs.append(_learning_tab(curves, LEARNING in figures))
+    for label, overlay in overlays.items():
+        until = min(OVERLAY_OPENS, float(_clock(overlay.t)[-1]))
+        views = _plots({f"{joint}, Nm": _entity("torque", label, joint) for joint in joints}, until=until)
+        tabs.append(rrb.Grid(*views, grid_columns=2, name=f"torque: {label}"))
+    tabs += [_picture(name, name) for name in figures if not (curves and name == LEARNING)]
+    time_panel = rrb.TimePanel(
+        state="collapsed",
+        timeline="time" if episodes or overlays else "env_steps",
+        play_state="playing" if episodes else "paused",
+        loop_mode="selection" if episodes else "off",
+        time_selection=_selection(_starts(episodes)[-1]) if episodes else None,
+    )
+    sides = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=0), *sides, time_panel)
+
+
+def _selection(seconds: float) -> rrb.components.AbsoluteTimeRange:
+    low, high = (rr.encodings.TimeInt(seconds=s) for s in (0.0, float(seconds)))
+    return rrb.components.AbsoluteTimeRange(min=low, max=high)
+
+
+def _picture(name: str, title: str) -> rrb.View:
+    return rrb.Spatial2DView(origin=_entity("figures", name), name=title)
+
+
+def _learning_tab(curves: Mapping[str, pd.DataFrame], pictured: bool) -> rrb.Container:
+    """Return the live plots, empty while the timeline is `time`, behind the figure if there is one."""
+    titles = [CURVES[c] for c in CURVES if any(c in table for table in curves.values())]
+    plots = _plots({title: _entity(LEARNING, title) for title in titles}, rrb.Corner2D.RightBottom)
+    live = rrb.Grid(*plots, grid_columns=3, name="live: pick the timeline env_steps or wall_clock below")
+    first = [_picture(LEARNING, "figure")] if pictured else []
+    return rrb.Tabs(*first, live, active_tab=0, name="learning")
+
+
+def _arms_tab(count: int, joints: Sequence[str], seconds: float) -> rrb.Container:
+    """Return the 3D view beside its plots; from four arms on, above them."""
+    width = SPACING * count
+    away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.7 * width)
+    eye = rrb.EyeControls3D(position=[away, -0.2 * away, 0.5 + 0.3 * away], look_target=[0.15, 0, 0.48])
+    scene = rrb.Spatial3DView(origin="arms", name="arms", eye_controls=eye)
+    distance = _plot("distance to goal, cm", "distance", rrb.Corner2D.RightTop, until=seconds)
+    near = _plot("the last 5 cm", "distance", y=(0.0, 5.0), until=seconds)
+    torques = [_plot(f"{joint}, Nm", _entity("command", joint), until=seconds) for joint in joints]
+    commands = rrb.Tabs(*torques, name="command")
+    if count > 3:
+        return rrb.Vertical(scene, rrb.Horizontal(distance, near, commands), row_shares=[3, 2], name="arms")
+    return rrb.Horizontal(scene, rrb.Vertical(distance, near, commands), column_shares=[3, 2], name="arms")
+
+
+def _plots(
+    origins: Mapping[str, str], corner: rrb.Corner2D = rrb.Corner2D.RightTop, until: float | None = None
+) -> list[rrb.View]:
+    """Return a plot per {title: origin}; only the first has the legend."""
+    corners = [corner, *[None] * len(origins)]
+    return [_plot(*origin, legend, until=until) for origin, legend in zip(origins.items(), corners, strict=False)]
+
+
+def _plot(
+    title: str,
+    origin: str,
+    legend: rrb.Corner2D | None = None,
+    *,
+    y: tuple[float, float] | None = None,
+    until: float | None = None,
+) -> rrb.View:
+    """Return a plot; with `until` it opens on that many seconds, else on everything."""
+    edge = rrb.TimeRangeBoundary
+    ends = (edge.infinite(), edge.infinite())
+    if until is not None:
+        ends = (edge.absolute(seconds=0.0), edge.absolute(seconds=until))
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=title,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(*ends)),
+        axis_y=rrb.ScalarAxis(range=y, zoom_lock=True) if y else None,
+    )

@@ -1,0 +1,233 @@
+"""The hidden twin behaves as an arm does; recording on it goes through the calls that hardware has."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from r2s.arm import twin as hidden
+from r2s.arm.interface import Arm, ArmStopped
+from r2s.arm.record import record
+from r2s.arm.twin import Twin
+from r2s.errors import UserError
+from r2s.excitation import Excitation, check_limits, fourier
+from r2s.robot import load_robot
+
+SMALL_ARM = """
+<mujoco model="small">
+  <compiler angle="radian"/>
+  <worldbody>
+    <body pos="0 0 0.3"><inertial pos="0 0 0.1" mass="0.3" diaginertia="1e-3 1e-3 5e-4"/>
+      <joint name="j1" axis="0 0 1" range="-2 2" actuatorfrcrange="-3 3" armature="0.01"/>
+      <body pos="0 0 0.2"><inertial pos="0 0 0.1" mass="0.2" diaginertia="1e-3 1e-3 5e-4"/>
+        <joint name="j2" axis="0 1 0" range="-1 1" actuatorfrcrange="-2 2"/>
+        <site name="tip" pos="0 0 0.2"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@cache
+def panda():
+    return load_robot(
+        q_home=[0, -0.785, 0, -2.356, 0, 1.571, 0.785],
+        dq_max=[2.175] * 4 + [2.61] * 3,
+        ddq_max=[15, 7.5, 10, 12.5, 15, 20, 20],
+        tau_max=[87] * 4 + [12] * 3,
+    )
+
+
+@pytest.fixture
+def small(tmp_path):
+    path = tmp_path / "small.xml"
+    path.write_text(SMALL_ARM)
+    return load_robot(str(path))
+
+
+def drive(arm, cycles):
+    """Push every joint about for some cycles; return what was read, (cycles, 3 n)."""
+    arm.move_to(arm.robot.q_home)
+    rows = []
+    for k in range(cycles):
+        s = arm.read()
+        rows.append(np.concatenate([s.q, s.dq, s.tau_J]))
+        arm.command(0.02 * arm.robot.tau_max * np.sin(2 * np.pi * k * 1e-3))
+    return np.array(rows)
+
+
+def ramp(arm, target):
+    """Return the next command on the way to `target` Nm that the arm accepts."""
+    now = arm.read().tau_J_d
+    return now + np.clip(target - now, -0.4, 0.4)
+
+
+def test_same_seed_is_bit_identical_and_another_is_another_robot():
+    first, again, other = (drive(Twin(panda(), seed), 400) for seed in (3, 3, 4))
+    assert np.array_equal(first, again)
+    assert np.abs(first[-1, :7] - other[-1, :7]).max() > 1e-3
+
+
+def test_an_episode_does_not_depend_on_the_one_before():
+    """After `move_to` nothing of the last motion is left; only the noise is another stream."""
+    a, b = Twin(panda(), 2), Twin(panda(), 2)
+    drive(a, 50)
+    drive(b, 700)
+    second, same = drive(a, 200), drive(b, 200)
+    assert np.array_equal(second, same)
+    assert not np.array_equal(second, drive(Twin(panda(), 2), 200))
+
+
+def push(arm, target, cycles):
+    for _ in range(cycles):
+        arm.command(ramp(arm, target))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_holds_still(seed):
+    """No creep under zero command, nor under half the breakaway torque in either direction."""
+    arm = Twin(panda(), seed)
+    arm.move_to(panda().q_home)
+    for _ in range(300):
+        arm.command(np.zeros(7))
+    assert np.abs(arm._q - panda().q_home).max() < 1e-6
+    p, carried = arm._hidden, arm._state[hidden.FRICTION].copy()
+    for sign, coulomb in ((1, p[hidden.C_POS]), (-1, p[hidden.C_NEG])):
+        target = 0.5 * sign * coulomb * p[hidden.BREAK] - carried
+        push(arm, target, 600)
+        here = arm._q.copy()
+        for _ in range(400):
+            arm.command(target)
+        assert np.abs(arm._q - here).max() < 1e-4
+        assert np.abs(arm._q - panda().q_home).max() < 5e-3  # bristles give a little
+
+
+def test_breaks_away():
+    """Well beyond the breakaway torque every joint slides."""
+    arm = Twin(panda(), 0)
+    arm.move_to(panda().q_home)
+    p, carried = arm._hidden, arm._state[hidden.FRICTION].copy()
+    load = p[hidden.MU] * np.abs(arm._nominal.gravity_torque(panda().q_home))
+    target = 1.3 * (p[hidden.C_POS] * p[hidden.BREAK] + load) - carried
+    push(arm, target, 250)
+    assert np.all(arm._q - panda().q_home > 5e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_answers_after_2_to_5_ms(seed):
+    """Two equal arms differ for the first time so long after their commands do (they share the noise)."""
+    idle, pushed = Twin(panda(), seed), Twin(panda(), seed)
+    for arm in (idle, pushed):
+        arm.move_to(panda().q_home)
+    begun = -1
+    while np.array_equal(idle.read().tau_J, pushed.read().tau_J):
+        begun += 1  # the command of cycle 0 acts in cycle `begun`
+        idle.command(np.zeros(7))
+        pushed.command(np.full(7, 0.5))
+    assert 2 <= begun <= 5
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({2: np.nan}, "joint 3: commanded torque is nan"),
+        ({4: 12.5}, "joint 5: commanded torque 12.5"),
+        ({1: -1.5}, "joint 2: commanded torque steps by -1.5"),
+    ],
+)
+def test_refuses_a_bad_command_and_names_the_joint(change, reason):
+    arm = Twin(panda(), 0)
+    arm.move_to(panda().q_home)
+    arm.command(np.zeros(7))
+    tau = np.zeros(7)
+    for i, value in change.items():
+        tau[i] = value
+    with pytest.raises(ArmStopped, match=reason):
+        arm.command(tau)
+    with pytest.raises(ArmStopped, match=f"the arm is stopped: {reason}"):
+        arm.command(np.zeros(7))
+    arm.move_to(panda().q_home)
+    arm.command(np.zeros(7))
+
+
+def test_stops_at_a_limit():
+    """A torque that is kept on ends at a velocity or position limit, not beyond."""
+    arm = Twin(panda(), 0)
+    arm.move_to(panda().q_home)
+    target = np.array([0, 0, 0, 0, 6.0, 0, 0])
+    with pytest.raises(ArmStopped, match=r"joint \d: (velocity|position)"):
+        push(arm, target, 3000)
+
+
+def test_any_serial_arm(small):
+    """Two light joints: friction in proportion to their torque, a motion that stays finite, a recording."""
+    arm: Arm = Twin(small, 1)
+    rows = drive(arm, 500)
+    assert np.all(np.isfinite(rows))
+    assert np.abs(rows[:, :2]).max() < 1
+    assert np.all(arm._hidden[hidden.C_POS] < 0.1 * small.tau_max)
+    excitation = fourier(small, duration=4.0, seed=0)
+    assert np.abs(record(arm, excitation).q - excitation.q).max() < 0.1
+
+
+@cache
+def excited():
+    return fourier(panda(), duration=6.0, seed=1)
+
+
+@pytest.mark.parametrize(("torque", "seed"), [("commanded", 0), ("measured", 1)])
+def test_record(torque, seed):
+    """The recording follows the excitation, inside every limit, and holds the torque that it declares."""
+    arm, seen = Twin(panda(), seed), []
+    recording = record(arm, excited(), torque=torque, progress=lambda done, total: seen.append((done, total)))
+    r = panda()
+    assert recording.torque == torque
+    assert recording.q.shape == excited().q.shape
+    assert np.all((recording.q > r.q_min) & (recording.q < r.q_max))
+    assert np.all(np.abs(recording.dq) < r.dq_max)
+    assert np.sqrt(np.mean((recording.q - excited().q) ** 2)) < 0.05
+    assert np.allclose(np.diff(recording.t), 1e-3)
+    assert seen[-1] == (len(recording.t), len(recording.t))
+    gravity = np.abs(recording.tau[:, 1]).max()
+    assert gravity > 20 if torque == "measured" else gravity < 30
+    if torque == "commanded":
+        assert np.abs(np.diff(recording.tau, axis=0)).max() <= 1.0
+    with pytest.raises(ArmStopped, match="stop was called"):
+        arm.command(np.zeros(7))
+
+
+def test_row_k_holds_the_command_of_cycle_k():
+    arm, sent = Twin(panda(), 0), []
+    command = arm.command
+    arm.command = lambda tau: (sent.append((arm.read().q, tau)), command(tau))
+    recording = record(arm, Excitation(*(x[:50] for x in vars(excited()).values())))
+    assert np.array_equal(recording.q, [q for q, _ in sent])
+    assert np.array_equal(recording.tau, [tau for _, tau in sent])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_excitation_keeps_the_limits(seed):
+    """Inside every limit on every sample, at rest at both ends, its derivatives consistent, slow and fast."""
+    r, e = panda(), fourier(panda(), duration=20.0, seed=seed)
+    check_limits(r, e)
+    half = 0.5 * (r.q_max - r.q_min)
+    assert np.all(np.abs(e.q - 0.5 * (r.q_min + r.q_max)) <= 0.8 * half + 1e-12)
+    assert np.all(np.abs(e.dq) <= 0.7 * r.dq_max + 1e-12)
+    assert np.abs(e.dq[[0, -1]]).max() < 1e-12
+    assert np.abs(e.ddq[[0, -1]]).max() < 1e-12
+    np.testing.assert_allclose(np.gradient(e.q, e.t, axis=0)[1:-1], e.dq[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(e.dq, e.t, axis=0)[1:-1], e.ddq[1:-1], atol=0.1)
+    for x in (e.dq / r.dq_max).T:
+        for direction in (x, -x):
+            assert np.mean((direction > 0.01) & (direction < 0.1)) > 0.02
+            assert np.mean(direction > 0.3) > 0.005
+
+
+def test_excitation_refuses_what_cannot_be():
+    with pytest.raises(UserError, match="joint 4"):
+        fourier(panda(), duration=5.0, seed=0, q_center=np.zeros(7))
+    with pytest.raises(UserError, match="duration"):
+        fourier(panda(), duration=0.1, seed=0)
+    with pytest.raises(UserError, match="above the base plane"):
+        fourier(panda(), duration=5.0, seed=0, z_min=2.0)
