@@ -160,7 +160,7 @@ def identify(cfg, overrides):
             validation.save(run.folder / "validation.npz")
         progress = Progress("identify")
 
-        def tell(row):
+        def told(row):
             progress(
                 row["done"] / row["total"],
                 f"{row['search']}, {row['evaluations']} candidates, cost {row.get('cost', float('nan')):.4g}",
@@ -178,7 +178,7 @@ def identify(cfg, overrides):
             cutoff_hz=settings["cutoff_hz"],
             breakaway=settings["breakaway"],
             nthread=cfg.threads,
-            report=tell,
+            report=told,
         )
         progress.close()
         how = {"window_s": settings["window_s"], "cutoff_hz": settings["cutoff_hz"], "nthread": cfg.threads}
@@ -224,10 +224,10 @@ def train(cfg, overrides):
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
     env = ReachEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
-    torque = torch.tensor(task.torque_fraction * robot.tau_max)
-    scale = tuple(torch.from_numpy(s) for s in observation_scale(robot, task))
-    algo = TQC(scale, torque, **settings)
-    weights = partial(curriculum, **{k: tuple(v) for k, v in plain(cfg.reward).items()})
+    torque = torch.from_numpy(task.torque(robot))
+    mean, std = (torch.from_numpy(s) for s in observation_scale(robot, task))
+    algo = TQC((mean, std), torque, **settings)
+    weights = partial(curriculum, **plain(cfg.reward))
     best: dict = {}
     last: dict = {}
 
@@ -394,7 +394,7 @@ def check_overrides(words):
     groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in CONF.iterdir() if p.is_dir()}
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         known = [*keys(compose("config")), *groups]
-        base = []
+        base: list[str] = []
         for word in words:
             try:
                 parsed = OverridesParser.create().parse_override(word)

@@ -1,14 +1,55 @@
-"""From a policy's torque to what the joints get each millisecond: low-pass, clip, rate limit last.
+"""The driver's torque path, one millisecond at a time: low-pass, soft limits, clip, rate limit last.
 
-The order is that of the driver on the real arm; training, evaluation and hardware share this one function.
+Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. In simulation
+the soft limits act inside the physics step (r2s/friction.py), because they need feedback every millisecond.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from r2s.robot import SIM_DT, Robot
+
+
+@dataclass(frozen=True)
+class SoftLimits:
+    """Torque that pushes a joint back before the arm would stop itself; n joints.
+
+    Attributes:
+        q_low, q_high: (n,) rad, where the push begins. q_gain: (n,) Nm/rad.
+        dq_soft: (n,) rad/s, where it begins. dq_gain: (n,) Nm s/rad.
+    """
+
+    q_low: np.ndarray
+    q_high: np.ndarray
+    q_gain: np.ndarray
+    dq_soft: np.ndarray
+    dq_gain: np.ndarray
+
+    @staticmethod
+    def of(robot: Robot, torque: np.ndarray, *, q_margin: float = 0.1, dq_margin: float = 0.3) -> "SoftLimits":
+        """Return limits that outweigh an action's full `torque` (n,) Nm at 2/3 of each margin.
+
+        Args:
+            robot: gives the hard limits.
+            torque: what the policy can ask for.
+            q_margin: rad before a position limit. dq_margin: share of dq_max before the velocity limit.
+        """
+        return SoftLimits(
+            q_low=robot.q_min + q_margin,
+            q_high=robot.q_max - q_margin,
+            q_gain=1.5 * torque / q_margin,
+            dq_soft=(1 - dq_margin) * robot.dq_max,
+            dq_gain=1.5 * torque / (dq_margin * robot.dq_max),
+        )
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the push (..., n) Nm at q, dq (..., n) rad, rad/s."""
+        beyond = np.maximum(0.0, q - self.q_high) + np.minimum(0.0, q - self.q_low)
+        fast = np.sign(dq) * np.maximum(0.0, np.abs(dq) - self.dq_soft)
+        return -self.q_gain * beyond - self.dq_gain * fast
 
 
 def low_pass_gain(cutoff_hz: float, dt: float = SIM_DT) -> float:
@@ -17,13 +58,13 @@ def low_pass_gain(cutoff_hz: float, dt: float = SIM_DT) -> float:
 
 
 @njit(cache=True)
-def _condition(target, filtered, last, nstep, gain, tau_max, step_max, out):
+def _condition(target, push, filtered, last, nstep, gain, tau_max, step_max, out):
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             f, u = filtered[i, j], last[i, j]
             for k in range(nstep):
                 f += gain * (target[i, j] - f)
-                clipped = min(max(f, -tau_max[j]), tau_max[j])
+                clipped = min(max(f + push[j], -tau_max[j]), tau_max[j])
                 u += min(max(clipped - u, -step_max[j]), step_max[j])
                 out[i, k, j] = u
             filtered[i, j], last[i, j] = f, u
@@ -37,6 +78,7 @@ class Actuation:
         self.last = np.zeros((m, robot.n))
         self._gain = low_pass_gain(cutoff_hz)
         self._tau_max, self._step_max = robot.tau_max, robot.dtau_max * SIM_DT
+        self._no_push = np.zeros(robot.n)
 
     def reset(self, ids: np.ndarray | None = None) -> None:
         """Start the arms `ids` (all by default) from zero torque."""
@@ -44,9 +86,13 @@ class Actuation:
         self.filtered[at] = 0.0
         self.last[at] = 0.0
 
-    def __call__(self, target: np.ndarray, nstep: int) -> np.ndarray:
-        """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
+    def __call__(self, target: np.ndarray, nstep: int, push: np.ndarray | None = None) -> np.ndarray:
+        """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm.
+
+        `push` (n,) Nm is what the soft limits add, where they do not act in the physics step.
+        """
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
-        _condition(target, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
+        push = self._no_push if push is None else push
+        _condition(target, push, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
         return out

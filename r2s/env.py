@@ -1,7 +1,7 @@
 """The task: reach a point with joint torques. A batch-locked TorchRL environment on one Simulator.
 
 A step, for all arms at once: action -> target torque (fraction of the limits) -> low-pass, clip, rate limit each ms
--> physics at 1 kHz for one control period -> kinematics -> observation, reward terms, truncation. Episodes never
+-> physics with soft limits at 1 kHz for one control period -> kinematics -> observation, reward terms, truncation. Episodes never
 terminate, they are cut off (`truncated`), so values bootstrap through their end.
 """
 
@@ -16,7 +16,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s import rewards
-from r2s.actuation import Actuation
+from r2s.actuation import Actuation, SoftLimits
 from r2s.errors import UserError
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
@@ -31,7 +31,7 @@ class Task:
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        torque_fraction: an action of 1 asks for this much of tau_max.
+        torque_fraction: an action of 1 asks for this much of tau_max; one for all joints, or one each.
         cutoff_hz: low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
         reach: (low, high) m, distance of goals from the shoulder (the second joint).
@@ -40,12 +40,19 @@ class Task:
 
     ctrl_hz: int = 50
     episode_s: float = 4.0
-    torque_fraction: float = 0.3
+    torque_fraction: float | tuple[float, ...] = 0.3
     cutoff_hz: float = 100.0
     start_spread: float = 0.1
     reach: tuple[float, float] = (0.3, 0.75)
     height: float = 0.1
     azimuth: float = 1.57
+
+    def torque(self, robot: Robot) -> np.ndarray:
+        """(n,) Nm that an action of 1 asks for."""
+        share = np.array(self.torque_fraction, dtype=float)
+        if share.ndim and share.shape != (robot.n,):
+            raise UserError(f"task.torque_fraction: {share.size} values for the {robot.n} joints of {robot.name}")
+        return share * robot.tau_max
 
     @property
     def steps(self) -> int:
@@ -88,8 +95,8 @@ def sample_goals(robot: Robot, task: Task, rng: np.random.Generator, count: int)
         if tried == 2000 and len(goals) < 2:
             break
     raise UserError(
-        f"task.reach {task.reach[0]:g} to {task.reach[1]:g} m, task.height {task.height:g} m: {robot.name} hardly ever "
-        "gets there; widen them"
+        f"task.reach {task.reach[0]:g} to {task.reach[1]:g} m, task.height {task.height:g} m: {robot.name} hardly "
+        "ever gets there; widen them"
     )
 
 
@@ -98,9 +105,9 @@ def observe(
 ) -> np.ndarray:
     """Return the observation (m, 5 n + 12) float32 in SI units; the same on the arm as in simulation.
 
-    q, dq, ee, goal, error, effort, tanh(error / 5 cm), J^T error, tanh(J^T error / 3 cm): the last three tell
-    a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is state,
-    because the rate limit lets a torque change by 1 Nm per ms only.
+    q, dq, ee, goal, error, effort, tanh(error / 5 cm), J^T error, tanh(J^T error / 3 cm): the last three
+    tell a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is
+    state, because the rate limit lets a torque change by 1 Nm per ms only.
 
     Args:
         q, dq: (m, n) rad, rad/s.
@@ -160,9 +167,10 @@ class ReachEnv(EnvBase):
         self.robot, self.task, self.draw = robot, task, draw
         self.rng = np.random.default_rng(seed)
         self.sim = Simulator(robot, draw(self.rng, nsim), nsim, nthread)
+        self.sim.set_soft_limits(SoftLimits.of(robot, task.torque(robot)))
         self.actuation = Actuation(robot, nsim, cutoff_hz=task.cutoff_hz)
         self.weights = rewards.PAPER
-        self._torque = task.torque_fraction * robot.tau_max
+        self._torque = task.torque(robot)
         self._stagger = stagger
         self._pool = sample_goals(robot, task, np.random.default_rng(seed + 1), 2048)
         self.goal = np.zeros((nsim, 3))

@@ -2,7 +2,8 @@
 
 Two forms of one law. `friction_torque`, `friction_slope` and `passive_torque` are NumPy, for readers and as the
 tests' oracle. `install()` puts the same law into MuJoCo as a native passive force that reads its parameters from
-`jnt_user`, so that `mujoco.batch.Batch` gives every simulation its own arm at full speed.
+`jnt_user`, so that `mujoco.batch.Batch` gives every simulation its own arm at full speed. The same callback holds the
+soft limits of the driver (r2s/actuation.py), which need feedback every millisecond, too.
 
 The native force is linearly implicit. With D = d tau_f / dv at the current velocity it adds D v - tau_f to
 qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D: exact to first order, and stable
@@ -18,7 +19,8 @@ import numpy as np
 
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
 MARK, PHI1, PHI2, PHI3, OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(9)
-WIDTH = 9
+Q_LOW, Q_HIGH, Q_GAIN, DQ_SOFT, DQ_GAIN = range(9, 14)  # the driver's soft limits; gains of 0: none
+WIDTH = 14
 MARKER = 7_202_019.0
 
 
@@ -72,8 +74,11 @@ def passive_torque(
 def pack(
     phi: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float, damping: np.ndarray
 ) -> np.ndarray:
-    """Return the (..., n, WIDTH) rows of `jnt_user` for the arguments of `passive_torque`; damping is the MJCF's."""
-    rows = np.empty((*np.broadcast_shapes(phi.shape[:-1], offset.shape, breakaway.shape[:-1]), WIDTH))
+    """Return the first columns of `jnt_user`, (..., n, Q_LOW), for the arguments of `passive_torque`.
+
+    damping is the MJCF's own (n,) Nm s/rad.
+    """
+    rows = np.empty((*np.broadcast_shapes(phi.shape[:-1], offset.shape, breakaway.shape[:-1]), Q_LOW))
     rows[..., MARK] = MARKER
     rows[..., PHI1 : PHI3 + 1] = phi
     rows[..., OFFSET] = offset
@@ -97,7 +102,8 @@ def _callback() -> Any:
     at = _struct_offsets()
     nv_at, nuser_at = at["nv"] // 8, at["nuser_jnt"] // 8
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
-    qvel_at, applied_at, passive_at = at["qvel"] // 8, at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
+    qpos_at, qvel_at = at["qpos"] // 8, at["qvel"] // 8
+    applied_at, passive_at = at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
     model_words, data_words = (
         max(at[k] for k in _MODEL_FIELDS) // 8 + 1,
         max(at[k] for k in _DATA_FIELDS) // 8 + 1,
@@ -116,12 +122,13 @@ def _callback() -> Any:
         if model[nuser_at] != WIDTH:
             return
         n = model[nv_at]
-        user = carray(as_doubles(model[user_at]), (n, WIDTH))
-        damping = carray(as_doubles(model[damping_at]), (n,))
+        user = carray(as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
+        damping = carray(as_doubles(model[damping_at]), (n,))  # type: ignore[call-arg]
         data = carray(data_ptr, (data_words,))
-        qvel = carray(as_doubles(data[qvel_at]), (n,))
-        applied = carray(as_doubles(data[applied_at]), (n,))
-        qfrc_passive = carray(as_doubles(data[passive_at]), (n,))
+        q = carray(as_doubles(data[qpos_at]), (n,))  # type: ignore[call-arg]
+        qvel = carray(as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
+        applied = carray(as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
+        qfrc_passive = carray(as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
         for j in range(n):
             if user[j, MARK] != MARKER:
                 return
@@ -139,6 +146,11 @@ def _callback() -> Any:
             damping[j] = user[j, DAMPING] + slope
             drive = applied[j] + user[j, OFFSET]
             held = abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            if user[j, DQ_GAIN] > 0.0 and abs(v) > user[j, DQ_SOFT]:
+                damping[j] += user[j, DQ_GAIN]
+                force -= user[j, DQ_GAIN] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
+            beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
+            force -= user[j, Q_GAIN] * beyond
             qfrc_passive[j] += force + (-applied[j] if held else user[j, OFFSET])
 
     mujoco.set_mjcb_passive(passive.ctypes)
@@ -146,7 +158,7 @@ def _callback() -> Any:
 
 
 _MODEL_FIELDS = ("nv", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = ("qvel", "qfrc_applied", "qfrc_passive")
+_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive")
 
 
 def _struct_offsets() -> dict[str, int]:

@@ -10,6 +10,9 @@ from torch.nn import functional as F
 class Normalizer(nn.Module):
     """(x - mean) / std with fixed values (size,); part of the policy it belongs to."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, mean: Tensor, std: Tensor):
         super().__init__()
         self.register_buffer("mean", mean.float())
@@ -42,6 +45,8 @@ class Actor(nn.Module):
 
 class Policy(nn.Module):
     """What goes onto the arm: observation in SI units (B, d) -> torque target (B, n) Nm."""
+
+    torque_scale: Tensor
 
     def __init__(self, normalizer: Normalizer, actor: Actor, torque: Tensor):
         super().__init__()
@@ -83,11 +88,12 @@ class Critics(nn.Module):
         return torch.baddbmm(self.bias[-1], x, self.weight[-1])
 
 
-def sample_tanh(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tanh(loc + scale * noise) (B, n) and its log-density (B,); noise is standard normal.
+def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Return tanh(loc + scale * noise) (B, n) and its log-density (B,) for a Gaussian (loc, scale); noise ~ N(0, 1).
 
     log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) keeps the density finite where tanh saturates.
     """
+    loc, scale = gaussian
     x = loc + scale * noise
     log_prob = -0.5 * noise.square() - scale.log() - 0.9189385332046727
     log_prob = log_prob - 2.0 * (0.6931471805599453 - x - F.softplus(-2.0 * x))

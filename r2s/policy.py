@@ -17,7 +17,7 @@ from r2s.robot import Robot
 def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
     """Return an untrained policy of this arm and task."""
     mean, std = (torch.from_numpy(x) for x in observation_scale(robot, task))
-    torque = torch.tensor(task.torque_fraction * robot.tau_max).float()
+    torque = torch.from_numpy(task.torque(robot)).float()
     return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
 
 
@@ -79,5 +79,6 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
         "low_pass_hz": str(task.cutoff_hz),
         "torque": "without gravity, before low-pass, clip and rate limit",
     }
-    onnx.helper.set_model_props(model, facts)
+    for key, value in facts.items():
+        model.metadata_props.add(key=key, value=value)
     onnx.save(model, path)

@@ -4,6 +4,8 @@ A reward is a weighted sum of terms. The replay buffer keeps the terms, so that 
 every stored transition is worth what the present weights say.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
@@ -36,9 +38,9 @@ PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
 def curriculum(
     progress: float,
     *,
-    smoothness: tuple[float, float],
-    precision: tuple[float, float],
-    anneal: tuple[float, float],
+    smoothness: Sequence[float],
+    precision: Sequence[float],
+    anneal: Sequence[float],
 ) -> np.ndarray:
     """Return the (3,) weights at `progress` in [0, 1] of the training budget.
 

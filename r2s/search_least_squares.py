@@ -44,6 +44,6 @@ def least_squares_search(*, max_evaluations: int = 40, ftol: float = 1e-6) -> Se
             ftol=ftol,
             x_scale="jac",
         )
-        return SearchResult(solution.x, solution.jac, solution.fun)
+        return SearchResult(solution.x, np.asarray(solution.jac), solution.fun)
 
     return search

@@ -11,6 +11,7 @@ import mujoco.batch
 import numpy as np
 
 from r2s import friction
+from r2s.actuation import SoftLimits
 from r2s.robot import SIM_DT, Robot
 
 
@@ -76,11 +77,17 @@ class Simulator:
         def spread(a: np.ndarray) -> np.ndarray:
             return np.repeat(a, repeat, axis=0) if a.ndim == 3 and repeat > 1 else a
 
-        self._user[arms] = spread(rows)
+        self._user[arms, :, : friction.Q_LOW] = spread(rows)
         self._damping[arms] = self.model.dof_damping
         self._inertia[arms[:, None], self._bodies] = spread(moments)
         self._iquat[arms[:, None], self._bodies] = spread(quaternions)
         self.batch.set_const(ids)
+
+    def set_soft_limits(self, limits: SoftLimits) -> None:
+        """Let the driver's soft limits act in all arms; without this call there are none."""
+        columns = (limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain)
+        for i, column in zip(range(friction.Q_LOW, friction.WIDTH), columns, strict=True):
+            self._user[:, :, i] = column
 
     def reset(self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics."""

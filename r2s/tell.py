@@ -49,7 +49,7 @@ def identification(
     cloud = motion.dq, motion.tau - rigid
     pictures.append(report.friction_figure(run.figure("friction"), both, visited, cloud))
     pictures.append(report.convergence_figure(run.figure("convergence"), found.history))
-    np.savez_compressed(run.folder / "torque.npz", t=motion.t, measured=motion.tau, **predicted)
+    np.savez_compressed(run.folder / "torque.npz", t=motion.t, measured=motion.tau, **predicted)  # type: ignore[arg-type]
     overlay = Overlay(motion.t, motion.tau, predicted)
     named = {p.stem: p for p in pictures if p.stem in ("friction", "convergence")}
     write_recording(run.folder / "recording.rrd", robot, overlays={kind: overlay}, figures=named)
@@ -72,7 +72,7 @@ def transfer(run: Run, robot: Robot, episodes: Mapping[str, Episodes]) -> None:
     """Draw distance over time for four goals, and record the arms reaching for them, side by side."""
     shown = {label: first(e) for label, e in episodes.items()}
     for label, e in shown.items():
-        np.savez_compressed(run.folder / f"episodes_{label}.npz", **stack(e))
+        np.savez_compressed(run.folder / f"episodes_{label}.npz", **stack(e))  # type: ignore[arg-type]
     report.reach_figure(run.figure("reach"), shown)
     write_recording(run.folder / "recording.rrd", robot, episodes=shown)
 
@@ -111,11 +111,17 @@ def pipeline(
     torque = report.torque_figure(run.figure("torque"), overlay.t, overlay.measured, predicted, title)
     pictures = [torque, learning, report.reach_figure(run.figure("reach"), episodes)]
     overlays = {"real against simulated torque": overlay}
-    seen = {"episodes": episodes, "overlays": overlays, "curves": curves, "figures": {"learning": learning}}
-    write_recording(run.folder / "recording.rrd", robot, **seen)
-    links = [f"Steps: {', '.join(str(p) for p in (identified, *trained.values(), *transferred.values()))}."]
-    sections = {
-        f"From a recording to a policy: {run.folder.name}": [report.reach_rows(rows), *links],
+    write_recording(
+        run.folder / "recording.rrd",
+        robot,
+        episodes=episodes,
+        overlays=overlays,
+        curves=curves,
+        figures={"learning": learning},
+    )
+    steps = ", ".join(str(p) for p in (identified, *trained.values(), *transferred.values()))
+    sections: dict[str, Sequence] = {
+        f"From a recording to a policy: {run.folder.name}": [report.reach_rows(rows), f"Steps: {steps}."],
         "Figures": pictures,
     }
     report.report_markdown(run.folder / "report.md", sections)

@@ -29,6 +29,8 @@ class TQC(nn.Module):
         target_entropy: None is minus the number of joints.
     """
 
+    torque: Tensor
+
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
@@ -78,7 +80,7 @@ class TQC(nn.Module):
         """
         alpha = self.log_alpha.exp().detach()
         with torch.no_grad():
-            next_action, next_log_prob = sample_tanh(*self.actor(batch["next_observation"]), noise[0])
+            next_action, next_log_prob = sample_tanh(self.actor(batch["next_observation"]), noise[0])
             atoms = self.targets(batch["next_observation"], next_action).transpose(0, 1).flatten(1)
             atoms = atoms.sort(-1).values[:, : self.keep] - (alpha * next_log_prob)[:, None]
             live = self.gamma * (1.0 - batch["terminated"])
@@ -86,7 +88,7 @@ class TQC(nn.Module):
         quantiles = self.critics(batch["observation"], batch["action"])
         critic = QuantileHuber.apply(quantiles, target)
 
-        action, log_prob = sample_tanh(*self.actor(batch["observation"]), noise[1])
+        action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
         # the actor's gradient goes through the critics, not into them
         for parameter in self.critics.parameters():
             parameter.requires_grad_(False)

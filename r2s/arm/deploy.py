@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from r2s import rewards
-from r2s.actuation import Actuation
+from r2s.actuation import Actuation, SoftLimits
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.env import Task, observe
 from r2s.evaluate import Episodes
@@ -53,7 +53,8 @@ def reach(
     robot, count = arm.robot, len(goals)
     kinematics = Kinematics(robot)
     actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
-    torque = task.torque_fraction * robot.tau_max
+    torque = task.torque(robot)
+    soft = SoftLimits.of(robot, torque)
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
@@ -75,12 +76,13 @@ def reach(
                 )
                 action = policy.action(torch.from_numpy(seen)).numpy().astype(np.float64)
                 try:
-                    for command in actuation(action * torque, task.substeps)[0]:
-                        arm.command(command)
+                    for _ in range(task.substeps):
+                        push = soft(state.q, state.dq)
+                        arm.command(actuation(action * torque, 1, push)[0, 0])
+                        state = arm.read()
                 except ArmStopped as stop:
                     stops.append(f"episode {e + 1}, {state.t:.2f} s: {stop}")
                     stopped = True
-                state = arm.read()
                 place, jacobian = kinematics(state.q)
             q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, actuation.last[0]
             distance[e, k] = np.linalg.norm(goals[e] - place)
