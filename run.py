@@ -128,6 +128,8 @@ def record_motion(cfg, robot, seed, label):
 
 def identify(cfg, overrides):
     """Recording -> parameters.yaml, errors on training and validation motion, figures."""
+    from dataclasses import replace
+
     from hydra.utils import instantiate
 
     from r2s import report, tell
@@ -144,6 +146,9 @@ def identify(cfg, overrides):
     if cfg.data.kind == "recording":
         how = {k: plain(cfg.data[k]) for k in ("torque", "columns", "period", "max_gap_s")} | {"n_joints": robot.n}
         recording = read(cfg.data.path, **how)
+        if how["period"] is None and not cfg.data.validation and (period := recording.repeats_after()):
+            print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
+            recording = replace(recording, period=period)
         inputs = [cfg.data.path]
         if cfg.data.validation:
             if os.path.realpath(cfg.data.validation) == os.path.realpath(cfg.data.path):
@@ -177,6 +182,7 @@ def identify(cfg, overrides):
             stride=settings["stride"],
             cutoff_hz=settings["cutoff_hz"],
             breakaway=settings["breakaway"],
+            folds=settings["folds"],
             nthread=cfg.threads,
             report=told,
         )

@@ -1,8 +1,8 @@
 """The task: reach a point with joint torques. A batch-locked TorchRL environment on one Simulator.
 
-A step, for all arms at once: action -> target torque (fraction of the limits) -> low-pass, clip, rate limit each ms
--> physics with soft limits at 1 kHz for one control period -> kinematics -> observation, reward terms, truncation. Episodes never
-terminate, they are cut off (`truncated`), so values bootstrap through their end.
+A step, for all arms at once: action -> target torque (fraction of the limits) -> low-pass, clip, rate limit each
+ms -> physics with soft limits at 1 kHz for one control period -> kinematics -> observation,
+reward terms, truncation. Episodes never terminate, they are cut off (`truncated`), so values bootstrap through their end.
 """
 
 from collections.abc import Callable

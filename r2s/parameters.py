@@ -67,6 +67,10 @@ class ParameterSpace:
         i = self.blocks.index(name)
         return x[..., i * self.n : (i + 1) * self.n]
 
+    def of_joints(self, joints: np.ndarray) -> np.ndarray:
+        """Return (P,) bool: friction and offset of the joints (n,) bool; inertia belongs to links, not joints."""
+        return np.concatenate([joints & (b != "inertia_scale") for b in self.blocks])
+
     @property
     def _log(self) -> np.ndarray:
         return np.repeat([b in LOGARITHMIC for b in self.blocks], self.n)

@@ -202,6 +202,32 @@ class Recording:
         """(T, n) rad/s^2: `derivative` of dq. Noisy on raw data; `resample` and `smooth` come first."""
         return self.derivative(self.dq)
 
+    def repeats_after(self, tolerance: float = 0.01, overlap_s: float = 0.5) -> float | None:
+        """Return the period, s, after which the motion repeats itself, or None.
+
+        It repeats when, at some lag, at least `overlap_s` of the recording comes again within `tolerance` rad RMS per
+        joint while the arm moves through ten times that. What was recorded twice must not be split in two.
+        """
+        dt = 0.02
+        grid = self.resample(dt)
+        step = np.round((grid.t - grid.t[0]) / dt).astype(int)
+        if len(np.unique(step)) < len(step):
+            return None  # clocks that restart have no common time
+        q = np.full((step[-1] + 1, self.n_joints), np.nan)
+        q[step] = grid.q
+        need, best = round(overlap_s / dt), (np.inf, 0)
+        for lag in range(need, len(q) - need):
+            both = ~np.isnan(q[lag:, 0]) & ~np.isnan(q[:-lag, 0])
+            if both.sum() < need:
+                continue
+            moved = np.ptp(q[lag:][both], axis=0).max()
+            error = np.sqrt(np.mean((q[lag:][both] - q[:-lag][both]) ** 2))
+            if error < tolerance and moved > 10 * tolerance:
+                best = min(best, (error, lag))
+            elif best[1]:
+                break  # past the first lag that fits
+        return best[1] * dt if best[1] else None
+
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
         """Return (train, validation), about `validation_fraction` of the rows in the second, without a leak.
 

@@ -1,4 +1,4 @@
-"""The friction law inside MuJoCo's step is the one written in NumPy, at any thread count, and stable where it matters."""
+"""The friction law inside MuJoCo's step is the one written in NumPy, at any thread count, and stays stable."""
 
 import subprocess
 import sys
@@ -140,15 +140,15 @@ def test_a_reset_forgets_the_motion_before(panda):
 
 
 def test_a_stiff_light_joint_comes_to_rest_without_chatter(light):
-    """10 Nm s/rad on 0.005 kg m^2 at 1 kHz: the velocity decays without changing sign, where the explicit form chatters."""
+    """10 Nm s/rad on 0.005 kg m^2 at 1 kHz: the velocity only decays, where the explicit form chatters."""
     phi = np.array([[1.0, 40.0, 0.0]])
     assert friction_slope(np.zeros(1), phi) == pytest.approx(10.0)
     still = Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia)
     sim = Simulator(light, still, 1, 1)
     sim.reset(np.zeros((1, 1)), np.full((1, 1), 0.3))
     dq = sim.rollout(np.zeros((1, 200, 1)), record=("qvel",))["qvel"][0, :, 0]
-    assert np.all(dq >= 0)
-    assert np.all(np.diff(dq) <= 0)
+    assert dq.min() >= -1e-15
+    assert np.diff(dq).max() <= 1e-15
     assert dq[-1] < 1e-9
 
     model = light.model(gravity=False)
@@ -164,7 +164,7 @@ def test_a_stiff_light_joint_comes_to_rest_without_chatter(light):
 
 
 def test_dead_zone_holds_below_its_edges_and_lets_go_above(panda):
-    """At rest, 98 % of an edge moves nothing at all; 102 % moves that joint in that direction; edges per simulation."""
+    """At rest 98 % of an edge moves nothing, 102 % moves that joint that way; each simulation has its own edges."""
     n = panda.n
     nsim = 2 * n
     dynamics = some_dynamics(panda, nsim)
@@ -238,7 +238,8 @@ UNTOUCHED = """
 import mujoco, numpy as np
 from r2s import friction
 ARM = '''<mujoco>{size}<worldbody><body><joint axis="0 1 0" damping="0.1" {user}/><geom size="0.1" pos="0 0 -0.3"/>
-<body pos="0 0 -0.3"><joint axis="0 1 0" {user}/><geom size="0.05" pos="0 0 -0.3"/></body></body></worldbody></mujoco>'''
+<body pos="0 0 -0.3"><joint axis="0 1 0" {user}/><geom size="0.05" pos="0 0 -0.3"/></body></body>
+</worldbody></mujoco>'''
 zeros = 'user="' + ' '.join(['0.5'] * friction.WIDTH) + '"'
 texts = [ARM.format(size='', user=''), ARM.format(size=f'<size nuser_jnt="{friction.WIDTH}"/>', user=zeros)]
 def swing(text):
@@ -273,7 +274,7 @@ def random_tensors(rng, count):
 
 
 def test_tensors_of_set_dynamics_make_the_mass_matrix(panda):
-    """The mass matrix of each simulated arm is the nominal one plus what its tensors add, sum J^T R (I - I0) R^T J."""
+    """Each arm's mass matrix is the nominal one plus what its tensors add, sum J^T R (I - I0) R^T J."""
     nsim, n = 5, panda.n
     rng = np.random.default_rng(5)
     d = some_dynamics(panda, nsim)

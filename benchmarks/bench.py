@@ -1,0 +1,181 @@
+"""make bench: what r2s costs over its peers, as ratios measured in one run. Writes runs/bench/bench.json.
+
+Every ratio alternates r2s and its peer and takes the median, so that a machine that slows down slows both.
+"""
+
+import copy
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+from r2s import randomization  # noqa: E402
+from r2s.env import ReachEnv, Task, observation_scale  # noqa: E402
+from r2s.parameters import nominal_dynamics  # noqa: E402
+from r2s.robot import load_robot  # noqa: E402
+from r2s.runs import _cpu  # noqa: E402
+from r2s.simulator import Simulator  # noqa: E402
+from r2s.tqc import TQC  # noqa: E402
+
+REPEATS = 15
+
+
+def conf(path: str) -> dict:
+    """Read one file of conf/."""
+    return yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+
+
+def duel(ours: Callable[[], object], peer: Callable[[], object], work: float) -> tuple[float, float]:
+    """Return (ours, peer): median rates, work per second, of calls in turn."""
+    seconds: list[list[float]] = [[], []]
+    for k in range(REPEATS + 2):
+        for side, call in enumerate((ours, peer)):
+            began = time.perf_counter()
+            call()
+            if k >= 2:
+                seconds[side].append(time.perf_counter() - began)
+    return work / float(np.median(seconds[0])), work / float(np.median(seconds[1]))
+
+
+def friction(robot, dynamics, threads: int) -> tuple[float, float]:
+    """Batched rollouts with friction, breakaway and offsets against the bare Batch, steps/s."""
+    arms, steps = 256, 200
+    tau = 0.3 * np.cumsum(np.random.default_rng(0).normal(size=(arms, steps, robot.n)), axis=1)
+    sim = Simulator(robot, dynamics, arms, threads)
+    bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)
+    q0, spec = np.tile(robot.q_home, (arms, 1)), int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+    def ours() -> None:
+        sim.reset(q0, np.zeros_like(q0))
+        sim.rollout(tau)
+
+    def peer() -> None:
+        bare.reset()
+        bare.bind("qpos")[:] = q0
+        bare.rollout(steps, tau, control_spec=spec, record=("qpos",))
+
+    return duel(ours, peer, arms * steps)
+
+
+def environment(robot, dynamics, threads: int) -> tuple[float, float]:
+    """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
+    arms, steps, task = 32, 50, Task(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
+
+    def draw(rng, m):
+        return randomization.draw(rng, dynamics, m, **conf("dr/paper"))
+
+    env = ReachEnv(robot, task, draw, arms, nthread=threads, stagger=True)
+    state = env.reset()
+    action = env.action_spec.rand()
+    bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)
+    tau, spec = np.zeros((arms, task.substeps, robot.n)), int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+    def ours() -> None:
+        nonlocal state
+        for _ in range(steps):
+            state["action"] = action
+            _, state = env.step_and_maybe_reset(state)
+
+    def peer() -> None:
+        for _ in range(steps):
+            bare.rollout(task.substeps, tau, control_spec=spec, record=("qpos",))
+
+    return duel(ours, peer, arms * steps)
+
+
+def learner(robot, threads: int) -> tuple[float, float]:
+    """TQC updates against TorchRL's eager TQCLoss with the same networks, batch and optimiser, updates/s."""
+    from tensordict import TensorDict
+    from tensordict.nn import TensorDictModule
+    from torch import nn
+    from torchrl.modules import ProbabilisticActor, ValueOperator
+    from torchrl.modules.distributions import TanhNormal
+    from torchrl.objectives import SoftUpdate, TQCLoss
+
+    torch.set_num_threads(threads)
+    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    d, n, b = len(mean), robot.n, 256
+    algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
+
+    class Critic(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            body = [nn.Linear(d + n, 256), nn.LayerNorm(256), nn.ReLU(), nn.Linear(256, 256), nn.LayerNorm(256)]
+            self.net = nn.Sequential(*body, nn.ReLU(), nn.Linear(256, 25))
+
+        def forward(self, observation, action):
+            return self.net(torch.cat([observation, action], -1))
+
+    actor = ProbabilisticActor(
+        TensorDictModule(copy.deepcopy(algo.actor), in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+    critic = ValueOperator(Critic(), in_keys=["observation", "action"])
+    loss = TQCLoss(actor, critic, num_qvalue_nets=2, target_entropy=-float(n), alpha_init=0.01)
+    loss.make_value_estimator(gamma=0.98)
+    target = SoftUpdate(loss, eps=0.995)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-4, fused=True)
+    seen, after, action, reward = torch.randn(b, d), torch.randn(b, d), torch.rand(b, n) * 2 - 1, torch.randn(b)
+    flags = torch.zeros(b, 1, dtype=torch.bool)
+    following = {"observation": after, "reward": reward[:, None], "done": flags, "terminated": flags.clone()}
+    theirs = TensorDict({"observation": seen, "action": action, "next": following}, batch_size=[b])
+    batch = {"observation": seen, "next_observation": after, "action": action, "reward": reward}
+    batch["terminated"] = torch.zeros(b)
+
+    def ours() -> None:
+        for _ in range(10):
+            algo.update(batch)
+
+    def peer() -> None:
+        for _ in range(10):
+            out = loss(theirs)
+            (out["loss_qvalue"] + out["loss_actor"] + out["loss_alpha"]).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            target.step()
+
+    return duel(ours, peer, 10)
+
+
+def main() -> None:
+    """Run all and print one table."""
+    robot = load_robot(**conf("robot/panda"))
+    dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    cores = os.cpu_count() or 1
+    rows = {}
+    for threads in sorted({1, cores}):
+        at = f"{threads} thread{'s' * (threads > 1)}"
+        rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)
+        rows[f"TorchRL environment / bare Batch, arm steps/s, {at}"] = environment(robot, dynamics, threads)
+        rows[f"TQC / TorchRL's TQCLoss, updates/s, {at}"] = learner(robot, threads)
+    table = Table(title=f"{_cpu()}, {cores} cores, mujoco {mujoco.__version__}, torch {torch.__version__}")
+    for column in ("what", "r2s", "peer", "ratio"):
+        table.add_column(column, justify="left" if column == "what" else "right")
+    for what, (ours, peer) in rows.items():
+        table.add_row(what, f"{ours:,.0f}", f"{peer:,.0f}", f"{ours / peer:.2f}")
+    Console(width=110).print(table)
+    folder = ROOT / "runs" / "bench"
+    folder.mkdir(parents=True, exist_ok=True)
+    machine = {"cpu": _cpu(), "cores": cores, "python": platform.python_version(), "torch": torch.__version__}
+    measured = {k: {"r2s": o, "peer": p, "ratio": o / p} for k, (o, p) in rows.items()}
+    (folder / "bench.json").write_text(json.dumps({"machine": machine, "rows": measured}, indent=1) + "\n")
+    print(f"written: {folder.relative_to(ROOT)}/bench.json")
+
+
+if __name__ == "__main__":
+    main()
