@@ -140,7 +140,7 @@ class ReachEnv(EnvBase):
     """`nsim` arms reaching for random goals, each with dynamics drawn at every reset.
 
     Keys: `observation` (nsim, 5 n + 12), `action` (nsim, n) in [-1, 1], `reward` (nsim, 1) under `weights`,
-    `reward_terms` (nsim, 3) of r2s/rewards.py, `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
+    `reward_terms` (nsim, 4) of r2s/rewards.py, `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
 
     Args:
         robot, task: the arm and what is asked of it.
@@ -179,7 +179,7 @@ class ReachEnv(EnvBase):
         shape = (nsim,)
         self.observation_spec = Composite(
             observation=Unbounded((nsim, 5 * robot.n + 12), dtype=torch.float32),
-            reward_terms=Unbounded((nsim, 3), dtype=torch.float32),
+            reward_terms=Unbounded((nsim, 4), dtype=torch.float32),
             distance=Unbounded((nsim, 1), dtype=torch.float32),
             shape=shape,
         )
@@ -216,7 +216,7 @@ class ReachEnv(EnvBase):
         return TensorDict(
             {
                 "observation": torch.from_numpy(self._observe()),
-                "reward_terms": torch.zeros(self.sim.nsim, 3),
+                "reward_terms": torch.zeros(self.sim.nsim, 4),
                 "distance": torch.from_numpy(distance[:, None].astype(np.float32)),
                 "done": none,
                 "terminated": none.clone(),

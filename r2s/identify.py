@@ -179,25 +179,27 @@ def scan_breakaway(
 
     The error jumps where a joint is held or let go one step sooner, so there is no gradient: each edge is scanned
     over [0, largest], all edges at once and each judged by its own joint, then again about the best, ever finer.
-    Both directions of a joint and all joints share each pass.
+    The coarse scan is done twice, because an edge looks different while the others are wrong.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
     )
-    data = ReplayResidual(robot, space, recording, window_s=window_s, stride=stride, slowest=0.0, nthread=nthread)
-    x, step, passes = space.start, largest / 12, 5
+    data = ReplayResidual(
+        robot, space, recording, window_s=window_s, stride=stride, slowest=0.0, limit=50, nthread=nthread
+    )
+    x, step, coarse, passes = space.start, largest / 12, 2, 6
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
     for k in range(passes):
-        offsets = np.linspace(0, largest, 13) if k == 0 else step * np.arange(-2, 3)
-        base = np.zeros_like(x) if k == 0 else x
+        offsets = np.linspace(0, largest, 13) if k < coarse else step * np.arange(-2, 3)
+        base = np.zeros_like(x) if k < coarse else x
         trials = np.clip(base[:, None] + sign[:, None] * offsets, space.lower[:, None], space.upper[:, None])
         candidates = np.repeat(x[None], trials.size, axis=0).reshape(*trials.shape, -1)
         candidates[np.arange(len(x)), :, np.arange(len(x))] = trials
         cost = data.joint_error(candidates.reshape(-1, len(x))).reshape(*trials.shape, robot.n)
         own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
         x = trials[np.arange(len(x)), own.argmin(1)]
-        step /= 1 if k == 0 else 2.5
+        step /= 1 if k < coarse else 2.5
         report(
             {
                 "pass": k + 1,

@@ -79,7 +79,7 @@ def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0)
 class ReplayResidual:
     """Residual of a commanded recording: simulated minus recorded joint angles in mrad, every `stride` ms.
 
-    Within a window a joint counts until it is slower than `slowest` rad/s for the first time.
+    With `limit`, that many windows. Within a window a joint counts until it is slower than `slowest` rad/s for the first time.
 
     Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to (errors within a
     window are correlated, so intervals count windows, not samples).
@@ -96,10 +96,11 @@ class ReplayResidual:
         window_s: float = 0.2,
         stride: int = 5,
         slowest: float = 0.02,
+        limit: int | None = None,
         batch: int = 36,
         nthread: int = 0,
     ):
-        self.space, self.windows, self._batch = space, cut_windows(recording, window_s), batch
+        self.space, self.windows, self._batch = space, cut_windows(recording, window_s, limit), batch
         w = self.windows
         self.count = len(w.q0)
         self._every = slice(stride - 1, None, stride)

@@ -10,7 +10,7 @@ from r2s.identify import Search, SearchResult
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
 
 
-def least_squares_search(*, max_evaluations: int = 40, ftol: float = 1e-6) -> Search:
+def least_squares_search(*, max_evaluations: int = 40, ftol: float = 1e-4) -> Search:
     """Return the search. `max_evaluations` counts trust-region steps; `ftol` is the relative gain that ends it."""
 
     def search(

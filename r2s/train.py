@@ -56,7 +56,7 @@ def train(
         env: arms to learn on.
         algo: a learner (r2s/tqc.py).
         evaluate: policy -> Episodes (r2s/evaluate.py).
-        weights: fraction of the budget -> (3,) weights of the reward terms (r2s/rewards.py).
+        weights: fraction of the budget -> (4,) weights of the reward terms (r2s/rewards.py).
         budget: when to stop.
         batch_size: transitions per update. updates_per_step: per step of all arms.
         learning_starts: environment steps of uniform random actions.

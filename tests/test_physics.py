@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from r2s.actuation import SoftLimits
 from r2s.friction import friction_slope, friction_torque, passive_torque
 from r2s.robot import load_robot
 from r2s.simulator import Dynamics, Simulator
@@ -73,7 +74,7 @@ def some_motion(robot, nsim, steps, seed=1):
     return q, dq, rng.uniform(-3, 3, (nsim, 1, robot.n)) * wave
 
 
-def oracle(robot, dynamics, k, q, dq, tau):
+def oracle(robot, dynamics, k, q, dq, tau, soft=None):
     """Return (steps, n) angles and velocities of simulation k, and how often a joint was held, in a Python loop."""
     model = robot.model(gravity=False)
     data = mujoco.MjData(model)
@@ -85,6 +86,9 @@ def oracle(robot, dynamics, k, q, dq, tau):
         slope = friction_slope(data.qvel, phi)
         passive = passive_torque(data.qvel, torque, phi, offset, breakaway, dq_min)
         held += int(np.sum(np.isclose(passive + friction_torque(data.qvel, phi), -torque, atol=1e-12)))
+        if soft is not None:
+            passive = passive + soft(data.qpos, data.qvel)
+            slope = slope + soft.dq_gain * (np.abs(data.qvel) > soft.dq_soft)
         data.qfrc_applied[:] = torque + passive + slope * data.qvel
         model.dof_damping[:] = base + slope
         mujoco.mj_step(model, data)
@@ -110,6 +114,27 @@ def test_native_friction_is_the_numpy_law(which, request):
         np.testing.assert_allclose(out["qpos"][k], qs, rtol=0, atol=1e-12)
         np.testing.assert_allclose(out["qvel"][k], dqs, rtol=0, atol=1e-11)
     assert 0.02 < held / tau.size < 0.98  # the dead zone took part, and so did the rest
+
+
+def test_native_soft_limits_are_those_of_the_driver(panda):
+    """Beyond their edges of position and speed arms are pushed as SoftLimits says, to 1e-12; inside not at all."""
+    nsim, steps = 6, 40
+    dynamics = some_dynamics(panda, nsim)
+    q, dq, tau = some_motion(panda, nsim, steps)
+    soft = SoftLimits.of(panda, 0.1 * panda.tau_max)
+    q[:2], dq[2:4] = panda.q_max - 0.05, 0.95 * panda.dq_max * np.array([1, -1, 1, -1, 1, -1, 1])
+    q[1, :3], dq[3] = panda.q_min[:3] + 0.05, -dq[3]
+    sim = Simulator(panda, dynamics, nsim, 1)
+    sim.reset(q, dq)
+    free = sim.rollout(tau)["qpos"]
+    sim.set_soft_limits(soft)
+    sim.reset(q, dq)
+    out = sim.rollout(tau)["qpos"]
+    assert np.abs(out - free).max(axis=(1, 2))[:4].min() > 1e-6
+    assert np.array_equal(out[4:, :5], free[4:, :5])
+    for k in range(nsim):
+        qs, _, _ = oracle(panda, dynamics, k, q, dq, tau, soft)
+        np.testing.assert_allclose(out[k], qs, rtol=0, atol=1e-12)
 
 
 def test_threads_do_not_change_a_bit(panda):

@@ -89,7 +89,10 @@ def reach(
             ddq = (state.dq - before) * task.ctrl_hz
             before = state.dq
             d = distance[e, k : k + 1]
-            reward[e, k] = rewards.terms(d, np.array([distance0]), state.dq[None], ddq[None])[0] @ rewards.PAPER
+            reward[e, k] = (
+                rewards.terms(d, np.array([distance0]), state.dq[None], ddq[None])[0]
+                @ rewards.PAPER
+            )
         if stopped:
             distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs
         arm.stop()

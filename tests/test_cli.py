@@ -1,0 +1,222 @@
+"""The front door: the README's own commands at toy size, and a user's mistakes."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import REAL, ROOT
+
+TOY = ["+experiment=toy"]
+
+
+def r2s(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run run.py as a user does, without a terminal."""
+    command = [sys.executable, str(ROOT / "run.py"), *words]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "COLUMNS": "110"})
+
+
+def succeed(*words: str) -> str:
+    done = r2s(*words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """A commanded recording of two seconds, as CSV with q1..q7 columns."""
+    path = tmp_path_factory.mktemp("data") / "log.csv"
+    t = np.arange(2000) * 1e-3
+    q = np.outer(1 - np.cos(2 * t), np.linspace(0.1, 0.2, 7)) + [0, -0.8, 0, -2.3, 0, 1.6, 0.8]
+    dq = np.outer(2 * np.sin(2 * t), np.linspace(0.1, 0.2, 7))
+    head = ",".join(["t", *(f"{name}{j}" for name in ("q", "dq", "tau") for j in range(1, 8))])
+    np.savetxt(path, np.column_stack([t, q, dq, 2 * dq]), delimiter=",", header=head, comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(root) -> Path:
+    succeed("name=seed_run", f"root={root}", *TOY)
+    return root / "train" / "seed_run"
+
+
+@pytest.fixture(scope="module")
+def identified(root) -> Path:
+    succeed("stage=identify", "name=seed_run", f"root={root}", *TOY)
+    return root / "identify" / "seed_run"
+
+
+def readme_commands() -> list[str]:
+    blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.S)
+    lines = [line for block in blocks for line in block.splitlines()]
+    return [line.removeprefix("python run.py ") for line in lines if line.startswith("python run.py")]
+
+
+@pytest.mark.parametrize("command", readme_commands())
+def test_readme_command(command, root, recording, trained, identified):
+    """Every `python run.py` line of the README ends well and says where its files are."""
+    command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))
+    command = command.replace("TRAIN_FOLDER", str(trained)).replace("runs/train", f"{root}/train")
+    command = command.replace("budget.minutes=4", "budget.minutes=0.05")
+    toy = [*TOY, "pipeline.train_minutes=null"] if "pipeline" in command else TOY
+    if "search=ga" in command:
+        toy = ["data.seconds=2", "search.0.population=4", "search.0.generations=2", "identify.breakaway=null"]
+    out = succeed(*shlex.split(command), f"root={root}", *toy)
+    folders = [root / Path(f).relative_to(root) for f in re.findall(r"written: (\S+)", out)]
+    assert folders
+    for folder in folders:
+        meta = json.loads((folder / "meta.json").read_text())
+        assert meta["status"] == "done"
+        assert (folder / "summary.json").is_file()
+        assert (folder / "recording.rrd").stat().st_size > 1000
+        assert list((folder / "figures").glob("*.png"))
+
+
+def test_run_folders_hold_what_the_contract_says(trained, identified):
+    """Names and keys of a training's and an identification's run folder."""
+    summary = json.loads((trained / "summary.json").read_text())
+    keys = {"env_steps", "wall_clock_s", "success_5cm", "success_2cm", "success_1cm", "success_5mm"}
+    assert keys | {"distance_median_m", "return_paper"} <= set(summary["best"]) & set(summary["last"])
+    assert {"config.yaml", "overrides.yaml", "policy.pt", "policy.onnx", "metrics.csv", "evaluations.csv"} <= {
+        p.name for p in trained.iterdir()
+    }
+    assert yaml.safe_load((trained / "overrides.yaml").read_text())[0] == "name=seed_run"
+    errors = json.loads((identified / "summary.json").read_text())
+    for side in ("train", "validation"):
+        for key in ("torque_rmse_Nm", "nominal_torque_rmse_Nm", "position_rmse_mrad", "nominal_position_rmse_mrad"):
+            assert len(errors[side][key]) == 7
+        assert "0.1" in errors[side]["ee_error_mm"]
+    parameters = yaml.safe_load((identified / "parameters.yaml").read_text())["parameters"]
+    assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset"}
+    assert parameters["phi1"]["unit"] == "Nm"
+    assert len(parameters["phi1"]["identifiable"]) == 7
+
+
+def test_exported_policy_is_the_trained_policy(trained):
+    """policy.onnx gives the torques of policy.pt, within 1e-5 of their scale, and carries what a driver needs."""
+    import onnxruntime
+    import torch
+
+    from r2s.env import Task
+    from r2s.policy import load_policy
+    from r2s.robot import load_robot
+
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    task = Task(**(config["task"] | {"reach": tuple(config["task"]["reach"])}))
+    policy = load_policy(trained, load_robot(**config["robot"]), task)
+    session = onnxruntime.InferenceSession(str(trained / "policy.onnx"))
+    seen = torch.randn(5, 47)
+    torque = session.run(None, {"observation": seen.numpy()})[0]
+    scale = policy.torque_scale.numpy()
+    assert np.abs((torque - policy(seen).detach().numpy()) / scale).max() < 1e-5
+    facts = session.get_modelmeta().custom_metadata_map
+    assert facts["policy_hz"] == "50"
+    assert len(facts["torque_scale_Nm"].split()) == 7
+
+
+def test_same_seed_same_training(root, trained):
+    """With a budget of environment steps, the seed decides every number."""
+    succeed("name=again", f"root={root}", *TOY)
+
+    def rows(folder: Path) -> list[list[str]]:
+        table = [line.split(",") for line in (folder / "evaluations.csv").read_text().splitlines()]
+        clock = table[0].index("wall_clock_s")
+        return [row[:clock] + row[clock + 1 :] for row in table]
+
+    assert rows(root / "train" / "again") == rows(trained)
+
+
+MISTAKES = {
+    "algo=tqq": r"algo: no option 'tqq'.*tqc",
+    "algo.gama=0.9": r"unknown option 'algo.gama'; did you mean 'algo.gamma'",
+    "+typo=1": r"unknown option 'typo'",
+    "nonsense": r"'nonsense' is not KEY=VALUE",
+    "-m seed=0,1 dr=papr": r"dr: no option 'papr'.*did you mean 'paper'",
+    "stage=identify data=recording data.path=nowhere.npz data.torque=measured": r"nowhere.npz",
+    "stage=identify data=recording data.path=LOG": r"torque is not declared.*data.torque=measured",
+    "stage=identify data=recording data.path=LOG data.torque=mesured": r"mesured.*did you mean 'measured'",
+    "stage=identify data=recording data.path=LOG data.torque=measured data.columns.q=qq": r"qq",
+    "stage=identify data=recording data.path=NAN data.torque=commanded": r"q is nan at row",
+    "stage=identify data=recording data.path=BACK data.torque=commanded": r"time does not increase at row",
+    "stage=identify data=recording data.path=SIX data.torque=commanded": r"6.*7|7.*6",
+    "stage=identify data=recording data.path=LOG data.torque=commanded data.validation=LOG": r"training file itself",
+    "robot.mjcf=nowhere.xml": r"nowhere.xml",
+    "calibration=nowhere": r"calibration: no parameters.yaml",
+    "stage=transfer policy=nowhere": r"policy: 'nowhere'",
+    "stage=compare runs=nowhere/*": r"no finished run",
+    "budget.minutes=null": r"budget",
+    "friction.phi1=[1,2]": r"friction.phi1: 2 values for the 7 joints",
+}
+
+
+@pytest.mark.parametrize("command", MISTAKES)
+def test_mistake_gets_one_line(command, recording, tmp_path):
+    """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
+    text = recording.read_text()
+    rows = text.splitlines()
+    (tmp_path / "nan.csv").write_text(
+        "\n".join([*rows[:500], rows[500].replace(rows[500].split(",")[1], "nan", 1), *rows[501:]])
+    )
+    (tmp_path / "back.csv").write_text("\n".join([*rows[:500], rows[400], *rows[500:]]))
+    six = [
+        ",".join(v for k, v in zip(rows[0].split(","), r.split(","), strict=True) if not k.endswith("7"))
+        for r in rows
+    ]
+    (tmp_path / "six.csv").write_text("\n".join(six))
+    places = {
+        "LOG": recording,
+        "NAN": tmp_path / "nan.csv",
+        "BACK": tmp_path / "back.csv",
+        "SIX": tmp_path / "six.csv",
+    }
+    for word, path in places.items():
+        command = command.replace(word, str(path))
+    done = r2s(*command.split(), f"root={tmp_path / 'runs'}")
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert re.search(
+        MISTAKES[command if command in MISTAKES else next(k for k in MISTAKES if _same(k, command, places))], lines[0]
+    )
+    assert not (tmp_path / "runs").exists()
+
+
+def _same(template: str, command: str, places: dict) -> bool:
+    for word, path in places.items():
+        template = template.replace(word, str(path))
+    return template == command
+
+
+def test_help_does_not_import_torch():
+    """--help answers without the heavy libraries."""
+    code = "import sys, runpy; sys.argv = ['run.py', '--help']\ntry: runpy.run_path('run.py', run_name='__main__')\n"
+    code += "except SystemExit: pass\nprint('LOADED', [m for m in ('torch', 'mujoco', 'rerun') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert "LOADED []" in done.stdout, done.stdout[-500:] + done.stderr
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="the real Panda recording is not beside this checkout")
+def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
+    """The README's command on the real recording: held-out torque improves on average over the joints."""
+    succeed(
+        "stage=identify",
+        "data=recording",
+        f"data.path={REAL}",
+        "data.torque=measured",
+        "name=real",
+        f"root={tmp_path}",
+    )
+    validation = json.loads((tmp_path / "identify" / "real" / "summary.json").read_text())["validation"]
+    ratio = np.array(validation["torque_rmse_Nm"]) / validation["nominal_torque_rmse_Nm"]
+    assert ratio.mean() < 0.9
