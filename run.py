@@ -34,8 +34,8 @@ def make_task(cfg):
     """Return conf/task."""
     from r2s.env import Task
 
-    settings = plain(cfg.task)
-    return Task(**(settings | {"reach": tuple(settings["reach"])}))
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items()}
+    return Task(**settings)  # type: ignore[arg-type]
 
 
 def make_draw(cfg, center):

@@ -1,7 +1,8 @@
-"""The driver's torque path, one millisecond at a time: low-pass, soft limits, clip, rate limit last.
+"""The driver's torque path, one millisecond at a time: low-pass, clip, rate limit; and its soft limits.
 
-Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. In simulation
-the soft limits act inside the physics step (r2s/friction.py), because they need feedback every millisecond.
+Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. The soft
+limits need feedback every millisecond: in simulation they act inside the physics step (r2s/friction.py), on an arm
+its loop adds them, clips the sum and limits its rate once more (r2s/arm/deploy.py).
 """
 
 import math
@@ -29,7 +30,7 @@ class SoftLimits:
     dq_gain: np.ndarray
 
     @staticmethod
-    def of(robot: Robot, torque: np.ndarray, *, q_margin: float = 0.1, dq_margin: float = 0.3) -> "SoftLimits":
+    def of(robot: Robot, torque: np.ndarray, *, q_margin: float = 0.1, dq_margin: float = 0.45) -> "SoftLimits":
         """Return limits that outweigh an action's full `torque` (n,) Nm at 2/3 of each margin.
 
         Args:
@@ -58,13 +59,13 @@ def low_pass_gain(cutoff_hz: float, dt: float = SIM_DT) -> float:
 
 
 @njit(cache=True)
-def _condition(target, push, filtered, last, nstep, gain, tau_max, step_max, out):
+def _condition(target, filtered, last, nstep, gain, tau_max, step_max, out):
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             f, u = filtered[i, j], last[i, j]
             for k in range(nstep):
                 f += gain * (target[i, j] - f)
-                clipped = min(max(f + push[j], -tau_max[j]), tau_max[j])
+                clipped = min(max(f, -tau_max[j]), tau_max[j])
                 u += min(max(clipped - u, -step_max[j]), step_max[j])
                 out[i, k, j] = u
             filtered[i, j], last[i, j] = f, u
@@ -78,7 +79,6 @@ class Actuation:
         self.last = np.zeros((m, robot.n))
         self._gain = low_pass_gain(cutoff_hz)
         self._tau_max, self._step_max = robot.tau_max, robot.dtau_max * SIM_DT
-        self._no_push = np.zeros(robot.n)
 
     def reset(self, ids: np.ndarray | None = None) -> None:
         """Start the arms `ids` (all by default) from zero torque."""
@@ -86,13 +86,9 @@ class Actuation:
         self.filtered[at] = 0.0
         self.last[at] = 0.0
 
-    def __call__(self, target: np.ndarray, nstep: int, push: np.ndarray | None = None) -> np.ndarray:
-        """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm.
-
-        `push` (n,) Nm is what the soft limits add, where they do not act in the physics step.
-        """
+    def __call__(self, target: np.ndarray, nstep: int) -> np.ndarray:
+        """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
-        push = self._no_push if push is None else push
-        _condition(target, push, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
+        _condition(target, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
         return out

@@ -1,8 +1,8 @@
 """The task: reach a point with joint torques. A batch-locked TorchRL environment on one Simulator.
 
 A step, for all arms at once: action -> target torque (fraction of the limits) -> low-pass, clip, rate limit each
-ms -> physics with soft limits at 1 kHz for one control period -> kinematics -> observation,
-reward terms, truncation. Episodes never terminate, they are cut off (`truncated`), so values bootstrap through their end.
+ms -> physics with soft limits at 1 kHz for one control period -> kinematics -> observation, reward
+terms, truncation. Episodes never terminate, they are cut off (`truncated`): values bootstrap through their end.
 """
 
 from collections.abc import Callable
@@ -140,7 +140,7 @@ class ReachEnv(EnvBase):
     """`nsim` arms reaching for random goals, each with dynamics drawn at every reset.
 
     Keys: `observation` (nsim, 5 n + 12), `action` (nsim, n) in [-1, 1], `reward` (nsim, 1) under `weights`,
-    `reward_terms` (nsim, 4) of r2s/rewards.py, `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
+    `reward_terms` (nsim, 3) of r2s/rewards.py, `distance` (nsim, 1) m, `truncated`, `terminated`, `done`.
 
     Args:
         robot, task: the arm and what is asked of it.
@@ -179,7 +179,7 @@ class ReachEnv(EnvBase):
         shape = (nsim,)
         self.observation_spec = Composite(
             observation=Unbounded((nsim, 5 * robot.n + 12), dtype=torch.float32),
-            reward_terms=Unbounded((nsim, 4), dtype=torch.float32),
+            reward_terms=Unbounded((nsim, 3), dtype=torch.float32),
             distance=Unbounded((nsim, 1), dtype=torch.float32),
             shape=shape,
         )
@@ -205,7 +205,7 @@ class ReachEnv(EnvBase):
             q = self.robot.q_home + self.rng.uniform(-spread, spread, (len(ids), self.robot.n))
             self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
             if self._stagger:
-                self._count[:] = self.rng.integers(self.task.steps, size=len(ids))
+                self._count[ids] = self.rng.integers(self.task.steps, size=len(ids))
                 self._stagger = False
         return self.read()
 
@@ -216,7 +216,7 @@ class ReachEnv(EnvBase):
         return TensorDict(
             {
                 "observation": torch.from_numpy(self._observe()),
-                "reward_terms": torch.zeros(self.sim.nsim, 4),
+                "reward_terms": torch.zeros(self.sim.nsim, 3),
                 "distance": torch.from_numpy(distance[:, None].astype(np.float32)),
                 "done": none,
                 "terminated": none.clone(),

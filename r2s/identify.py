@@ -269,15 +269,16 @@ def intervals(
     """Return ((low, high), identifiable) of x (P,), 95 %, linearised about the result.
 
     Errors within a window are correlated, so the covariance is the cluster sandwich
-    H^-1 (sum_w g_w g_w^T) H^-1 with H = J^T J and g_w = J_w^T r_w (Liang and Zeger 1986). A parameter counts as
-    identifiable when its interval is shorter than half of its value, or a tenth of its bounds.
+    H^-1 (sum_w g_w g_w^T) H^-1 with H = J^T J and g_w = J_w^T r_w (Liang and Zeger 1986), but no less than H^-1, what
+    rows of unit noise would give: a residual that a parameter does not touch knows nothing of it. A parameter counts
+    as identifiable when its interval is shorter than half of its value, or a tenth of its bounds.
     """
     hessian = jacobian.T @ jacobian + 1e-9 * np.eye(len(x))
     score = np.zeros((int(clusters.max()) + 1, len(x)))
     np.add.at(score, clusters, jacobian * residual[:, None])
     inverse = np.linalg.inv(hessian)
-    covariance = inverse @ (score.T @ score) @ inverse
-    half_unit = 1.96 * np.sqrt(np.diag(covariance))
+    variance = np.maximum(np.diag(inverse @ (score.T @ score) @ inverse), np.diag(inverse))
+    half_unit = 1.96 * np.sqrt(variance)
     u = space.to_unit(x)
     low, high = space.from_unit(u - half_unit), space.from_unit(u + half_unit)
     width = high - low

@@ -239,8 +239,8 @@ def load_parameters(folder: str | Path, robot: Robot) -> Dynamics:
     if not path.is_file():
         siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
         raise UserError(f"calibration: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")
-    document = yaml.safe_load(path.read_text())
     try:
+        document = yaml.safe_load(path.read_text())
         found, fixed, joints = document["parameters"], document["fixed"], document["joints"]
         values = {name: np.array(found[name]["value"], dtype=float) for name in found}
         phi = np.array(fixed["phi"], dtype=float)
@@ -249,12 +249,13 @@ def load_parameters(folder: str | Path, robot: Robot) -> Dynamics:
         dynamics = Dynamics(
             phi=phi,
             offset=values.get("offset", np.array(fixed["offset"], dtype=float)),
-            breakaway=np.stack([fixed["breakaway_negative"], fixed["breakaway_positive"]], -1).astype(float),
+            breakaway=np.stack([values.get(k, fixed[k]) for k in ("breakaway_negative", "breakaway_positive")], -1),
             dq_min=float(fixed["dq_min"]),
             inertia=robot.inertia,
         ).scaled(values.get("inertia_scale", np.array(fixed["inertia_scale"], dtype=float)))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise UserError(f"calibration: {path} is not a parameters.yaml of r2s ({error})") from None
+    except (KeyError, TypeError, ValueError, IndexError, yaml.YAMLError) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"calibration: {path} is not a parameters.yaml of r2s ({seen})") from None
     if document["robot"] != robot.name or joints != robot.n:
         raise UserError(
             f"calibration: {path} is of '{document['robot']}' with {joints} joints; this arm is '{robot.name}' with "

@@ -79,7 +79,8 @@ def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0)
 class ReplayResidual:
     """Residual of a commanded recording: simulated minus recorded joint angles in mrad, every `stride` ms.
 
-    With `limit`, that many windows. Within a window a joint counts until it is slower than `slowest` rad/s for the first time.
+    With `limit`, that many windows. Within a window a joint counts until it is slower than `slowest` rad/s for the
+    first time.
 
     Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to (errors within a
     window are correlated, so intervals count windows, not samples).

@@ -11,17 +11,15 @@ import numpy as np
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = 0.03  # length of the bonus: within it, closer still pays
 STILL = 0.2  # rad/s, scale of its stillness: a redundant arm can drift with its hand on the goal
-TERMS = ("distance", "smoothness", "precision", "steadiness")
+TERMS = ("distance", "smoothness", "precision")
 
 
 def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return (m, 4): the two halves of eq. (2), which add up to it, and two helpers of the curriculum.
+    """Return (m, 3): the two halves of eq. (2), which add up to it, and a bonus for precision.
 
     distance    -k1 d, with d the distance over the initial one
     smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
     precision   (1 - tanh(distance / 3 cm)) (1 - mean tanh(|dq| / 0.2 rad/s) / 2)
-    steadiness  -mean log(1 + |ddq|): the tanh of eq. (2) is flat above 2 rad/s^2, so an arm that shakes has nothing to
-                gain by shaking less; the logarithm shows the way out at every scale
 
     Args:
         distance, distance0: (m,) m, now and at the start of the episode.
@@ -34,10 +32,10 @@ def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.n
     smoothness = -K2 * speed - K3 * jerkiness / np.abs(K4 - np.minimum(1.0, d)) - K5 * jerkiness / (K6 + d)
     still = 1.0 - 0.5 * np.tanh(np.abs(dq) / STILL).mean(-1)
     precision = (1.0 - np.tanh(distance / PRECISION_M)) * still
-    return np.stack([-K1 * d, smoothness, precision, -np.log1p(np.abs(ddq)).mean(-1)], -1)
+    return np.stack([-K1 * d, smoothness, precision], -1)
 
 
-PAPER = np.array([1.0, 1.0, 0.0, 0.0])  # weights of the terms that make eq. (2)
+PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
 
 
 def curriculum(
@@ -45,21 +43,20 @@ def curriculum(
     *,
     smoothness: Sequence[float],
     precision: Sequence[float],
-    steadiness: Sequence[float],
     anneal: Sequence[float],
 ) -> np.ndarray:
-    """Return the (4,) weights at `progress` in [0, 1] of the training budget.
+    """Return the (3,) weights at `progress` in [0, 1] of the training budget.
 
     Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
-    with light smoothness and the two helpers, then moves linearly towards eq. (2) between the two `anneal`
-    fractions of the budget. reward=paper is the same with constant pairs (1, 0 and 0).
+    with light smoothness and a bonus for precision, then moves linearly towards eq. (2) between the two `anneal`
+    fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
     Args:
         progress: fraction of the budget spent.
-        smoothness, precision, steadiness: weights before and after.
+        smoothness, precision: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
     """
     start, end = anneal
     at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
-    moving = [before + at * (after - before) for before, after in (smoothness, precision, steadiness)]
+    moving = [before + at * (after - before) for before, after in (smoothness, precision)]
     return np.array([1.0, *moving])

@@ -4,15 +4,15 @@ The population starts around the nominal model, not anywhere in the bounds: defa
 uniform population converge long before the friction curves do.
 """
 
+import time
 from collections.abc import Callable
 
 import numpy as np
 from pymoo.algorithms.soo.nonconvex.ga import GA
 from pymoo.core.problem import Problem
+from pymoo.core.termination import NoTermination
 from pymoo.operators.crossover.sbx import SBX
 from pymoo.operators.mutation.pm import PM
-from pymoo.optimize import minimize
-from pymoo.termination.max_time import TimeBasedTermination
 
 from r2s.identify import Search, SearchResult
 
@@ -41,7 +41,6 @@ def ga_search(
     def search(
         residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray, report: Callable[[dict], None]
     ) -> SearchResult:
-        costs: list[float] = []
         rng = np.random.default_rng(seed)
         first = np.clip(start + spread * rng.normal(size=(population, len(start))), 0, 1)
         first[0] = start
@@ -53,28 +52,24 @@ def ga_search(
             def _evaluate(self, x, out, *args, **kwargs):
                 out["F"] = (residual(x) ** 2).sum(-1, keepdims=True)
 
-        def after_generation(algorithm) -> None:
-            cost = float(algorithm.opt[0].F[0])
-            costs.append(cost)
-            row = {"search": "ga", "generation": algorithm.n_gen, "evaluations": algorithm.evaluator.n_eval}
-            report(row | {"cost": cost, "done": algorithm.n_gen, "total": generations})
-            stale = len(costs) > patience and costs[-1 - patience] - cost < tolerance * cost
-            if stale or algorithm.n_gen >= generations:
-                algorithm.termination.terminate()
-
-        result = minimize(
-            Replay(),
-            GA(
-                pop_size=population,
-                sampling=first,
-                crossover=SBX(eta=10, prob=0.9),
-                mutation=PM(eta=15),
-                eliminate_duplicates=True,
-            ),
-            TimeBasedTermination(60 * minutes),
-            seed=seed,
-            callback=after_generation,
+        algorithm = GA(
+            pop_size=population,
+            sampling=first,
+            crossover=SBX(eta=10, prob=0.9),
+            mutation=PM(eta=15),
+            eliminate_duplicates=True,
         )
-        return SearchResult(np.asarray(result.X, dtype=float), None, residual(result.X[None])[0])
+        algorithm.setup(Replay(), termination=NoTermination(), seed=seed)
+        began, costs = time.perf_counter(), []
+        for generation in range(1, generations + 1):
+            algorithm.next()
+            costs.append(float(algorithm.opt[0].F[0]))
+            row = {"search": "ga", "generation": generation, "evaluations": algorithm.evaluator.n_eval}
+            report(row | {"cost": costs[-1], "done": generation, "total": generations})
+            stale = len(costs) > patience and costs[-1 - patience] - costs[-1] < tolerance * costs[-1]
+            if stale or time.perf_counter() - began > 60 * minutes:
+                break
+        best = np.asarray(algorithm.opt[0].X, dtype=float)
+        return SearchResult(best, None, residual(best[None])[0])
 
     return search

@@ -26,6 +26,8 @@ class TQC(nn.Module):
         hidden: units per layer, of actor and critics.
         n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
         gamma: discount. tau: step of the target critics. lr: of Adam, for all. alpha_init: first temperature.
+        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER): where the
+            critics hardly tell actions apart, the small one wins, instead of full torque one way and the other.
         target_entropy: None is minus the number of joints.
     """
 
@@ -45,6 +47,7 @@ class TQC(nn.Module):
         lr: float = 5e-4,
         alpha_init: float = 0.01,
         target_entropy: float | None = None,
+        action_l2: float = 0.0,
     ):
         super().__init__()
         obs_dim, act_dim = len(scale[0]), len(torque)
@@ -56,6 +59,7 @@ class TQC(nn.Module):
         self.register_buffer("torque", torque.float())
         self.gamma, self.tau = gamma, tau
         self.keep = n_critics * (n_quantiles - drop_per_critic)
+        self.action_l2 = action_l2
         self.target_entropy = -float(act_dim) if target_entropy is None else target_entropy
         self._learned = [*self.actor.parameters(), *self.critics.parameters(), self.log_alpha]
         self.optimizer = torch.optim.Adam(self._learned, lr=lr, fused=True)
@@ -95,7 +99,7 @@ class TQC(nn.Module):
         value = self.critics(batch["observation"], action).mean((0, 2))
         for parameter in self.critics.parameters():
             parameter.requires_grad_(True)
-        actor = (alpha * log_prob - value).mean()
+        actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
         return {
             "loss_critic": critic,
@@ -134,8 +138,8 @@ class QuantileHuber(torch.autograd.Function):
         count, b, n = quantiles.shape
         m = target.shape[-1]
         # sums of squares cancel in single precision: centre the targets of each row, sum in double
-        centre = target.mean(-1, keepdim=True)
-        y = (target - centre).double()
+        centre = target.double().mean(-1, keepdim=True)
+        y = target.double() - centre
         theta = quantiles.transpose(0, 1).reshape(b, -1).double() - centre
         zero = y.new_zeros(b, 1)
         first = torch.cat([zero, y.cumsum(-1)], -1)

@@ -5,6 +5,7 @@ With env_steps alone a seed gives the same run, bit for bit at a fixed number of
 follow the clock.
 """
 
+import ctypes
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,16 @@ class Budget:
         return max(time_share, step_share)
 
 
+def keep_memory() -> None:
+    """Let glibc keep freed blocks: it gives large ones back at once, and faulting them in again slows every update."""
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
+        libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
+    except (OSError, AttributeError):
+        pass  # another C library: only slower
+
+
 def train(
     env: ReachEnv,
     algo: TQC,
@@ -56,7 +67,7 @@ def train(
         env: arms to learn on.
         algo: a learner (r2s/tqc.py).
         evaluate: policy -> Episodes (r2s/evaluate.py).
-        weights: fraction of the budget -> (4,) weights of the reward terms (r2s/rewards.py).
+        weights: fraction of the budget -> (3,) weights of the reward terms (r2s/rewards.py).
         budget: when to stop.
         batch_size: transitions per update. updates_per_step: per step of all arms.
         learning_starts: environment steps of uniform random actions.
@@ -65,6 +76,7 @@ def train(
         log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
         progress: gets the fraction spent and what is worth showing, every step.
     """
+    keep_memory()
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(replay_size), sampler=RandomSampler(), batch_size=batch_size

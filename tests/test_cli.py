@@ -38,7 +38,7 @@ def recording(tmp_path_factory) -> Path:
     """A commanded recording of two seconds, as CSV with q1..q7 columns."""
     path = tmp_path_factory.mktemp("data") / "log.csv"
     t = np.arange(2000) * 1e-3
-    q = np.outer(1 - np.cos(2 * t), np.linspace(0.1, 0.2, 7)) + [0, -0.8, 0, -2.3, 0, 1.6, 0.8]
+    q = np.outer(1 - np.cos(2 * t), np.linspace(0.1, 0.2, 7)) + np.array([0, -0.8, 0, -2.3, 0, 1.6, 0.8])
     dq = np.outer(2 * np.sin(2 * t), np.linspace(0.1, 0.2, 7))
     head = ",".join(["t", *(f"{name}{j}" for name in ("q", "dq", "tau") for j in range(1, 8))])
     np.savetxt(path, np.column_stack([t, q, dq, 2 * dq]), delimiter=",", header=head, comments="")

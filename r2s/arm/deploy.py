@@ -12,6 +12,7 @@ from r2s.arm.interface import Arm, ArmStopped
 from r2s.env import Task, observe
 from r2s.evaluate import Episodes
 from r2s.networks import Policy
+from r2s.robot import SIM_DT
 
 
 class Kinematics:
@@ -54,13 +55,14 @@ def reach(
     kinematics = Kinematics(robot)
     actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
     torque = task.torque(robot)
-    soft = SoftLimits.of(robot, torque)
+    soft, step = SoftLimits.of(robot, torque), robot.dtau_max * SIM_DT
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
     for e in range(count):
         state = arm.move_to(starts[e])
         actuation.reset()
+        sent = np.zeros(robot.n)
         place, jacobian = kinematics(state.q)
         distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
         before, stopped = state.dq, False
@@ -77,22 +79,21 @@ def reach(
                 action = policy.action(torch.from_numpy(seen)).numpy().astype(np.float64)
                 try:
                     for _ in range(task.substeps):
-                        push = soft(state.q, state.dq)
-                        arm.command(actuation(action * torque, 1, push)[0, 0])
+                        wanted = actuation(action * torque, 1)[0, 0] + soft(state.q, state.dq)
+                        wanted = np.clip(wanted, -robot.tau_max, robot.tau_max)
+                        sent = sent + np.clip(wanted - sent, -step, step)  # the rate limit comes last
+                        arm.command(sent)
                         state = arm.read()
                 except ArmStopped as stop:
                     stops.append(f"episode {e + 1}, {state.t:.2f} s: {stop}")
                     stopped = True
                 place, jacobian = kinematics(state.q)
-            q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, actuation.last[0]
+            q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, sent
             distance[e, k] = np.linalg.norm(goals[e] - place)
             ddq = (state.dq - before) * task.ctrl_hz
             before = state.dq
             d = distance[e, k : k + 1]
-            reward[e, k] = (
-                rewards.terms(d, np.array([distance0]), state.dq[None], ddq[None])[0]
-                @ rewards.PAPER
-            )
+            reward[e, k] = rewards.terms(d, np.array([distance0]), state.dq[None], ddq[None])[0] @ rewards.PAPER
         if stopped:
             distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs
         arm.stop()
