@@ -90,7 +90,7 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 110)
 
 
-def set_threads(cfg, device_seed=True):
+def set_threads(cfg):
     """Give torch its threads and seed; the physics gets its own from cfg.threads."""
     import torch
 
@@ -103,7 +103,9 @@ def set_threads(cfg, device_seed=True):
 
 def record_motion(cfg, robot, seed, label):
     """Return a recording of an excitation on conf/arm, or on a simulated arm of known truth."""
+    from r2s.arm.interface import ArmStopped
     from r2s.arm.record import record
+    from r2s.errors import UserError
     from r2s.excitation import fourier
     from r2s.runs import Progress
 
@@ -121,7 +123,10 @@ def record_motion(cfg, robot, seed, label):
         arm = make_arm(cfg, robot)
     progress = Progress(label)
     motion = fourier(robot, duration=cfg.data.seconds, seed=seed)
-    out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+    try:
+        out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+    except ArmStopped as stop:
+        raise UserError(f"the arm stopped while it was recorded: {stop}") from None
     progress.close(f"{out.duration:.1f} s of motion")
     return out
 
@@ -226,7 +231,7 @@ def train(cfg, overrides):
     center = make_dynamics(cfg, robot)
     draw = make_draw(cfg, center)
     set_threads(cfg)
-    loop = {k: settings.pop(k) for k in ("batch_size", "learning_starts", "updates_per_step", "replay_size")}
+    loop = {k: settings.pop(k) for k in LOOP}
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
     env = ReachEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
@@ -365,6 +370,8 @@ def pipeline(cfg, overrides):
     print(f"written: {run.folder} (look: rerun {run.folder / 'recording.rrd'})")
 
 
+# what conf/algo says of the loop rather than of the learner
+LOOP = ("batch_size", "learning_starts", "updates_per_step", "replay_size", "lr_decay", "lr_end")
 STAGES = {
     "train": train,
     "identify": identify,
@@ -450,7 +457,7 @@ def main():
         overrides = list(HydraConfig.get().overrides.task)
         try:
             STAGES[cfg.stage](cfg, overrides)
-        except UserError as error:
+        except (UserError, FloatingPointError) as error:
             sys.exit(stop(error))
         except KeyboardInterrupt:
             print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)

@@ -126,6 +126,7 @@ def identify(
             robot, space.dynamics(space.from_unit(u)), recording, breakaway, window_s, stride, nthread, told
         )
         data.space = space = replace(space, nominal=replace(nominal, breakaway=edges))
+        weigh = Weighted(data, prior, kept, fitted=space.from_unit(u))
         result = searches[-1](weigh, u, told)
         u = result.u
     x = space.from_unit(u)
@@ -232,16 +233,23 @@ def make_residual(
 class Weighted:
     """The residual a search sees: each joint over its noise, and the prior as rows of its own.
 
-    A joint's noise is the residual's own `scale`. Friction and offset of the joints `kept` (n,) stay nominal.
+    A joint's noise is the residual's own `scale`, of a `fitted` x (P,) where there is one: against what a model
+    cannot explain (a delay, another friction law) a prior has to weigh more than against encoder noise. Friction and
+    offset of the joints `kept` (n,) stay nominal.
     """
 
     def __init__(
-        self, data: ReplayResidual | TorqueResidual, prior: Mapping[str, float], kept: np.ndarray | None = None
+        self,
+        data: ReplayResidual | TorqueResidual,
+        prior: Mapping[str, float],
+        kept: np.ndarray | None = None,
+        fitted: np.ndarray | None = None,
     ):
         self._data, space = data, data.space
         start = space.start
         rows = len(data.clusters) // space.n
-        self._scale = np.tile(data.scale(start), rows)
+        scale = data.scale(start, False) if fitted is None else data.scale(fitted, True)
+        self._scale = np.tile(scale, rows)
         self._start = space.to_unit(start)
         sigma = np.repeat([prior.get(block, np.inf) for block in space.blocks], space.n)
         if kept is not None:

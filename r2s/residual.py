@@ -22,6 +22,7 @@ from r2s.recording import Recording
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
 
+ENCODER_MRAD = 0.2  # what replays of 0.2 s miss through encoder noise in their start state
 VELOCITY_SAMPLES = 31  # Savitzky-Golay window for a window's start state, samples at 1 kHz
 
 
@@ -133,9 +134,13 @@ class ReplayResidual:
         """Return (C, n) mrad^2: the mean square error of each joint."""
         return (self(x).reshape(len(x), -1, self._target.shape[-1]) ** 2).mean(1)
 
-    def scale(self, x: np.ndarray) -> np.ndarray:
-        """Return (n,) mrad: one standard deviation of a row; encoders are alike, and a window counts as one."""
-        return np.full(self._target.shape[-1], 0.2 * np.sqrt(self._target.shape[1]))
+    def scale(self, x: np.ndarray, fitted: bool) -> np.ndarray:
+        """Return (n,) mrad: one standard deviation of a row, where a whole window says one thing.
+
+        Before a fit that is encoder noise alone; of a `fitted` x (P,) it is what the model leaves unexplained.
+        """
+        left = np.sqrt(self.joint_error(x[None])[0]) if fitted else 0.0
+        return np.sqrt(self._target.shape[1]) * np.maximum(ENCODER_MRAD, np.full(self._target.shape[-1], left))
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C,) mrad: eq. (8) per sample, the mean over time of the norm over joints."""
@@ -181,14 +186,14 @@ class TorqueResidual:
         self.candidates += len(x)
         return (self.predict(self.space.dynamics(x)) - self.motion.tau).reshape(len(x), -1)
 
-    def scale(self, x: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm: one standard deviation of an independent row, about half of the RMS at x (P,).
+    def scale(self, x: np.ndarray, fitted: bool) -> np.ndarray:
+        """Return (n,) Nm: one standard deviation of an independent row: RMS at a `fitted` x (P,), else half of it.
 
         Real torque keeps that much unexplained whatever the parameters; the factor is how many rows in a row say
         the same thing, so that a prior weighs against independent rows.
         """
         r = self.predict(self.space.dynamics(x)) - self.motion.tau
-        return 0.5 * np.sqrt((r**2).mean(0) * _correlation_length(r))
+        return (1.0 if fitted else 0.5) * np.sqrt((r**2).mean(0) * _correlation_length(r))
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C,) Nm: eq. (8) per sample, the mean over time of the norm over joints."""

@@ -4,8 +4,8 @@ The losses are those of `torchrl.objectives.TQCLoss`, which the tests hold this 
 Two things are written differently because two cores have to do: the critics are one batched network instead of a
 vmap, and the quantile loss goes by prefix sums over the sorted targets instead of all pairs.
 
-An algorithm is a class with four verbs: `explore`, `update`, `policy`, `state_dict`/`load_state_dict`. DDPG, SAC and
-TD3 are to be files beside this one; r2s/train.py does not know which it runs.
+An algorithm is a class with a few verbs: `explore`, `update`, `set_lr`, `policy`, `state_dict` and
+`load_state_dict`. DDPG, SAC and TD3 are to be files beside this one; r2s/train.py does not know which it runs.
 """
 
 import copy
@@ -62,6 +62,7 @@ class TQC(nn.Module):
         self.action_l2 = action_l2
         self.target_entropy = -float(act_dim) if target_entropy is None else target_entropy
         self._learned = [*self.actor.parameters(), *self.critics.parameters(), self.log_alpha]
+        self.lr = lr
         self.optimizer = torch.optim.Adam(self._learned, lr=lr, fused=True)
 
     @property
@@ -74,6 +75,11 @@ class TQC(nn.Module):
         """Return sampled actions (B, n) for observations (B, d)."""
         loc, scale = self.actor(self.normalizer(observation))
         return torch.tanh(loc + scale * torch.randn_like(loc))
+
+    def set_lr(self, share: float) -> None:
+        """Set the learning rate to this share of its first value."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = share * self.lr
 
     def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """Return critic, actor and alpha losses of a batch.

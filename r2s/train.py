@@ -36,7 +36,7 @@ class Budget:
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed blocks: it gives large ones back at once, and faulting them in again slows every update."""
+    """Let glibc keep freed blocks: it gives large ones back at once, and every update would fault them in again."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
@@ -56,6 +56,8 @@ def train(
     learning_starts: int = 3200,
     updates_per_step: int = 1,
     replay_size: int = 1_000_000,
+    lr_decay: float = 0.6,
+    lr_end: float = 0.1,
     eval_env_steps: int = 80_000,
     log: Callable[[dict], None] = lambda row: None,
     evaluated: Callable[[dict], None] = lambda row: None,
@@ -72,6 +74,7 @@ def train(
         batch_size: transitions per update. updates_per_step: per step of all arms.
         learning_starts: environment steps of uniform random actions.
         replay_size: transitions kept.
+        lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
         eval_env_steps: environment steps between two evaluations; one more comes at the end.
         log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
         progress: gets the fraction spent and what is worth showing, every step.
@@ -91,6 +94,7 @@ def train(
 
     while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
         env.weights = weights(spent)
+        algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / (1.0 - lr_decay))
         warm = env_steps >= learning_starts
         state["action"] = algo.explore(state["observation"]) if warm else env.action_spec.rand()
         step, state_next = env.step_and_maybe_reset(state)
