@@ -406,7 +406,8 @@ def check_overrides(words):
 
     groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in CONF.iterdir() if p.is_dir()}
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        known = [*keys(compose("config")), *groups]
+        cfg = compose("config")
+        known = [*keys(cfg), *groups]
         base: list[str] = []
         for word in words:
             try:
@@ -417,7 +418,8 @@ def check_overrides(words):
                 values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
                 trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
                 for trial in trials:
-                    cfg = compose("config", [*base, trial])
+                    before, cfg = cfg, compose("config", [*base, trial])
+                    check_number(name, before, cfg)
                 if not parsed.is_sweep_override() and name in ("data", "arm", "simulator"):
                     known = [*keys(cfg), *groups]
                 base.append(trials[0])
@@ -439,6 +441,20 @@ def check_overrides(words):
     GlobalHydra.instance().clear()
 
 
+def check_number(key, before, after):
+    """Raise UserError where a number of the config was replaced by a word."""
+    from omegaconf import OmegaConf
+
+    from r2s.errors import UserError
+
+    def number(value):
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+    old, new = OmegaConf.select(before, key, throw_on_missing=False), OmegaConf.select(after, key)
+    if number(old) and isinstance(new, str):
+        raise UserError(f"{key}: '{new}' is not a number, such as {old:g}")
+
+
 def main():
     """Compose and run; a user's mistake is one line and exit status 2."""
     import hydra
@@ -453,12 +469,15 @@ def main():
     @hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")
     def job(cfg):
         from hydra.core.hydra_config import HydraConfig
+        from omegaconf.errors import MissingMandatoryValue
 
         overrides = list(HydraConfig.get().overrides.task)
         try:
             STAGES[cfg.stage](cfg, overrides)
         except (UserError, FloatingPointError) as error:
             sys.exit(stop(error))
+        except MissingMandatoryValue as error:
+            sys.exit(stop(f"{error.full_key} must be given: {error.full_key}=..."))
         except KeyboardInterrupt:
             print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
             sys.exit(130)

@@ -21,8 +21,8 @@ from r2s.errors import UserError
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
 
-FINE_M = 0.05  # tanh scales of the observation: the last centimetres fill the range of a network's input
-FINE_RAD = 0.03
+FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
+FINE_RAD = 0.015
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def observe(
 ) -> np.ndarray:
     """Return the observation (m, 5 n + 12) float32 in SI units; the same on the arm as in simulation.
 
-    q, dq, ee, goal, error, effort, tanh(error / 5 cm), J^T error, tanh(J^T error / 3 cm): the last three
+    q, dq, ee, goal, error, effort, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm): the last three
     tell a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is
     state, because the rate limit lets a torque change by 1 Nm per ms only.
 

@@ -71,7 +71,7 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
     facts = {
         "robot": robot.name,
         "joints": " ".join(f"joint{j + 1}" for j in range(robot.n)),
-        "observation": "q dq ee goal error effort tanh(error/0.05) J'error tanh(J'error/0.03); rad, rad/s, m",
+        "observation": "q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015); rad, rad/s, m",
         "policy_hz": str(task.ctrl_hz),
         "torque_max_Nm": " ".join(f"{t:g}" for t in robot.tau_max),
         "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
-PRECISION_M = 0.03  # length of the bonus: within it, closer still pays
+PRECISION_M = np.array([0.03, 0.01])  # lengths of the bonus: within them, closer still pays
 STILL = 0.2  # rad/s, scale of its stillness: a redundant arm can drift with its hand on the goal
 TERMS = ("distance", "smoothness", "precision")
 
@@ -19,7 +19,7 @@ def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.n
 
     distance    -k1 d, with d the distance over the initial one
     smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision   (1 - tanh(distance / 3 cm)) (1 - mean tanh(|dq| / 0.2 rad/s) / 2)
+    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2) (1 - mean tanh(|dq| / 0.2 rad/s) / 2)
 
     Args:
         distance, distance0: (m,) m, now and at the start of the episode.
@@ -31,8 +31,8 @@ def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.n
     jerkiness = np.tanh(np.abs(ddq)).sum(-1)
     smoothness = -K2 * speed - K3 * jerkiness / np.abs(K4 - np.minimum(1.0, d)) - K5 * jerkiness / (K6 + d)
     still = 1.0 - 0.5 * np.tanh(np.abs(dq) / STILL).mean(-1)
-    precision = (1.0 - np.tanh(distance / PRECISION_M)) * still
-    return np.stack([-K1 * d, smoothness, precision], -1)
+    near = 1.0 - np.tanh(distance[:, None] / PRECISION_M).mean(-1)
+    return np.stack([-K1 * d, smoothness, near * still], -1)
 
 
 PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
