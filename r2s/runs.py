@@ -6,6 +6,7 @@ meta.json says `running` from the first moment, so a killed run is seen for what
 import csv
 import hashlib
 import json
+import math
 import os
 import platform
 import re
@@ -115,9 +116,17 @@ class Run:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON so that the name appears only once the file is whole."""
+    """Write JSON so that the name appears only once the file is whole; numbers that are not finite become null."""
+
+    def finite(node: Any) -> Any:
+        if isinstance(node, Mapping):
+            return {k: finite(v) for k, v in node.items()}
+        if isinstance(node, list):
+            return [finite(v) for v in node]
+        return None if isinstance(node, float) and not math.isfinite(node) else node
+
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(document, indent=1) + "\n")
+    part.write_text(json.dumps(finite(document), indent=1) + "\n")
     os.replace(part, path)
 
 

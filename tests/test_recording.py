@@ -397,3 +397,16 @@ def test_a_path_that_is_no_recording(tmp_path):
         assert str(tmp_path / name) in text
     assert read(good, torque="measured").name == "swing"
     assert read(good, torque="measured", name="mine", period=2).name == "mine"
+
+
+def test_a_motion_that_comes_again_is_noticed():
+    """`repeats_after` finds the period of an excitation across a gap in the log, and none where nothing repeats."""
+    t = np.arange(0, 12, 0.01)
+    t = t[(t < 3.0) | (t > 4.4)]
+    q = np.stack([np.sin(2 * np.pi * t / 5.0), 0.5 * np.cos(4 * np.pi * t / 5.0)], -1)
+    made = {"t": t, "dq": np.zeros_like(q), "tau": np.zeros_like(q), "torque": "commanded"}
+    assert Recording(q=q, **made).split_at_gaps(0.05).repeats_after() == pytest.approx(5.0, abs=0.03)
+    chirp = np.stack([np.sin(0.4 * t**2), np.cos(0.3 * t**2)], -1)
+    assert Recording(q=chirp, **made).repeats_after() is None
+    still = np.zeros_like(q)
+    assert Recording(q=still, **made).repeats_after() is None
