@@ -126,12 +126,15 @@ def identify(
             robot, space.dynamics(space.from_unit(u)), recording, breakaway, window_s, stride, nthread, told
         )
         data.space = space = replace(space, nominal=replace(nominal, breakaway=edges))
-        weigh = Weighted(data, prior, kept, fitted=space.from_unit(u))
-        result = searches[-1](weigh, u, told)
+    weigh = Weighted(data, prior, kept, fitted=space.from_unit(u))
+    if result.jacobian is not None:  # a local search goes on from where it was, weighed by what is left unexplained
+        result = searches[-1](weigh, u, lambda row: told(row | {"search": f"{row['search']}, reweighed"}))
         u = result.u
+    else:
+        result = SearchResult(u, weigh.jacobian(u), weigh(u[None])[0])
     x = space.from_unit(u)
-    jacobian = result.jacobian if result.jacobian is not None else weigh.jacobian(u)
-    interval, identifiable = intervals(space, x, jacobian, result.residual, weigh.clusters)
+    assert result.jacobian is not None
+    interval, identifiable = intervals(space, x, result.jacobian, result.residual, weigh.clusters, weigh.priors)
     identifiable &= ~space.of_joints(kept)
     return Identified(space, x, interval, identifiable, pd.DataFrame(history))
 
@@ -256,6 +259,7 @@ class Weighted:
             sigma[space.of_joints(kept)] = 1e-4
         self._believed = np.flatnonzero(np.isfinite(sigma))
         self._prior = (space.spread / sigma)[self._believed]
+        self.priors = len(self._believed)
         blocks = data.clusters.max() + 1 + np.arange(len(self._believed))
         self.clusters = np.concatenate([data.clusters, blocks])
 
@@ -272,20 +276,29 @@ class Weighted:
 
 
 def intervals(
-    space: ParameterSpace, x: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, clusters: np.ndarray
+    space: ParameterSpace,
+    x: np.ndarray,
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    clusters: np.ndarray,
+    priors: int,
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return ((low, high), identifiable) of x (P,), 95 %, linearised about the result.
 
     Errors within a window are correlated, so the covariance is the cluster sandwich
-    H^-1 (sum_w g_w g_w^T) H^-1 with H = J^T J and g_w = J_w^T r_w (Liang and Zeger 1986), but no less than H^-1, what
-    rows of unit noise would give: a residual that a parameter does not touch knows nothing of it. A parameter counts
-    as identifiable when its interval is shorter than half of its value, or a tenth of its bounds.
+    H^-1 (sum_w g_w g_w^T) H^-1 with H = J^T J and g_w = J_w^T r_w (Liang and Zeger 1986). It is empty where a
+    residual does not depend on a parameter, so it counts no less than the model's own: data rows of the residual's
+    variance, and the last `priors` rows of variance 1. A parameter counts as identifiable when its interval is
+    shorter than half of its value, or a tenth of its bounds.
     """
-    hessian = jacobian.T @ jacobian + 1e-9 * np.eye(len(x))
+    rows = len(residual) - priors
+    data, prior = jacobian[:rows], jacobian[rows:]
+    believed = prior.T @ prior + 1e-9 * np.eye(len(x))  # knowing nothing is a very wide prior
+    inverse = np.linalg.inv(data.T @ data + believed)
+    own = inverse @ (np.mean(residual[:rows] ** 2) * data.T @ data + believed) @ inverse
     score = np.zeros((int(clusters.max()) + 1, len(x)))
     np.add.at(score, clusters, jacobian * residual[:, None])
-    inverse = np.linalg.inv(hessian)
-    variance = np.maximum(np.diag(inverse @ (score.T @ score) @ inverse), np.diag(inverse))
+    variance = np.maximum(np.diag(inverse @ (score.T @ score) @ inverse), np.diag(own))
     half_unit = 1.96 * np.sqrt(variance)
     u = space.to_unit(x)
     low, high = space.from_unit(u - half_unit), space.from_unit(u + half_unit)

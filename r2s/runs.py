@@ -140,8 +140,8 @@ def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
 
 def default_name(overrides: Iterable[str]) -> str:
     """Return a name made of the time and the overrides, fit for a folder."""
-    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=")))
-    readable = re.sub(r"[^A-Za-z0-9=,.+-]+", "_", typed)[:80].strip("_,")
+    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=")))
+    readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # also a value that Hydra takes unquoted
     return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
 
 

@@ -109,7 +109,7 @@ def train(
             batch["reward"] = batch["reward_terms"] @ price
             row = algo.update(batch)
             updates += 1
-        if updates % 1000 < updates_per_step:
+        if updates % 1000 < updates_per_step or updates == updates_per_step:
             _check(row, updates)
             numbers = {k: float(v) for k, v in row.items()}
             head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}

@@ -315,7 +315,7 @@ def test_searches_run_one_after_the_other(arm, truth, wrong):
         nthread=1,
     )
     cost = result.history.groupby("search", sort=False)["cost"]
-    assert list(cost.groups) == ["ga", "least_squares"]
+    assert list(cost.groups) == ["ga", "least_squares", "least_squares, reweighed"]
     assert cost.first()["least_squares"] == pytest.approx(cost.last()["ga"], rel=1e-2)
     assert cost.last()["least_squares"] < cost.last()["ga"]
 
