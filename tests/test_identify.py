@@ -120,7 +120,7 @@ def test_breakaway_edges_are_found(found, truth):
 def test_the_history_tells_what_the_search_did(found):
     """Each row has search, evaluations, cost and time; the cost of least squares never rises within a run."""
     history = found.history
-    assert set(history["search"]) == {"least_squares", "breakaway"}
+    assert set(history["search"]) == {"least_squares", "breakaway", "least_squares, reweighed"}
     assert history["seconds"].is_monotonic_increasing
     assert (history["done"] <= history["total"]).all()
     scan = np.flatnonzero(history["search"] == "breakaway")
