@@ -214,3 +214,4 @@ def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
     )
     validation = json.loads((tmp_path / "identify" / "real" / "summary.json").read_text())["validation"]
     assert np.mean(validation["torque_rmse_Nm"]) < 0.9 * np.mean(validation["nominal_torque_rmse_Nm"])
+    assert np.all(np.array(validation["torque_rmse_Nm"]) <= 1.02 * np.array(validation["nominal_torque_rmse_Nm"]))
