@@ -1,20 +1,23 @@
-"""Read a `Recording` from .csv, .npz or .parquet: one column map for all three."""
+"""Read a `Recording` from .csv, .npz, .parquet, HDF5 or a robot's own log: one column map for all of them."""
 
 import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from r2s.errors import UserError, choices, nearest
+from r2s.readers_robot import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra
 from r2s.recording import Recording, declared_torque
 
-SUFFIXES = (".csv", ".npz", ".parquet")
+HDF5 = (".h5", ".hdf5")
+SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
 DEFAULT_COLUMNS = {  # the first name that the file has
     "t": ("t",),
     "q": ("q",),
@@ -25,7 +28,6 @@ DEFAULT_COLUMNS = {  # the first name that the file has
 FRANKA_TAU = {"measured": "tau_J", "commanded": "tau_J_d"}  # looked for before tau
 OPTIONAL = ("dq", "trajectory")
 
-Table = dict[str, np.ndarray]  # column name -> (T,) or (T, n)
 Spec = str | list[str] | None
 
 
@@ -38,6 +40,9 @@ def read(
     max_gap_s: float | None = 0.05,
     period: float | None = None,
     name: str | None = None,
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    model_joints: Sequence[str] | None = None,
 ) -> Recording:
     """Read the recording in `path`, or raise a UserError: one line, the file and what is wrong with it.
 
@@ -46,16 +51,19 @@ def read(
         the default, t: t, q: q, dq: dq, tau: tau_J if measured or tau_J_d if commanded, where absent tau,
         trajectory: segment, where absent trajectory. A name for q, dq or tau is a (T, n) array, or stands for
         q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name spells
-        that out; a list names the joints one by one.
+        that out; a list names the joints one by one. In HDF5 a name is a path: robot/q.
     n_joints: expected number of joints, if known.
     max_gap_s: longer gaps in time start a new trajectory; None leaves them. Units of time are never guessed.
     period: s, see `Recording`. name: of the recording; the default is the file's.
+    topic, joints, model_joints: of a bag (.bag, .db3, .mcap or a ROS 2 bag's folder), see `bag_table`.
 
     Without dq in the file it is the central difference of q on the logged time (zero phase), each trajectory
-    by itself; without trajectory, gaps alone separate them. A file by `Recording.save` comes back as it was.
+    by itself; without trajectory, gaps alone separate them. A file by `Recording.save` comes back as it was. The
+    logs of `franka::logToCSV` and of Franka's ROS messages hold both torques: `torque` picks one.
     """
     path = Path(path).expanduser()
-    table = _load(path)
+    bag = {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints}
+    table = _load(path, bag)
     try:
         return _recording(table, torque, columns or {}, n_joints, max_gap_s, period, name or path.stem)
     except UserError as error:
@@ -72,6 +80,8 @@ def _recording(table: Table, torque, columns, n_joints, max_gap_s, period, name)
         for field, names in found.items()
         if names
     }
+    if not np.any(arrays["tau"]):  # a position-controlled or simulated arm fills the field, with nothing
+        raise UserError(f"tau ({_listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
@@ -154,9 +164,12 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
     """Say which column is missing; never suggest the other kind of torque as a mere typo."""
-    hint = nearest(name, table)
+    inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
+    nested = [key for key, last in inside.items() if last == name]
+    hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
     for other, column in FRANKA_TAU.items():
-        if field == "tau" and torque and other != torque and _match(table, field, column):
+        known = column in inside.values() or _match(table, field, column)
+        if field == "tau" and torque and other != torque and known and not nested:
             hint = f"; {column} is {other} torque"
     of = f" ({torque} torque)" if torque and field == "tau" else ""
     return UserError(
@@ -205,38 +218,52 @@ def _numbers(table: Table, name: str) -> np.ndarray:
     raise UserError(f"column '{name}' is not numeric: its type is {column.dtype}")
 
 
-def _load(path: Path) -> Table:
-    """Return all columns of the file."""
-    if path.is_dir():
-        raise UserError(f"{path} is a folder; a recording is one file ({choices(SUFFIXES)})")
+def files_of(path: str | os.PathLike) -> list[Path]:
+    """Return the files of a recording: itself, or all files of a ROS 2 bag's folder."""
+    path = Path(path).expanduser()
+    return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+
+
+def _load(path: Path, bag: Mapping[str, Any]) -> Table:
+    """Return all columns of the file; `bag` goes to `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: there is no folder {path.parent}")
         raise UserError(f"no file {path}{nearest(path.name, (p.name for p in path.parent.iterdir()))}")
+    if path.is_dir() and not is_bag(path):
+        raise UserError(f"{path} is a folder; a recording is one file ({choices(SUFFIXES)}) or a ROS 2 bag's folder")
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    if suffix not in SUFFIXES and not is_bag(path):
         raise UserError(
             f"{path}: unknown suffix '{path.suffix}'; allowed: {choices(SUFFIXES)}{nearest(suffix, SUFFIXES)}"
         )
     try:
-        if suffix == ".npz":
-            return _load_npz(path)
-        if suffix == ".csv":
-            frame = pd.read_csv(path, skipinitialspace=True, low_memory=False)
-        else:
-            frame = pd.read_parquet(path)
-        return {str(name).strip(): _column(frame[name]) for name in frame.columns}
-    except UserError:
-        raise
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        if is_bag(path):
+            return bag_table(path, **bag)
+        for key in ("topic", "joints"):
+            if bag[key] is not None:
+                raise UserError(f"data.{key}={bag[key]} is for bags ({choices(BAGS)}); leave it null for {suffix}")
+        return libfranka_table(_columns(path, suffix))
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    except (ValueError, OSError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path} cannot be read as {suffix[1:]}: {reason}") from None
+
+
+def _columns(path: Path, suffix: str) -> Table:
+    if suffix in HDF5:
+        return _load_hdf5(path)
+    if suffix == ".npz":
+        return _load_npz(path)
+    frame = pd.read_csv(path, skipinitialspace=True, low_memory=False) if suffix == ".csv" else pd.read_parquet(path)
+    return {str(name).strip(): _column(frame[name]) for name in frame.columns}
 
 
 def _load_npz(path: Path) -> Table:
     table: Table = {}
     if not zipfile.is_zipfile(path):
-        raise UserError(f"{path} is not an .npz archive (damaged, or not written by numpy.savez)")
+        raise UserError("not an .npz archive (damaged, or not written by numpy.savez)")
     with np.load(path, allow_pickle=False) as archive:
         for name in archive.files:
             try:
@@ -244,7 +271,24 @@ def _load_npz(path: Path) -> Table:
             except ValueError as error:
                 if "allow_pickle" not in str(error):
                     raise
-                raise UserError(f"{path}: '{name}' is pickled, which is never loaded; save plain arrays") from None
+                raise UserError(f"'{name}' is pickled, which is never loaded; save plain arrays") from None
+    return table
+
+
+def _load_hdf5(path: Path) -> Table:
+    """Return every dataset by its path in the file; not the images, which no column can be."""
+    try:
+        import h5py
+    except ImportError:
+        raise missing_extra("h5py", "hdf5") from None
+    table: Table = {}
+
+    def keep(name, item):
+        if isinstance(item, h5py.Dataset) and item.shape is not None and item.ndim <= 2:
+            table[name] = np.asarray(item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()])
+
+    with h5py.File(path, "r") as file:
+        file.visititems(keep)
     return table
 
 

@@ -1,0 +1,483 @@
+"""The user's own logs: bags, HDF5 and libfranka's CSV come back as what was written into them, or are refused."""
+
+import sqlite3
+import sys
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from r2s.errors import UserError
+from r2s.readers import files_of, read
+from r2s.readers_robot import choose_joints
+
+PANDA = [f"panda_joint{j}" for j in range(1, 8)]
+EPOCH = 1_700_000_000_123_456_789  # ns
+OMEGA = 2 * np.pi * 0.4  # rad/s
+STATE = "std_msgs/Header header\n" + "".join(f"float64[7] {f}\n" for f in ("q", "q_d", "dq", "{0}", "{1}"))
+ROBOT_STATE = (
+    "std_msgs/Header header\nsensor_msgs/JointState measured_joint_state\nsensor_msgs/JointState desired_joint_state"
+)
+
+
+def motion(rows=300, n=7, step=1e-3, jitter=0.3, seed=0):
+    """Return t (T,) ns from 0, and q, dq, tau_J, tau_J_d (T, n): every joint and every row differ."""
+    steps = step * np.random.default_rng(seed).uniform(1 - jitter, 1 + jitter, rows - 1) if jitter else step
+    ns = np.concatenate([[0], np.cumsum(np.round(1e9 * np.broadcast_to(steps, rows - 1)).astype(np.int64))])
+    angle = OMEGA * ns[:, None] * 1e-9 + np.arange(n)
+    q, dq = np.sin(angle), OMEGA * np.cos(angle)
+    return ns, q, dq, 10 * q + dq, 3 * dq
+
+
+def message(call, *args, **kwargs):
+    with pytest.raises(UserError) as caught:
+        call(*args, **kwargs)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+# --- bags
+
+
+class Bag:
+    """Write one bag of the given kind: 'bag' (ROS 1), 'db3' or 'mcap' (ROS 2)."""
+
+    def __init__(self, folder, kind):
+        self.ros1 = kind == "bag"
+        self.path = folder / ("log.bag" if self.ros1 else "log")
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        self.writer = Writer1(self.path) if self.ros1 else Writer2(self.path, version=9, storage_plugin=plugin)
+        self.writer.open()
+        self.topics = {}
+
+    def define(self, kind, text):
+        """Add a message type."""
+        self.store.register(get_types_from_msg(text, kind))
+
+    def header(self, ns):
+        """Return a std_msgs/Header with that stamp."""
+        seq = {"seq": 0} if self.ros1 else {}
+        stamp = self.store.types["builtin_interfaces/msg/Time"](sec=int(ns // 10**9), nanosec=int(ns % 10**9))
+        return self.store.types["std_msgs/msg/Header"](**seq, stamp=stamp, frame_id="")
+
+    def joint_state(self, ns, names, q, dq, tau):
+        """Return a sensor_msgs/JointState."""
+        make = self.store.types["sensor_msgs/msg/JointState"]
+        return make(header=self.header(ns), name=list(names), position=q, velocity=dq, effort=tau)
+
+    def write(self, topic, kind, ns, content):
+        """Add a message, received at ns."""
+        if topic not in self.topics:
+            self.topics[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        encode = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
+        self.writer.write(self.topics[topic], int(ns), encode(content, kind))
+
+    def close(self):
+        """Finish the bag and return where it is."""
+        self.writer.close()
+        return self.path
+
+
+NOTHING = np.empty(0)
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+def joint_states(folder, kind="mcap", names=PANDA, data=None, change=None, others=(), stamped=True):
+    """Write /joint_states with `names` in a new order in every message; `change` edits (k, q, dq, tau)."""
+    ns, q, dq, tau, _ = data or motion(n=len(names))
+    bag, order = Bag(folder, kind), np.random.default_rng(1)
+    for k in range(len(ns)):
+        at = order.permutation(len(names)) if others != "fixed" else np.arange(len(names))
+        values = [x[k][at] for x in (q, dq, tau)]
+        values = change(k, *values) if change else values
+        stamp = EPOCH + ns[k] if stamped else 0
+        content = bag.joint_state(stamp, [names[j] for j in at], *values)
+        received = EPOCH + (1_000_000 * k if stamped else ns[k])  # by the recorder, on a clock of its own
+        bag.write("/joint_states", JOINT_STATE, received, content)
+        if others == "gripper":
+            half = [np.full(2, 0.04)] * 3
+            bag.write("/joint_states", JOINT_STATE, received, bag.joint_state(EPOCH, ["f1", "f2"], *half))
+        elif others == "text":
+            text = bag.store.types["std_msgs/msg/String"](data="hello")
+            bag.write("/chatter", "std_msgs/msg/String", received, text)
+        elif others == "second":
+            bag.write("/arm2/joint_states", JOINT_STATE, received, content)
+    return bag.close()
+
+
+def assert_motion(recording, data, torque="measured"):
+    ns, q, dq, tau, _ = data
+    np.testing.assert_allclose(recording.t, ns * 1e-9, rtol=0, atol=1e-12)
+    for field, x in (("q", q), ("dq", dq), ("tau", tau)):
+        np.testing.assert_array_equal(getattr(recording, field), x, err_msg=field)
+    assert recording.torque == torque
+    assert recording.name == "log"
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+@pytest.mark.parametrize("others", ["", "gripper", "text"])
+def test_joint_states_come_back_in_joint_order(tmp_path, kind, others):
+    """Joint order differs from message to message; a gripper shares the topic; other topics do not matter."""
+    path = joint_states(tmp_path, kind, others=others)
+    assert_motion(read(path, torque="measured", n_joints=7), motion())
+    assert_motion(read(path, torque="commanded", n_joints=7), motion(), "commanded")
+    reverse = read(path, torque="measured", joints=PANDA[::-1], topic="/joint_states")
+    np.testing.assert_array_equal(reverse.q, motion()[1][:, ::-1])
+    if kind != "bag":  # also the file in the folder, by itself
+        (file,) = path.glob(f"*.{kind}")
+        np.testing.assert_array_equal(read(file, torque="measured", n_joints=7).q, motion()[1])
+        assert files_of(path) == sorted([file, path / "metadata.yaml"])
+    else:
+        assert files_of(path) == [path]
+
+
+def test_without_stamps_the_time_of_the_bag_counts(tmp_path):
+    assert_motion(read(joint_states(tmp_path, stamped=False), torque="measured"), motion())
+
+
+@pytest.mark.parametrize("absent", [NOTHING, np.full(7, np.nan)])
+def test_absent_velocity_is_derived_and_absent_effort_refused(tmp_path, absent):
+    """Empty (ROS 1) or NaN (ROS 2 broadcasters) both mean: this driver does not say."""
+    path = joint_states(tmp_path, change=lambda k, q, dq, tau: (q, absent, tau))
+    recording = read(path, torque="measured")
+    assert np.abs(recording.dq - motion()[2]).max() < 0.01 * OMEGA
+    (tmp_path / "b").mkdir()
+    path = joint_states(tmp_path / "b", change=lambda k, q, dq, tau: (q, dq, absent))
+    text = message(read, path, torque="measured")
+    assert text == (
+        f"{path}: the messages on '/joint_states' carry no effort; a recording needs both, position and effort"
+    )
+
+
+def test_late_messages_are_put_in_order_and_repeated_ones_dropped(tmp_path):
+    data = motion()
+    rows = np.arange(300)
+    rows[100:102] = [101, 100]
+    rows = np.insert(rows, 200, rows[200])
+    mixed = [x[rows] for x in data]
+    assert_motion(read(joint_states(tmp_path, data=mixed, others="fixed"), torque="measured"), data)
+
+
+def test_a_restarted_clock_is_refused(tmp_path):
+    """Rows of two starts must not be shuffled into one another."""
+    data = motion(step=0.02)
+    data[0][150:] -= data[0][150]
+    assert "time does not increase at row 150" in message(read, joint_states(tmp_path, data=data), torque="measured")
+
+
+def test_slow_irregular_logs_are_resampled_and_smoothed_in_phase(tmp_path):
+    """100 Hz JointState with 30 % jitter: on the 1 ms grid, and filtered there, it stays on the true motion."""
+    recording = read(joint_states(tmp_path, data=motion(rows=600, step=0.01)), torque="measured")
+    assert recording.rate_hz == pytest.approx(100, rel=0.05)
+    fine = recording.resample(1e-3)
+    truth = np.sin(OMEGA * fine.t[:, None] + np.arange(7))
+    assert fine.rate_hz == pytest.approx(1000)
+    assert np.abs(fine.q - truth).max() < OMEGA**2 * 0.013**2 / 8 * 1.01  # what a chord misses of a sine
+    middle = slice(500, -500)
+    smooth = fine.smooth(10.0)
+    assert np.abs(smooth.q - truth)[middle].max() < 2e-4  # a delay of 1 ms would miss by OMEGA * 1e-3 = 2.5e-3
+
+
+FRANKA = [("bag", "tau_J", "tau_J_d"), ("mcap", "tau_j", "tau_j_d"), ("db3", "tau_j", "tau_j_d")]
+
+
+def franka_state(folder, kind, tau_J, tau_J_d):
+    bag = Bag(folder, kind)
+    bag.define("franka_msgs/msg/FrankaState", STATE.format(tau_J, tau_J_d))
+    ns, q, dq, measured, commanded = motion(jitter=0)
+    for k in range(len(ns)):
+        torques = {tau_J: measured[k], tau_J_d: commanded[k]}
+        make = bag.store.types["franka_msgs/msg/FrankaState"]
+        content = make(header=bag.header(EPOCH + ns[k]), q=q[k], q_d=0 * q[k], dq=dq[k], **torques)
+        bag.write("/franka_states", "franka_msgs/msg/FrankaState", EPOCH + ns[k], content)
+    return bag.close()
+
+
+@pytest.mark.parametrize(("kind", "tau_J", "tau_J_d"), FRANKA)
+def test_franka_states_hold_both_torques(tmp_path, kind, tau_J, tau_J_d):
+    """tau_J is measured; tau_J_d is the command of the cycle before, so row k commands what row k + 1 logs."""
+    path = franka_state(tmp_path, kind, tau_J, tau_J_d)
+    data = motion(jitter=0)
+    assert_motion(read(path, torque="measured", n_joints=7), data)
+    commanded = read(path, torque="commanded", n_joints=7, model_joints=[f"joint{j}" for j in range(1, 8)])
+    np.testing.assert_allclose(commanded.tau[:-1], data[4][1:], rtol=0, atol=1e-9)
+    assert "name no joints: leave data.joints=null" in message(read, path, torque="measured", joints=PANDA)
+    assert "q has 7 joints (q), the robot has 6" in message(read, path, torque="measured", n_joints=6)
+
+
+def test_franka_robot_state_holds_both_torques(tmp_path):
+    bag, kind = Bag(tmp_path, "mcap"), "franka_msgs/msg/FrankaRobotState"
+    bag.define(kind, ROBOT_STATE)
+    data = motion(jitter=0)
+    ns, q, dq, tau_J, tau_J_d = data
+    names = [f"fr3_joint{j}" for j in range(1, 8)]
+    for k in range(len(ns)):
+        stamp = EPOCH + ns[k]
+        measured = bag.joint_state(0, names, q[k], dq[k], tau_J[k])
+        desired = bag.joint_state(0, names, 0 * q[k], 0 * dq[k], tau_J_d[k])
+        make = bag.store.types[kind]
+        content = make(header=bag.header(stamp), measured_joint_state=measured, desired_joint_state=desired)
+        bag.write("/state", kind, stamp, content)
+    path = bag.close()
+    assert_motion(read(path, torque="measured", n_joints=7), data)
+    np.testing.assert_allclose(read(path, torque="commanded").tau[:-1], tau_J_d[1:], rtol=0, atol=1e-9)
+
+
+def forget_definitions(path):
+    (file,) = path.glob("*.db3")
+    with sqlite3.connect(file) as connection:
+        connection.execute("DELETE FROM message_definitions")
+    connection.close()
+
+
+def test_old_ros2_bags_hold_no_definitions(tmp_path):
+    """Before Iron: JointState is known anyway, Franka's own messages are not."""
+    path = joint_states(tmp_path, "db3")
+    forget_definitions(path)
+    assert_motion(read(path, torque="measured"), motion())
+    (tmp_path / "franka").mkdir()
+    path = franka_state(tmp_path / "franka", "db3", "tau_j", "tau_j_d")
+    forget_definitions(path)
+    text = message(read, path, torque="measured")
+    assert "no definition of franka_msgs/msg/FrankaState" in text
+    assert "ros2 bag convert" in text
+
+
+@pytest.mark.parametrize(
+    ("written", "arguments", "said"),
+    [
+        (
+            {"others": "text"},
+            {"topic": "/joint_state"},
+            "no topic '/joint_state'; topics: /joint_states (sensor_msgs/JointState), /chatter (std_msgs/String); "
+            "did you mean '/joint_states'? (set data.topic)",
+        ),
+        ({"others": "text"}, {"topic": "/chatter"}, "topic '/chatter' is std_msgs/String; allowed: JointState, Fr"),
+        ({"others": "second"}, {}, "several topics hold joint states: /joint_states (sensor_msgs/JointState), /arm2"),
+        ({}, {"joints": [*PANDA[:6], "panda_jont7"]}, "'/joint_states': no joint 'panda_jont7'; joints: panda_jo"),
+        ({}, {"joints": [*PANDA[:6], "panda_jont7"]}, "; did you mean 'panda_joint7'? (set data.joints)"),
+        ({}, {"joints": PANDA[:6], "n_joints": 7}, "data.joints names 6 different joints (panda_joint1, panda_joi"),
+        ({}, {"joints": PANDA[:6], "n_joints": 7}, "it must name 7, as the robot has"),
+        ({}, {"joints": [*PANDA[:6], PANDA[0]]}, "names 6 different joints"),
+        ({}, {"joints": []}, "it must name at least one"),
+        ({"names": PANDA[:3]}, {"n_joints": 7}, "3 joints (panda_joint"),
+        ({"others": "gripper"}, {"joints": ["panda_joint1", "f1"]}, "holds all of panda_joint1, f1; they hold panda"),
+        ({}, {"torque": None}, "torque is not declared"),
+        ({}, {"columns": {"tau": "tau_J"}}, "no column 'tau_J' for tau"),
+        ({}, {"max_gap_s": 1e-4}, "most steps in time are longer than max_gap_s"),
+        (
+            {"change": lambda k, q, dq, tau: (q, dq, tau[: 6 if k == 8 else 7])},
+            {},
+            "message 8 on '/joint_states' holds 6 values of tau for 7 joints",
+        ),
+        (
+            {"change": lambda k, q, dq, tau: (q, dq, 0 * tau)},
+            {},
+            "tau (tau) is 0 in every row: this log holds no measured torque",
+        ),
+    ],
+)
+def test_a_bad_bag_is_named_in_one_line(tmp_path, written, arguments, said):
+    path = joint_states(tmp_path, data=motion(rows=20, n=len(written.get("names", PANDA))), **written)
+    text = message(read, path, **{"torque": "measured", **arguments})
+    assert text.startswith(f"{path}: ")
+    assert said in text
+
+
+def test_a_bag_without_joint_states(tmp_path):
+    bag = Bag(tmp_path, "bag")
+    bag.write("/chatter", "std_msgs/msg/String", EPOCH, bag.store.types["std_msgs/msg/String"](data="hello"))
+    path = bag.close()
+    assert message(read, path, torque="measured") == (
+        f"{path}: no topic of type JointState, FrankaRobotState, FrankaState; topics: /chatter (std_msgs/String)"
+    )
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_truncated_bag_is_refused(tmp_path, kind, share):
+    """Whether the end is missing or all but the start: one line, nothing half-read."""
+    path = joint_states(tmp_path, kind)
+    file = path if kind == "bag" else next(path.glob(f"*.{kind}"))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(share * len(whole))])
+    text = message(read, path, torque="measured")
+    assert text.startswith(f"{path}: cannot be read as a bag: ")
+
+
+def test_what_only_looks_like_a_bag(tmp_path):
+    for name in ("noise.bag", "noise.db3", "noise.mcap"):
+        (tmp_path / name).write_bytes(b"\x00\x01" * 99)
+        assert "cannot be read as a bag: " in message(read, tmp_path / name, torque="measured")
+    (tmp_path / "folder.bag").mkdir()
+    assert "is a folder; a recording is one file" in message(read, tmp_path / "folder.bag", torque="measured")
+
+
+def test_joint_names_are_told_or_known_or_numbered_or_as_they_come():
+    """The order of a message is never taken for the robot's where something better is known."""
+    shuffled = ["panda_joint2", "panda_finger_joint1", "panda_joint1", "panda_joint3"]
+    known = ["panda_joint1", "panda_joint2", "panda_joint3"]
+    assert choose_joints(shuffled, None, None, 3) == known
+    assert choose_joints([f"j{j}" for j in (10, 9, 1)], None, None, 3) == ["j1", "j9", "j10"]
+    assert choose_joints(["ur_elbow", "ur_lift", "ur_pan"], None, ["pan", "lift", "elbow"], 3) == [
+        "ur_pan",
+        "ur_lift",
+        "ur_elbow",
+    ]
+    assert choose_joints(["elbow", "pan", "grip"], None, None, 2) == ["elbow", "pan"]
+    assert choose_joints(["elbow", "pan", "grip"], ["pan", "elbow"], ["a", "b"], 2) == ["pan", "elbow"]
+    assert "say which they are" in message(choose_joints, ["elbow", "pan"], None, ["a", "b"], 2)
+    two = [f"{side}_joint{j}" for side in ("left", "right") for j in (1, 2)]
+    assert "several arms of 2 joints" in message(choose_joints, two, None, ["joint1", "joint2"], 2)
+
+
+def without(monkeypatch, *heads):
+    """Make the libraries look as if they were not installed."""
+    for name in list(sys.modules):
+        if name.split(".")[0] in heads:
+            monkeypatch.setitem(sys.modules, name, None)
+
+
+def test_missing_extras_say_what_to_install(tmp_path, monkeypatch):
+    bag, file = joint_states(tmp_path), tmp_path / "log.h5"
+    with h5py.File(file, "w") as h5:
+        h5["t"] = np.arange(20.0)
+    without(monkeypatch, "rosbags", "h5py")
+    assert message(read, bag, torque="measured") == (
+        f"{bag}: reading it needs rosbags, which is not installed: pip install 'r2s[bags]'"
+    )
+    assert message(read, file, torque="measured") == (
+        f"{file}: reading it needs h5py, which is not installed: pip install 'r2s[hdf5]'"
+    )
+
+
+# --- HDF5
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".hdf5"])
+@pytest.mark.parametrize("group", ["", "robot/arm/"])
+def test_hdf5_datasets_by_name(tmp_path, suffix, group):
+    ns, q, dq, tau, _ = motion()
+    path = tmp_path / f"log{suffix}"
+    with h5py.File(path, "w") as h5:
+        h5.create_dataset(f"{group}t", data=ns[:, None] * 1e-9)
+        h5.create_dataset(f"{group}q", data=q, compression="gzip", chunks=(50, 7))
+        for j in range(7):
+            h5[f"{group}dq_{j}"] = dq[:, j]
+        h5[f"{group}tau_J"] = tau
+        h5["camera"] = np.zeros((3, 4, 4, 3), np.uint8)
+        h5["operator"] = "someone"
+        h5["empty"] = h5py.Empty("f8")
+    columns = {field: group + name for field, name in (("t", "t"), ("q", "q"), ("dq", "dq"), ("tau", "tau_J"))}
+    assert_motion(read(path, torque="measured", columns=columns, n_joints=7), motion())
+    if not group:
+        assert_motion(read(path, torque="measured"), motion())
+    else:
+        text = message(read, path, torque="measured")
+        assert "no column 't' for t" in text
+        assert "did you mean 'robot/arm/t'? (set data.columns.t)" in text
+        wrong = message(read, path, torque="commanded", columns=columns | {"tau": None})
+        assert "no column 'tau_J_d' for tau (commanded torque)" in wrong
+        assert wrong.endswith("; tau_J is measured torque (set data.columns.tau)")
+        assert "did you mean 'robot/arm/q'?" in message(
+            read, path, torque="measured", columns=columns | {"q": "/robot/arm/q"}
+        )
+
+
+def test_hdf5_says_its_torque_and_text_is_no_column(tmp_path):
+    ns, q, dq, tau, _ = motion()
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as h5:
+        for name, x in (("t", ns * 1e-9), ("q", q), ("dq", dq), ("tau", tau)):
+            h5[name] = x
+        h5["note"] = ["a"] * 300
+        h5["torque"] = "commanded"
+    assert_motion(read(path, torque=None), motion(), "commanded")
+    assert "declares torque=commanded" in message(read, path, torque="measured")
+    text = message(read, path, torque="commanded", columns={"t": "note"})
+    assert text == f"{path}: column 'note' is not numeric: 'a' at row 0"
+
+
+def test_a_damaged_hdf5_file_is_refused(tmp_path):
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as h5:
+        h5["t"] = np.arange(9999.0)
+    whole = path.read_bytes()
+    for content in (b"", b"\x00\x01" * 99, whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        assert message(read, path, torque="measured").startswith(f"{path} cannot be read as h5: ")
+
+
+@pytest.mark.parametrize("key", ["topic", "joints"])
+def test_what_belongs_to_bags_is_not_silently_ignored(tmp_path, key):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q1\n")
+    text = message(read, path, torque="measured", **{key: "x"})
+    assert text == f"{path}: data.{key}=x is for bags (.bag, .db3, .mcap); leave it null for .csv"
+
+
+# --- CSV
+
+
+def libfranka_log(path, sep=", ", rows=300):
+    """Write what `franka::logToCSV` writes: time in ms, a state beside the command of the cycle before it."""
+    _, q, dq, tau_J, command = motion(rows + 1, jitter=0)
+    columns = {"state.q": q[1:], "state.q_d": q[1:] + 1, "state.dq": dq[1:], "state.dq_d": dq[1:] + 1}
+    columns |= {"state.tau_J": tau_J[1:], "state.tau_ext_hat_filtered": 0 * q[1:], "cmd.q_d": 0 * q[1:]}
+    columns |= {"cmd.dq_d": 0 * q[1:], "cmd.O_T_EE_d": np.zeros((rows, 16)), "cmd.O_dP_EE_d": np.zeros((rows, 6))}
+    columns |= {"cmd.tau_J_d": command[:-1]}
+    header = ",".join(sep.join(f"{name}[{i}]" for i in range(x.shape[1])) for name, x in columns.items())
+    times = 81234 + np.arange(rows)
+    lines = [f"time{sep}success_rate{sep}{header}"]
+    for k, row in enumerate(np.concatenate(list(columns.values()), axis=1)):
+        lines.append(f"{times[k]},1," + ",".join(repr(float(x)) for x in row))
+    path.write_text("\n".join(lines) + "\n")
+    return q[1:], dq[1:], tau_J[1:], command[1:]
+
+
+@pytest.mark.parametrize("sep", [", ", ","])  # older and newer versions
+def test_libfranka_logs(tmp_path, sep):
+    """Milliseconds become seconds; `torque` picks tau_J, or the command that was sent from the state of a row."""
+    path = tmp_path / "log.csv"
+    q, dq, tau_J, command = libfranka_log(path, sep)
+    columns = {"t": "t", "q": "q", "dq": "dq", "tau": None, "trajectory": None}  # as conf/data/recording.yaml has it
+    measured = read(path, torque="measured", columns=columns, n_joints=7)
+    np.testing.assert_allclose(measured.t, 81.234 + 1e-3 * np.arange(300), rtol=0, atol=1e-9)
+    for field, x in (("q", q), ("dq", dq), ("tau", tau_J)):
+        np.testing.assert_array_equal(getattr(measured, field), x)
+    commanded = read(path, torque="commanded", columns=columns)
+    np.testing.assert_allclose(commanded.tau[:-1], command[:-1], rtol=0, atol=1e-6)
+    desired = read(path, torque="measured", columns={"q": "state.q_d"})  # any other column by its own name
+    np.testing.assert_array_equal(desired.q, q + 1)
+
+
+def test_a_libfranka_log_of_position_control_holds_no_command(tmp_path):
+    path = tmp_path / "log.csv"
+    libfranka_log(path)
+    frame = pd.read_csv(path, skipinitialspace=True)
+    frame[[f"cmd.tau_J_d[{i}]" for i in range(7)]] = 0.0
+    frame.to_csv(path, index=False)
+    assert message(read, path, torque="commanded") == (
+        f"{path}: tau (tau_J_d) is 0 in every row: this log holds no commanded torque"
+    )
+    read(path, torque="measured")
+    with open(path, "a") as file:
+        file.write("cut off,here\n")
+    assert "column 't' is not numeric: 'cut off' at row 300" in message(read, path, torque="measured")
+
+
+@pytest.mark.parametrize("joint", ["{}{}", "{}_{}", "{}[{}]"])
+def test_wide_csv_from_zero(tmp_path, joint):
+    ns, q, dq, tau, _ = motion()
+    table = {"t": ns * 1e-9}
+    for name, x in (("q", q), ("dq", dq), ("tau", tau)):
+        table |= {joint.format(name, i): x[:, i] for i in range(7)}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    assert_motion(read(tmp_path / "log.csv", torque="measured", n_joints=7), motion())
