@@ -27,6 +27,7 @@ class Robot:
         tau_max: (n,) Nm. dtau_max: (n,) Nm/s.
         q_home: (n,) rad, where episodes and excitations start.
         ee_site: the site that reaches for goals.
+        mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
     """
 
@@ -40,6 +41,8 @@ class Robot:
     dtau_max: np.ndarray
     q_home: np.ndarray
     ee_site: str
+    mass: np.ndarray
+    com: np.ndarray
     inertia: np.ndarray
 
     @property
@@ -65,6 +68,7 @@ class Robot:
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         spec.nuser_jnt = user
+        spec.nuserdata = self.n if user else 0  # what friction remembers
         spec.option.timestep = dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -143,6 +147,8 @@ def load_robot(
         dtau_max=per_joint("dtau_max", dtau_max, np.ones(n)),
         q_home=home,
         ee_site=site,
+        mass=model.body_mass[model.jnt_bodyid].copy(),
+        com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1),
     )
 

@@ -8,7 +8,7 @@ from conftest import conf
 from r2s.env import ReachEnv, Task
 from r2s.errors import UserError
 from r2s.excitation import check_limits, fourier
-from r2s.parameters import nominal_dynamics, parameter_space
+from r2s.parameters import LINK, nominal_dynamics, parameter_space
 from r2s.recording import Recording
 from r2s.residual import TorqueResidual
 from r2s.robot import load_robot
@@ -70,6 +70,8 @@ def test_the_panda_is_built_of_the_published_figures(panda):
     assert (model.nq, model.nv, model.nu) == (7, 7, 0)
     masses = [4.970684, 0.646926, 3.228604, 3.587895, 1.225946, 1.666555, 0.735522]
     np.testing.assert_allclose(model.body_mass[model.jnt_bodyid], masses, atol=1e-9)
+    np.testing.assert_allclose(panda.mass, masses, atol=1e-9)
+    np.testing.assert_allclose(panda.com[[0, 6]], [[0.003875, 0.002081, -0.175], [0.010517, -0.004252, 0.061597]])
     izz = [0.009117, 0.025995, 0.01083, 0.02832, 0.008627, 0.005433, 0.004815]
     ixy = [-0.000139, -0.003925, -0.004761, 0.007796, -0.002117, 0.000109, -0.000428]
     np.testing.assert_allclose(panda.inertia[:, 2, 2], izz, atol=1e-8)
@@ -109,6 +111,8 @@ def test_the_files_limits_are_read(arm):
     np.testing.assert_allclose(arm.tau_max, [30, 20, 12])
     assert np.all((arm.q_home > arm.q_min) & (arm.q_home < arm.q_max))
     np.testing.assert_allclose(arm.inertia[1], np.diag([0.02, 0.02, 0.005]))
+    np.testing.assert_allclose(arm.mass, [2, 1.5, 0.8])
+    np.testing.assert_allclose(arm.com, [[0, 0, 0.1], [0, 0, 0.15], [0, 0, 0.1]])
 
 
 def test_the_compiled_arm_keeps_the_limits_and_drops_the_motors(arm):
@@ -146,8 +150,9 @@ def test_another_arm_goes_through_environment_and_identification(arm):
     motion = fourier(arm, duration=3.0, seed=0)
     check_limits(arm, motion)
     recording = Recording(t=motion.t, q=motion.q, dq=motion.dq, tau=np.zeros_like(motion.q), torque="measured")
-    space = parameter_space(arm, nominal, conf("config")["identify"]["bounds"])
-    assert len(space.names) == 5 * 3
+    bounds = conf("config")["identify"]["bounds"]
+    space = parameter_space(arm, nominal, {k: bounds[k] for k in ("phi1", "phi2", "offset", *LINK, "delay")})
+    assert len(space.names) == 13 * 3 + 1
     residual = TorqueResidual(arm, space, recording)
     assert np.isfinite(residual(np.stack([space.start, space.lower, space.upper]))).all()
 
