@@ -1,0 +1,290 @@
+"""Ramps on an arm of known truth give its dead zone back; on a twin, what its friction lets go at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import conf
+
+from r2s.arm import twin as hidden
+from r2s.arm.interface import ArmStopped
+from r2s.arm.ramp import MARGIN, ramp
+from r2s.arm.simulated import SimulatedArm
+from r2s.arm.twin import Twin
+from r2s.breakaway import Ramps, breakaway
+from r2s.errors import UserError
+from r2s.parameters import nominal_dynamics
+from r2s.readers import read
+from r2s.recording import Recording
+
+ELSEWHERE = np.array([0.4, 0.3, -0.4, 0.4, 0.5, 0.4, -0.5])  # rad from home
+
+
+def message(call, *args, **kwargs):
+    with pytest.raises(UserError) as caught:
+        call(*args, **kwargs)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def truth(panda):
+    return nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+
+
+@pytest.fixture(scope="module")
+def poses(panda):
+    return np.array([panda.q_home, panda.q_home + ELSEWHERE])
+
+
+class Watched:
+    """An arm whose torques come some cycles late; it keeps the time and how far it went."""
+
+    def __init__(self, arm, late=0):
+        self.arm, self.robot, self.late = arm, arm.robot, late
+        self.cycles, self.far = 0, 0.0
+
+    def move_to(self, q):  # noqa: D102
+        self.pose, self.line = np.asarray(q), [np.zeros(self.robot.n)] * (self.late + 1)
+        self.arm.move_to(q)
+        return self.read()
+
+    def read(self):  # noqa: D102
+        return replace(self.arm.read(), tau_J_d=self.line[-1])
+
+    def command(self, tau):  # noqa: D102
+        self.line = [*self.line[1:], np.array(tau)]
+        self.cycles += 1
+        self.arm.command(self.line[0])
+        self.far = max(self.far, np.abs(self.arm.read().q - self.pose).max())
+
+    def stop(self):  # noqa: D102
+        self.arm.stop()
+
+
+def simulated(panda, dynamics, seed=0, late=0):
+    return Watched(SimulatedArm(panda, dynamics, position_noise=2e-5, velocity_noise=3e-3, seed=seed), late)
+
+
+def assert_edges(found, truth):
+    error = np.abs(found.edges(truth.offset) - truth.breakaway)
+    allowed = np.maximum(0.02 * np.abs(truth.breakaway), 0.01)
+    assert (error <= allowed).all(), f"{1e3 * error} mNm"
+
+
+@pytest.fixture(scope="module")
+def recorded(panda, truth, poses):
+    arm = simulated(panda, truth)
+    return ramp(arm, poses), arm
+
+
+# --- an arm of known truth
+
+
+def test_the_dead_zone_of_the_paper_is_found(recorded, truth):
+    """All 14 edges of Table II within 2 % or 0.01 Nm, at two poses; repeatable, and fitted down to the noise."""
+    found = breakaway(recorded[0])
+    assert found.not_reached == []
+    assert_edges(found, truth)
+    assert (found.count == 2).all()
+    assert (found.spread < 0.025).all()
+    assert found.misfit.max() < 4e-5
+
+
+def test_a_late_torque_is_allowed_for(panda, truth, poses):
+    """Commands that act 3 ms late shift every edge outwards by 3 ms of ramp, unless `delay` says so."""
+    ramps = ramp(simulated(panda, truth, seed=1, late=3), poses)
+    found = breakaway(ramps, delay=3e-3)
+    assert_edges(found, truth)
+    rate = np.where(panda.tau_max > 40, 2.2, 4.0)[:, None]
+    shift = (breakaway(ramps).command - found.command) * [-1, 1]
+    np.testing.assert_allclose(shift, 3e-3 * rate + 0 * shift, atol=2e-3)
+    lagged = (breakaway(ramps, lag=3e-3).command - found.command) * [-1, 1]  # far into a ramp a lag is a delay
+    np.testing.assert_allclose(lagged, 0, atol=4e-3)
+
+
+def test_the_protocol_is_short_gentle_and_complete(recorded, panda, poses):
+    """About 5 s a pose, never near the margin; each ramp pushes one joint one way, slowly, from 0, after a rest."""
+    ramps, arm = recorded
+    assert arm.cycles * 1e-3 / len(poses) < 5.6
+    assert arm.far < 0.5 * MARGIN
+    kinds = set(zip(ramps.pose.tolist(), ramps.joint.tolist(), ramps.sign.tolist(), strict=True))
+    assert kinds == {(p, j, s) for p in range(2) for j in range(7) for s in (-1, 1)}
+    assert len(ramps.recording.stretches) == len(ramps.joint) == 28
+    for rows, j, sign in zip(ramps.recording.stretches, ramps.joint, ramps.sign, strict=True):
+        tau = ramps.recording.tau[rows]
+        pushed = sign * tau[:, j]
+        assert not np.delete(tau, j, axis=1).any()
+        assert not pushed[:10].any()
+        assert (np.diff(pushed[10:]) > 0).all()
+        assert np.diff(pushed).max() < 5e-3
+        assert sign * (ramps.recording.q[rows.stop - 1, j] - ramps.recording.q[rows.start, j]) > 5e-3
+
+
+def test_a_joint_that_does_not_move_or_does_not_rest_leaves_the_others_alone(panda, truth):
+    """Joint 5 is held by more than is tried; joint 7 slides without command, and is ramped from what stops it."""
+    breaks, offset = truth.breakaway.copy(), truth.offset.copy()
+    breaks[4], offset[6] = (-9.0, 9.0), 0.45
+    arm = simulated(panda, replace(truth, breakaway=breaks, offset=offset))
+    found = breakaway(ramp(arm, [panda.q_home], largest=np.where(panda.tau_max > 40, 3.0, 1.0)))
+    assert arm.far < MARGIN
+    assert found.not_reached == ["joint 5, positive, pose 1", "joint 5, negative, pose 1"]
+    assert np.isnan(found.command[4]).all()
+    rest = [0, 1, 2, 3, 5, 6]
+    np.testing.assert_allclose((found.edges(offset) - breaks)[rest], 0, atol=0.02)
+
+
+def test_an_arm_that_stops_says_so(panda, truth):
+    """ArmStopped goes through, and the arm has been told to stop."""
+
+    class Touchy(Watched):
+        stops = 0
+
+        def command(self, tau):
+            if self.cycles == 300:
+                raise ArmStopped("collision")
+            super().command(tau)
+
+        def stop(self):
+            self.stops += 1
+
+    arm = Touchy(SimulatedArm(panda, truth, position_noise=2e-5, velocity_noise=3e-3))
+    with pytest.raises(ArmStopped, match="collision"):
+        ramp(arm, [panda.q_home])
+    assert arm.stops == 1
+
+
+# --- the twin: another engine, bristles that creep by millirads before they let go
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_twin_lets_go_where_its_friction_does(panda, poses, seed):
+    """Level of the bristles at rest, less offset and drag: 15 % as a rule, and repeatable from pose to pose."""
+    arm = Twin(panda, seed)
+    ramps = ramp(arm, poses)
+    found = breakaway(ramps, delay=4e-3, lag=2e-3)
+    assert found.not_reached == []
+    p = arm._hidden
+    error = np.empty(len(ramps.joint))
+    for k, (j, sign, pose) in enumerate(zip(ramps.joint, ramps.sign, poses[ramps.pose], strict=True)):
+        believed, true = arm._nominal.gravity_torque(pose), arm._engine.gravity_torque(pose)
+        coulomb = p[hidden.C_POS if sign > 0 else hidden.C_NEG, j]
+        level = p[hidden.BREAK, j] * coulomb + p[hidden.MU, j] * abs(believed[j])
+        left = believed[j] - true[j] + p[hidden.OFFSET, j] + hidden._drag(p, pose, j)
+        error[k] = (sign * (found.value[k] + left) - level) / level
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert np.mean(np.abs(error) < 0.15) > 0.8
+    assert np.abs(error).max() < 0.35
+    # what changes from pose to pose is the load's friction, cable drag and what gravity compensation leaves
+    assert (found.spread < 0.3 * np.ptp(found.command, axis=1)[:, None]).all()
+    assert (found.command[:, 0] < found.command[:, 1]).all()
+
+
+# --- ramps made by hand
+
+
+def by_hand(t, onset, creep=0.0, rate=2.0, far=0.012, noise=1e-5, seed=0, flip=1, wait=0.0):
+    """One joint of three: it creeps as Dahl's until `onset` s, then accelerates by 2 + 6 (t - onset) rad/s^2."""
+    since = np.maximum(t - onset, 0)
+    x = 2 * since**2 / 2 + 6 * since**3 / 6
+    left = np.maximum(onset - t, 1e-2)
+    x += creep * (-np.log(left / onset) + np.maximum(t - onset + 1e-2, 0) / 1e-2)
+    q = np.zeros((len(t), 3))
+    q[:, 1] = 0.7 + flip * (x + noise * np.random.default_rng(seed).standard_normal(len(t)))
+    tau = np.zeros((len(t), 3))
+    tau[:, 1] = flip * rate * np.maximum(t - wait, 0)
+    keep = x < far
+    return Recording(t[keep], q[keep], np.zeros_like(q[keep]), tau[keep], "commanded")
+
+
+@pytest.mark.parametrize("flip", [1, -1])
+@pytest.mark.parametrize("hz", [250, 1000])
+@pytest.mark.parametrize("onset", [0.06, 0.301])
+def test_an_onset_that_is_known(onset, hz, flip):
+    """No arm is needed: t, q, tau of any clock; what is seen 70 ms later is traced back to within 2 ms."""
+    t = np.arange(0, 1, 1 / hz)
+    t[1:] += 0.3 / hz * np.random.default_rng(1).uniform(-1, 1, len(t) - 1)
+    ramps = Ramps(by_hand(t, onset, flip=flip), joint=1, sign=flip)
+    found = breakaway(ramps)
+    assert found.value[0] == pytest.approx(flip * 2 * onset, abs=4e-3)
+    assert found.count.tolist() == [[0, 0], [int(flip < 0), int(flip > 0)], [0, 0]]
+    early = breakaway(ramps, delay=10e-3)
+    assert flip * (found.value[0] - early.value[0]) == pytest.approx(0.02, abs=2e-3)
+
+
+def test_creep_is_not_taken_for_letting_go():
+    """2 mrad and more of creep over 0.6 s, faster and faster, shift the onset by a few percent of the ramp."""
+    t = np.arange(0, 1.5, 1e-3)
+    for creep in (2e-4, 5e-4):
+        ramps = Ramps(by_hand(t, 0.6, creep), joint=1, sign=1)
+        x = ramps.recording.q[:, 1] - ramps.recording.q[0, 1]
+        assert t[np.argmax(x > 3e-4)] < 0.5  # where a threshold would see motion
+        assert breakaway(ramps).value[0] == pytest.approx(1.2, rel=0.05)
+
+
+def test_what_does_not_move_is_listed_and_the_rest_survives():
+    t = np.arange(0, 0.4, 1e-3)
+    parts = [
+        by_hand(t, 0.2),
+        by_hand(t, 9.0),  # nothing moves
+        by_hand(t, 0.25),  # told the wrong way
+        by_hand(t, 0.21),
+        by_hand(t, 0.02, wait=0.04),  # gone before the command rises
+        by_hand(np.arange(0, 0.4, 0.02), 0.1, far=0.06),  # too few rows
+    ]
+    whole = {f: np.concatenate([getattr(p, f) for p in parts]) for f in ("t", "q", "dq", "tau")}
+    labels = np.repeat(np.arange(6), [len(p.t) for p in parts])
+    motion = Recording(**whole, torque="commanded", trajectory=labels)
+    found = breakaway(Ramps(motion, 1, [1, 1, -1, 1, 1, 1], [0, 1, 2, 3, 4, 5]), moved=3e-3)
+    assert found.not_reached == [f"joint 2, {s}, pose {p}" for p, s in ((2, "positive"), (3, "negative"))] + [
+        f"joint 2, positive, pose {p}" for p in (5, 6)
+    ]
+    np.testing.assert_allclose(found.value[[0, 3]], [0.4, 0.42], atol=4e-3)
+    assert found.count[1].tolist() == [0, 2]
+    assert found.command[1, 1] == pytest.approx(0.41, abs=3e-3)
+    assert found.spread[1, 1] == pytest.approx(0.02 / np.sqrt(2), abs=3e-3)
+    assert np.isnan(found.command[0]).all()
+    np.testing.assert_allclose(found.edges([1.0, 0.5, 0.0])[1, 1], 0.5 + found.command[1, 1])
+
+
+# --- files and mistakes
+
+
+def test_ramps_come_back_as_they_were(recorded, tmp_path):
+    ramps, path = recorded[0], tmp_path / "ramps.npz"
+    ramps.save(path)
+    again = Ramps.load(path)
+    for field in ("joint", "sign", "pose"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(ramps, field))
+    for field in ("t", "q", "dq", "tau", "trajectory"):
+        np.testing.assert_array_equal(getattr(again.recording, field), getattr(ramps.recording, field))
+        np.testing.assert_array_equal(getattr(read(path, torque="commanded"), field), getattr(ramps.recording, field))
+    assert (again.recording.torque, again.recording.name) == ("commanded", ramps.recording.name)
+    assert [p.name for p in tmp_path.iterdir()] == ["ramps.npz"]
+    assert "ends in '.csv'" in message(ramps.save, tmp_path / "ramps.csv")
+    assert "no file" in message(Ramps.load, tmp_path / "ramp.npz")
+    ramps.recording.save(tmp_path / "plain.npz")
+    (tmp_path / "noise.npz").write_bytes(b"\x00\x01" * 99)
+    for name in ("plain.npz", "noise.npz"):
+        assert "is not a file of ramps by r2s" in message(Ramps.load, tmp_path / name)
+
+
+def test_bad_input_is_named_in_one_line(panda, truth):
+    motion = by_hand(np.arange(0, 0.4, 1e-3), 0.2)
+    assert "torque is 'measured'; allowed: commanded" in message(Ramps, replace(motion, torque="measured"), 1, 1)
+    assert "joint of ramp 0 is 3, allowed 0 to 2" in message(Ramps, motion, 3, 1)
+    assert "sign of ramp 0 is 0, allowed -1 or 1" in message(Ramps, motion, 1, 0)
+    assert "joint has shape (2,); the recording has 1 trajectories" in message(Ramps, motion, [1, 1], 1)
+    ramps = Ramps(motion, 1, 1)
+    assert "delay=-0.1 must be at least 0" in message(breakaway, ramps, delay=-0.1)
+    assert "lag=nan must be" in message(breakaway, ramps, lag=np.nan)
+    assert "moved=1e-05 must be at least 0.0002" in message(breakaway, ramps, moved=1e-5)
+    arm, home = simulated(panda, truth), panda.q_home
+    assert "pose 2 at 2.85 rad, allowed -2.7473 to 2.7473" in message(ramp, arm, [home, [2.85, *home[1:]]])
+    assert "have shape (1, 3); panda has 7 joints" in message(ramp, arm, [home[:3]])
+    assert "not rows of 7 joint angles" in message(ramp, arm, [home, home[:3]])
+    assert "rate of joint 2 is -1, allowed above 0" in message(ramp, arm, [home], rate=[1, -1, 1, 1, 1, 1, 1])
+    assert "rate: 3 values for 7 joints" in message(ramp, arm, [home], rate=[1, 1, 1])
+    assert "largest of joint 5 is 20, allowed above 0 and up to 12" in message(ramp, arm, [home], largest=20)
+    assert "ramp.moved=1 rad" in message(ramp, arm, [home], moved=1)
+    assert arm.cycles == 0
