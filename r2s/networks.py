@@ -1,10 +1,16 @@
-"""The networks every algorithm shares: a normaliser, an actor, an ensemble of critics."""
+"""What every algorithm shares: a normaliser, an actor, an ensemble of critics, and the learner that holds them."""
 
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from r2s.errors import UserError
 
 
 class Normalizer(nn.Module):
@@ -24,7 +30,11 @@ class Normalizer(nn.Module):
 
 
 class Actor(nn.Module):
-    """Gaussian before tanh: observation (B, d) -> loc, scale (B, n)."""
+    """Gaussian before tanh: observation (B, d) -> loc, scale (B, n).
+
+    A deterministic algorithm uses `mode` alone and leaves the n outputs of the scale as they are: so every policy is
+    the same file, and the networks that are compared have the same size.
+    """
 
     def __init__(
         self, obs_dim: int, act_dim: int, hidden: tuple[int, ...], log_std: tuple[float, float] = (-5.0, 2.0)
@@ -42,6 +52,10 @@ class Actor(nn.Module):
         loc, log_std = self.body(observation).chunk(2, -1)
         return loc, log_std.clamp(*self.log_std).exp()
 
+    def mode(self, observation: Tensor) -> Tensor:
+        """Return the deterministic action (B, n), tanh of loc."""
+        return torch.tanh(self.body(observation).chunk(2, -1)[0])
+
 
 class Policy(nn.Module):
     """What goes onto the arm: observation in SI units (B, d) -> torque target (B, n) Nm."""
@@ -55,7 +69,7 @@ class Policy(nn.Module):
 
     def action(self, observation: Tensor) -> Tensor:
         """Return the deterministic action (B, n) in [-1, 1]."""
-        return torch.tanh(self.actor(self.normalizer(observation))[0])
+        return self.actor.mode(self.normalizer(observation))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return torque targets in Nm, without gravity, before the driver's filters and limits."""
@@ -80,12 +94,33 @@ class Critics(nn.Module):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """Return every critic's outputs (C, B, outputs)."""
-        x = torch.cat([observation, action], -1)
-        x = x.expand(len(self.weight[0]), *x.shape)
-        for w, b, gain, shift in zip(self.weight, self.bias, self.gain, self.shift, strict=False):
-            x = torch.baddbmm(b, x, w)
-            x = F.relu(torch.addcmul(shift, F.layer_norm(x, x.shape[-1:]), gain))
-        return torch.baddbmm(self.bias[-1], x, self.weight[-1])
+        return _outputs(observation, action, self.weight, self.bias, self.gain, self.shift)
+
+    def judge(self, observation: Tensor, action: Tensor, count: int | None = None) -> Tensor:
+        """Return the outputs (C, B, outputs) of the first `count` critics (None: all) for an actor's loss.
+
+        The gradient goes through the critics to the action, not into them.
+        """
+        groups = (self.weight, self.bias, self.gain, self.shift)
+        return _outputs(observation, action, *([p.detach()[:count] for p in group] for group in groups))
+
+
+def _outputs(
+    observation: Tensor,
+    action: Tensor,
+    weight: Iterable[Tensor],
+    bias: Iterable[Tensor],
+    gain: Iterable[Tensor],
+    shift: Iterable[Tensor],
+) -> Tensor:
+    *weights, last_weight = weight
+    *biases, last_bias = bias
+    x = torch.cat([observation, action], -1)
+    x = x.expand(len(last_weight), *x.shape)
+    for w, b, g, s in zip(weights, biases, gain, shift, strict=True):
+        x = torch.baddbmm(b, x, w)
+        x = F.relu(torch.addcmul(s, F.layer_norm(x, x.shape[-1:]), g))
+    return torch.baddbmm(last_bias, x, last_weight)
 
 
 def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,3 +133,135 @@ def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor,
     log_prob = -0.5 * noise.square() - scale.log() - 0.9189385332046727
     log_prob = log_prob - 2.0 * (0.6931471805599453 - x - F.softplus(-2.0 * x))
     return torch.tanh(x), log_prob.sum(-1)
+
+
+class Learner(nn.Module, ABC):
+    """What DDPG, TD3, SAC and TQC have in common; r2s/train.py needs no more than this.
+
+    The verbs are `explore`, `update`, `set_lr`, `policy`, `state_dict` and `load_state_dict`; the last two carry the
+    optimiser and the number of updates as well, so that a copy goes on bit for bit. Beside them each algorithm has
+    `losses`, which takes its random draws as arguments and is what the tests hold against TorchRL.
+
+    Args:
+        scale: mean and standard deviation (d,) that normalise an observation.
+        torque: (n,) Nm, what an action of 1 asks for; goes into the policy.
+        hidden: units per layer, of actor and critics.
+        n_critics, outputs: critics in the ensemble, numbers that each returns.
+        gamma: discount. tau: step of the target networks. lr: of Adam, for all.
+        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER): where the
+            critics hardly tell actions apart, the small one wins, instead of full torque one way and the other.
+
+    Raises:
+        UserError: a setting of the wrong kind or out of range.
+    """
+
+    torque: Tensor
+
+    def __init__(
+        self,
+        scale: tuple[Tensor, Tensor],
+        torque: Tensor,
+        *,
+        hidden: Sequence[int],
+        n_critics: int,
+        outputs: int,
+        gamma: float,
+        tau: float,
+        lr: float,
+        action_l2: float,
+    ):
+        super().__init__()
+        check_hidden(hidden)
+        check_number("n_critics", n_critics, "[1, inf)", whole=True)
+        check_number("gamma", gamma, "[0, 1)")
+        check_number("tau", tau, "(0, 1]")
+        check_number("lr", lr, "(0, 1]")
+        check_number("action_l2", action_l2, "[0, inf)")
+        obs_dim, act_dim = len(scale[0]), len(torque)
+        self.normalizer = Normalizer(*scale)
+        self.actor = Actor(obs_dim, act_dim, tuple(hidden))
+        self.critics = Critics(obs_dim, act_dim, tuple(hidden), n_critics, outputs)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.register_buffer("torque", torque.float())
+        self.gamma, self.tau, self.lr, self.action_l2 = gamma, tau, lr, action_l2
+        self.updates = 0
+        # one optimiser: a parameter without a gradient, as the actor's between delayed updates, is left alone
+        self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
+
+    @abstractmethod
+    def explore(self, observation: Tensor) -> Tensor:
+        """Return actions (B, n) in [-1, 1] to try, for observations (B, d) in SI units."""
+
+    @abstractmethod
+    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Do one gradient step on a batch in SI units; return what is worth logging, scalars, detached.
+
+        Args:
+            batch: observation, next_observation (B, d); action (B, n); reward, terminated (B,).
+        """
+
+    @property
+    def policy(self) -> Policy:
+        """The deterministic policy, sharing this learner's weights."""
+        return Policy(self.normalizer, self.actor, self.torque)
+
+    def set_lr(self, share: float) -> None:
+        """Set the learning rate to this share of its first value."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = share * self.lr
+
+    def normalized(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the batch with both observations normalised."""
+        both = {k: self.normalizer(batch[k]) for k in ("observation", "next_observation")}
+        return dict(batch) | both
+
+    def descend(self, loss: Tensor) -> None:
+        """Take one step of Adam down the gradient of `loss`."""
+        loss.backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.updates += 1
+
+    def get_extra_state(self) -> dict:
+        """Return what state_dict holds beyond parameters and buffers."""
+        return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Take over what get_extra_state returned."""
+        # torch would keep the moments it is given, and then two learners would write into them
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self.updates = state["updates"]
+
+
+@torch.no_grad()
+def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
+    """Move every parameter of `target` by the share tau towards that of `source`."""
+    torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
+
+
+def check_number(name: str, value: object, interval: str, whole: bool = False) -> None:
+    """Check one setting.
+
+    Args:
+        name, value: of the setting.
+        interval: where it may lie, written as in "(0, 1]".
+        whole: it must be an integer.
+
+    Raises:
+        UserError: it is no such number.
+    """
+    low, high = (float(end) for end in interval[1:-1].split(","))
+    if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):
+        x = float(value)  # type: ignore[arg-type]
+        if (low < x or (x == low and interval[0] == "[")) and (x < high or (x == high and interval[-1] == "]")):
+            return
+    kind = "whole number" if whole else "number"
+    raise UserError(f"{name}: {value!r} is not allowed; a {kind} in {interval} is")
+
+
+def check_hidden(hidden: object) -> None:
+    """Check the units per hidden layer; raise UserError where they are not one or more positive whole numbers."""
+    if not isinstance(hidden, Sequence) or isinstance(hidden, str) or not hidden:
+        raise UserError(f"hidden: {hidden!r} is not allowed; units per layer are, such as [128, 128]")
+    for units in hidden:
+        check_number("hidden", units, "[1, inf)", whole=True)

@@ -4,41 +4,35 @@ The losses are those of `torchrl.objectives.TQCLoss`, which the tests hold this 
 Two things are written differently because two cores have to do: the critics are one batched network instead of a
 vmap, and the quantile loss goes by prefix sums over the sorted targets instead of all pairs.
 
-An algorithm is a class with a few verbs: `explore`, `update`, `set_lr`, `policy`, `state_dict` and
-`load_state_dict`. DDPG, SAC and TD3 are to be files beside this one; r2s/train.py does not know which it runs.
+The verbs are those of r2s.networks.Learner; `losses` is what the tests compare.
 """
 
-import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from r2s.networks import Actor, Critics, Normalizer, Policy, sample_tanh
+from r2s.networks import Learner, check_number, polyak, sample_tanh
 
 
-class TQC(nn.Module):
-    """Learner of a stochastic policy.
+class TQC(Learner):
+    """Learner of a stochastic policy, with quantile critics whose highest atoms are left out.
 
     Args:
-        scale: mean and standard deviation (d,) that normalise an observation.
-        torque: (n,) Nm, what an action of 1 asks for; goes into the policy.
-        hidden: units per layer, of actor and critics.
+        scale, torque, hidden, gamma, tau, lr, action_l2: see Learner.
         n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
-        gamma: discount. tau: step of the target critics. lr: of Adam, for all. alpha_init: first temperature.
-        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER): where the
-            critics hardly tell actions apart, the small one wins, instead of full torque one way and the other.
-        target_entropy: None is minus the number of joints.
-    """
+        alpha_init: first temperature. target_entropy: None is minus the number of joints.
 
-    torque: Tensor
+    Raises:
+        UserError: a setting of the wrong kind or out of range.
+    """
 
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
         torque: Tensor,
         *,
-        hidden: tuple[int, ...] = (128, 128),
+        hidden: Sequence[int] = (128, 128),
         n_critics: int = 2,
         n_quantiles: int = 25,
         drop_per_critic: int = 2,
@@ -49,37 +43,32 @@ class TQC(nn.Module):
         target_entropy: float | None = None,
         action_l2: float = 0.0,
     ):
-        super().__init__()
-        obs_dim, act_dim = len(scale[0]), len(torque)
-        self.normalizer = Normalizer(*scale)
-        self.actor = Actor(obs_dim, act_dim, tuple(hidden))
-        self.critics = Critics(obs_dim, act_dim, tuple(hidden), n_critics, n_quantiles)
-        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
-        self.register_buffer("torque", torque.float())
-        self.gamma, self.tau = gamma, tau
+        check_number("n_quantiles", n_quantiles, "[1, inf)", whole=True)
+        check_number("drop_per_critic", drop_per_critic, f"[0, {n_quantiles})", whole=True)
+        check_number("alpha_init", alpha_init, "(0, inf)")
+        if target_entropy is not None:
+            check_number("target_entropy", target_entropy, "(-inf, inf)")
+        super().__init__(
+            scale,
+            torque,
+            hidden=hidden,
+            n_critics=n_critics,
+            outputs=n_quantiles,
+            gamma=gamma,
+            tau=tau,
+            lr=lr,
+            action_l2=action_l2,
+        )
         self.keep = n_critics * (n_quantiles - drop_per_critic)
-        self.action_l2 = action_l2
-        self.target_entropy = -float(act_dim) if target_entropy is None else target_entropy
-        self._learned = [*self.actor.parameters(), *self.critics.parameters(), self.log_alpha]
-        self.lr = lr
-        self.optimizer = torch.optim.Adam(self._learned, lr=lr, fused=True)
-
-    @property
-    def policy(self) -> Policy:
-        """The deterministic policy, sharing this learner's weights."""
-        return Policy(self.normalizer, self.actor, self.torque)
+        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
+        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
+        self.optimizer.add_param_group({"params": [self.log_alpha]})
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
         """Return sampled actions (B, n) for observations (B, d)."""
         loc, scale = self.actor(self.normalizer(observation))
         return torch.tanh(loc + scale * torch.randn_like(loc))
-
-    def set_lr(self, share: float) -> None:
-        """Set the learning rate to this share of its first value."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = share * self.lr
 
     def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """Return critic, actor and alpha losses of a batch.
@@ -99,12 +88,7 @@ class TQC(nn.Module):
         critic = QuantileHuber.apply(quantiles, target)
 
         action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
-        # the actor's gradient goes through the critics, not into them
-        for parameter in self.critics.parameters():
-            parameter.requires_grad_(False)
-        value = self.critics(batch["observation"], action).mean((0, 2))
-        for parameter in self.critics.parameters():
-            parameter.requires_grad_(True)
+        value = self.critics.judge(batch["observation"], action).mean((0, 2))
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
         return {
@@ -116,16 +100,10 @@ class TQC(nn.Module):
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
-        batch = dict(batch)
-        for key in ("observation", "next_observation"):
-            batch[key] = self.normalizer(batch[key])
-        shape = batch["action"].shape
-        out = self.losses(batch, (torch.randn(shape), torch.randn(shape)))
-        (out["loss_critic"] + out["loss_actor"] + out["loss_alpha"]).backward()
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.targets.parameters()), list(self.critics.parameters()), self.tau)
+        batch = self.normalized(batch)
+        out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
+        self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
+        polyak(self.targets, self.critics, self.tau)
         return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
 
 

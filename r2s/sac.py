@@ -1,0 +1,98 @@
+"""Soft Actor-Critic (Haarnoja et al. 2018, arXiv:1801.01290) with the automatic temperature of arXiv:1812.05905.
+
+The losses are those of `torchrl.objectives.SACLoss` without a value network and with the papers' squared error, which
+the tests hold this file to.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from r2s.networks import Learner, check_number, polyak, sample_tanh
+
+
+class SAC(Learner):
+    """Learner of a stochastic policy, with pessimistic critics.
+
+    Args:
+        scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.networks.Learner.
+        n_critics: the smallest of their values counts, for target and actor.
+        alpha_init: first temperature. target_entropy: None is minus the number of joints.
+
+    Raises:
+        UserError: a setting of the wrong kind or out of range.
+    """
+
+    def __init__(
+        self,
+        scale: tuple[Tensor, Tensor],
+        torque: Tensor,
+        *,
+        hidden: Sequence[int] = (128, 128),
+        n_critics: int = 2,
+        gamma: float = 0.95,
+        tau: float = 0.01,
+        lr: float = 5e-4,
+        alpha_init: float = 0.01,
+        target_entropy: float | None = None,
+        action_l2: float = 0.0,
+    ):
+        check_number("alpha_init", alpha_init, "(0, inf)")
+        if target_entropy is not None:
+            check_number("target_entropy", target_entropy, "(-inf, inf)")
+        super().__init__(
+            scale,
+            torque,
+            hidden=hidden,
+            n_critics=n_critics,
+            outputs=1,
+            gamma=gamma,
+            tau=tau,
+            lr=lr,
+            action_l2=action_l2,
+        )
+        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
+        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
+        self.optimizer.add_param_group({"params": [self.log_alpha]})
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """Return sampled actions (B, n) for observations (B, d)."""
+        loc, scale = self.actor(self.normalizer(observation))
+        return torch.tanh(loc + scale * torch.randn_like(loc))
+
+    def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+        """Return critic, actor and alpha losses of a batch.
+
+        Args:
+            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
+            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
+        """
+        alpha = self.log_alpha.exp().detach()
+        with torch.no_grad():
+            next_action, next_log_prob = sample_tanh(self.actor(batch["next_observation"]), noise[0])
+            next_value = self.targets(batch["next_observation"], next_action)[..., 0].min(0).values
+            live = self.gamma * (1.0 - batch["terminated"])
+            target = batch["reward"] + live * (next_value - alpha * next_log_prob)
+        values = self.critics(batch["observation"], batch["action"])[..., 0]
+        critic = (values - target).square().mean(1).sum()
+
+        action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
+        value = self.critics.judge(batch["observation"], action)[..., 0].min(0).values
+        actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
+        temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
+        return {
+            "loss_critic": critic,
+            "loss_actor": actor,
+            "loss_alpha": temperature,
+            "entropy": -log_prob.mean(),
+        }
+
+    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
+        batch = self.normalized(batch)
+        out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
+        self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
+        polyak(self.targets, self.critics, self.tau)
+        return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
