@@ -1,0 +1,162 @@
+"""The wire format of the Franka Control Interface (FCI), as far as torque control needs it.
+
+A client opens TCP port 1337, says its version and a UDP port; the robot then sends a RobotState per millisecond by
+UDP and, in a motion, takes a RobotCommand for each. Two generations are spoken here: version 5 (libfranka 0.9, the
+Panda, FER) and version 10 (libfranka 0.18 and later, the FR3). All structs are packed and little-endian. Facts: the
+public headers of libfranka-common (service_types.h, rbk_types.h), checked against both client packages.
+"""
+
+import mujoco
+import numpy as np
+
+from r2s.robot import Robot
+
+PORT = 1337  # libfranka cannot ask for another one: several robots are several addresses
+VERSIONS = (5, 10)
+HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
+CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
+MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # deviations follow, unused
+
+_SHARED = ("Connect", "Move", "StopMove")
+_SETTERS = (
+    "SetCollisionBehavior", "SetJointImpedance", "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE",
+    "SetLoad",
+)  # fmt: skip
+REQUESTS = {  # the number of a request is its place
+    5: (*_SHARED, "GetCartesianLimit", *_SETTERS, "SetFilters", "AutomaticErrorRecovery", "LoadModelLibrary"),
+    10: (*_SHARED, *_SETTERS, "AutomaticErrorRecovery", "GetRobotModel"),
+}
+MOVE_STATUS = {
+    5: {
+        "Success": 0, "MotionStarted": 1, "Preempted": 2, "NotPossible": 3, "InvalidArgument": 5,
+        "ReflexAborted": 6, "EmergencyAborted": 7,
+    },
+    10: {
+        "Success": 0, "MotionStarted": 1, "Preempted": 2, "NotPossible": 5, "InvalidArgument": 7,
+        "ReflexAborted": 8, "EmergencyAborted": 9,
+    },
+}  # fmt: skip
+DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of the other requests; a wrong version is 1, too
+
+# torque control in a Move request, and in the state while it runs; 0.9 has no "none" among motion generators
+EXTERNAL_CONTROLLER = 2
+GENERATOR_ASKED = {5: 1, 10: 4}
+GENERATOR_RUNNING = {5: 2, 10: 5}
+OTHER_CONTROLLER, NO_GENERATOR = 3, 0
+
+IDLE, MOVE_MODE, GUIDING, REFLEX, USER_STOPPED = 1, 2, 3, 4, 5  # robot_mode
+
+# places in `errors` and `reflex_reason`, of 41
+N_ERRORS = 41
+JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX = 0, 3, 6
+COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34
+
+# the FR3 allows less speed the closer a joint is to its position limit; rad/s and rad/s^2, Franka's documentation
+FR3_VELOCITY_OFFSET = np.array([0.6599, 0.2517, 0.2, 0.3533, 0.5757, 0.4878, 0.4628])
+FR3_DECELERATION = np.array([6, 2.585, 3.5, 4, 17, 5.5, 17])
+
+_STATE = (
+    ("O_T_EE", 16), ("O_T_EE_d", 16), ("F_T_EE", 16), ("EE_T_K", 16), ("F_T_NE", 16), ("NE_T_EE", 16),
+    ("m_ee", 1), ("I_ee", 9), ("F_x_Cee", 3), ("m_load", 1), ("I_load", 9), ("F_x_Cload", 3),
+    ("elbow", 2), ("elbow_d", 2), ("tau_J", 7), ("tau_J_d", 7), ("dtau_J", 7), ("q", 7), ("q_d", 7),
+    ("dq", 7), ("dq_d", 7), ("ddq_d", 7), ("joint_contact", 7), ("cartesian_contact", 6),
+    ("joint_collision", 7), ("cartesian_collision", 6), ("tau_ext_hat_filtered", 7), ("O_F_ext_hat_K", 6),
+    ("K_F_ext_hat_K", 6), ("O_dP_EE_d", 6), ("O_ddP_O", 3), ("elbow_c", 2), ("delbow_c", 2), ("ddelbow_c", 2),
+    ("O_T_EE_c", 16), ("O_dP_EE_c", 6), ("O_ddP_EE_c", 6), ("theta", 7), ("dtheta", 7),
+)  # fmt: skip
+_ACCELEROMETERS = (("accelerometer_top", 18), ("accelerometer_bottom", 18))
+
+
+def _state_type(number: str, values: tuple[tuple[str, int], ...]) -> np.dtype:
+    flags = [(name, "u1", (N_ERRORS,)) for name in ("errors", "reflex_reason")]
+    return np.dtype(
+        [("message_id", "<u8")]  # is the robot's time in ms, too
+        + [(name, number, (n,)) for name, n in values]
+        + [("motion_generator_mode", "u1"), ("controller_mode", "u1"), *flags, ("robot_mode", "u1")]
+        + [("control_command_success_rate", number)]
+    )
+
+
+STATE = {5: _state_type("<f8", _STATE), 10: _state_type("<f4", _STATE + _ACCELEROMETERS)}
+
+_MOTION = (
+    ("message_id", "<u8"), ("q_c", "<f8", (7,)), ("dq_c", "<f8", (7,)), ("O_T_EE_c", "<f8", (16,)),
+    ("O_dP_EE_c", "<f8", (6,)), ("elbow_c", "<f8", (2,)), ("valid_elbow", "?"), ("motion_generation_finished", "?"),
+    ("tau_J_d", "<f8", (7,)),
+)  # fmt: skip
+COMMAND = {5: np.dtype(list(_MOTION)), 10: np.dtype([*_MOTION, ("torque_command_finished", "?")])}
+FINISHED = {5: "motion_generation_finished", 10: "torque_command_finished"}
+
+
+def fr3_velocity_bounds(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest dq (7,) rad/s that an FR3 takes at q (7,) rad."""
+
+    def bound(room: np.ndarray) -> np.ndarray:
+        free = np.sqrt(2 * FR3_DECELERATION * np.maximum(room, 0)) - FR3_VELOCITY_OFFSET
+        return np.minimum(robot.dq_max, np.maximum(0, free))
+
+    return -bound(q - robot.q_min), bound(robot.q_max - q)
+
+
+def urdf(robot: Robot) -> str:
+    """Return the arm as URDF, without shapes and with an FR3's joint limits: what GetRobotModel answers."""
+    model = robot.model(gravity=True)
+    name = [f"link{i}" for i in range(model.nbody)]
+    parts = [f'<robot name="{robot.name}">']
+    for i in range(model.nbody):
+        parts.append(f'<link name="{name[i]}">')
+        if model.body_mass[i] > 0:
+            ixx, iyy, izz = model.body_inertia[i]
+            parts.append(
+                f'<inertial>{_origin(model.body_ipos[i], model.body_iquat[i])}<mass value="{model.body_mass[i]}"/>'
+                f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>'
+            )
+        parts.append("</link>")
+    for i in range(1, model.nbody):
+        at = int(model.body_jntadr[i])
+        kind, own = ("revolute", f"joint{at + 1}") if at >= 0 else ("fixed", f"fixed{i}")
+        parts.append(
+            f'<joint name="{own}" type="{kind}">{_origin(model.body_pos[i], model.body_quat[i])}'
+            f'<parent link="{name[model.body_parentid[i]]}"/><child link="{name[i]}"/>'
+        )
+        if at >= 0:
+            x, y, z = model.jnt_axis[at]
+            parts.append(
+                f'<axis xyz="{x} {y} {z}"/><limit lower="{robot.q_min[at]}" upper="{robot.q_max[at]}" '
+                f'velocity="{robot.dq_max[at]}" effort="{robot.tau_max[at]}"/>'
+                # not URDF, but libfranka does not connect without it
+                f'<position_based_velocity_limits velocity_offset="{FR3_VELOCITY_OFFSET[at]}" '
+                f'deceleration_limit="{FR3_DECELERATION[at]}"/>'
+            )
+        parts.append("</joint>")
+    return "".join([*parts, "</robot>"])
+
+
+def _origin(position: np.ndarray, quaternion: np.ndarray) -> str:
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    m = rotation.reshape(3, 3)
+    pitch = np.arctan2(-m[2, 0], np.hypot(m[0, 0], m[1, 0]))
+    if abs(m[2, 0]) < 1 - 1e-12:
+        roll, yaw = np.arctan2(m[2, 1], m[2, 2]), np.arctan2(m[1, 0], m[0, 0])
+    else:  # straight up or down only the sum of the two counts
+        roll, yaw = 0.0, np.arctan2(-m[0, 1], m[1, 1])
+    return f'<origin xyz="{position[0]} {position[1]} {position[2]}" rpy="{roll} {pitch} {yaw}"/>'
+
+
+class Forward:
+    """The pose of the arm's hand, as RobotState holds it."""
+
+    def __init__(self, robot: Robot):
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._site = self._model.site(robot.ee_site).id
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        """Return the homogeneous transform (16,), column by column, at q (n,) rad."""
+        self._data.qpos[:] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        pose = np.eye(4)
+        pose[:3, :3] = self._data.site_xmat[self._site].reshape(3, 3)
+        pose[:3, 3] = self._data.site_xpos[self._site]
+        return pose.T.ravel()

@@ -1,0 +1,88 @@
+"""The FR3 through pylibfranka, libfranka 0.18 and later: hardware, or the emulator in version 10.
+
+pylibfranka has neither rate limiter nor low-pass in this loop: what is commanded is what the arm gets.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.franka import Franka, connect, package, words
+from r2s.arm.interface import ArmStopped
+from r2s.robot import Robot
+
+
+class FR3(Franka):
+    """A Franka Research 3.
+
+    Args:
+        robot: its limits and nominal model.
+        address: host name or IP of the arm, or of an emulator.
+        clear: asked before a reflex is cleared, see `Franka`.
+        realtime: demand a real-time kernel and priority, as hardware deserves; the emulator does not need them.
+
+    Raises:
+        UserError: pylibfranka is missing, or nothing that speaks its version answers at the address.
+    """
+
+    def __init__(
+        self, robot: Robot, address: str, *, clear: Callable[[str], bool] | None = None, realtime: bool = False
+    ):
+        super().__init__(robot, _FR3Client(address, realtime), clear)
+
+
+class _FR3Client:
+    def __init__(self, address: str, realtime: bool):
+        self._pylibfranka = package("pylibfranka", "fr3")
+        config = self._pylibfranka.RealtimeConfig
+        config = config.kEnforce if realtime else config.kIgnore
+        self._robot = connect(lambda: self._pylibfranka.Robot(address, config), "fr3", address)
+        self._control: Any = None
+        self._last = [0.0] * 7
+
+    def idle(self) -> Any:
+        return self._ask(lambda: (self._robot.read_once(), self._robot.read_once())[1])  # the first may be old
+
+    def start(self) -> Any:
+        return self._ask(self._start)
+
+    def exchange(self, tau: np.ndarray) -> Any:
+        return self._ask(lambda: self._exchange(tau))
+
+    def finish(self) -> None:
+        if self._control is not None:
+            self._ask(self._finish)
+            self._control = None
+
+    def recover(self) -> None:
+        self._ask(self._robot.automatic_error_recovery)
+
+    def close(self) -> None:
+        self._control = self._robot = None
+
+    def _start(self) -> Any:
+        self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
+        while True:
+            state, _ = self._control.readOnce()
+            # until the arm counts commands it may not apply them, and the caller's first one shall not get lost
+            if state.control_command_success_rate > 0:
+                return state
+            self._control.writeOnce(self._pylibfranka.Torques(self._last))
+
+    def _exchange(self, tau: np.ndarray) -> Any:
+        self._last = tau.tolist()
+        self._control.writeOnce(self._pylibfranka.Torques(self._last))
+        return self._control.readOnce()[0]
+
+    def _finish(self) -> None:
+        torques = self._pylibfranka.Torques(self._last)  # a step to zero could be a reflex
+        torques.motion_finished = True
+        self._control.writeOnce(torques)
+
+    def _ask(self, question: Callable[[], Any]) -> Any:
+        try:
+            return question()
+        except Exception as error:
+            self._control = None
+            raise ArmStopped(words(error)) from error

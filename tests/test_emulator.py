@@ -1,0 +1,396 @@
+"""The clients that drive hardware, against our own FCI server; and what that server promises by itself.
+
+The clients are the real packages (panda-python, pylibfranka): a test of one that is not installed is skipped.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from importlib.util import find_spec
+
+import mujoco
+import numpy as np
+import psutil
+import pytest
+from conftest import ROOT, conf
+
+from r2s.arm import fci
+from r2s.arm.control import Control, Fault
+from r2s.arm.emulator import Emulator, main
+from r2s.arm.fr3 import FR3
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.panda import Panda
+from r2s.arm.server import listen
+from r2s.arm.twin import Twin
+from r2s.errors import UserError
+from r2s.robot import SIM_DT, load_robot
+
+CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3, 10)}
+CYCLES = 300
+BARE = 1e-4  # of tau_max: what moves an arm without friction
+SEED = 3
+FAULTS = (  # of the second server; motion 0 is undisturbed
+    Fault("late", 5, motion=1, cycles=6),
+    Fault("drop", 20, motion=1, cycles=6),
+    Fault("late", 10, motion=2, cycles=20),
+    Fault("drop", 10, motion=3, cycles=20),
+    Fault("discontinuity", 10, motion=4),
+    Fault("joint_limit", 10, motion=5),
+    Fault("estop", 10, motion=6),
+)
+
+# the clients keep real time: on a loaded machine they give up, and say so
+pytestmark = pytest.mark.slow
+
+
+class Bare:
+    """The smallest `Arm`: the nominal model in MuJoCo, which starts in no time."""
+
+    # ruff: noqa: D102
+
+    def __init__(self, robot):
+        self.robot, self._reflexes = robot, Reflexes(robot)
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self.commands = []
+        self.move_to(robot.q_home)
+
+    def move_to(self, q):
+        mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos, self._last = q, np.zeros(7)
+        return self.read()
+
+    def read(self):
+        return ArmState(0.0, self._data.qpos.copy(), self._data.qvel.copy(), self._last, self._last)
+
+    def command(self, tau):
+        self._reflexes.command(tau, self._last)
+        self.commands.append(tau)
+        self._last = self._data.qfrc_applied[:] = tau
+        mujoco.mj_step(self._model, self._data)
+        self._reflexes.state(self._data.qpos, self._data.qvel)
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return load_robot(**conf("robot/panda"))
+
+
+@pytest.fixture(scope="module")
+def servers(panda):
+    """Two equal twins behind each client's version, all started at once: {client: (address, address)}."""
+    with ExitStack() as stack, ThreadPoolExecutor() as pool:
+        emulators = {
+            (name, i): Emulator(partial(Twin, panda, SEED), version=version, faults=FAULTS)
+            for name, (package, _, version) in CLIENTS.items()
+            for i in range(2 if find_spec(package.split(".")[0]) else 0)
+        }
+        started = {key: pool.submit(stack.enter_context, emulator) for key, emulator in emulators.items()}
+        yield {name: tuple(x.result() for (other, _), x in started.items() if other == name) for name in CLIENTS}
+
+
+@pytest.fixture(params=CLIENTS)
+def client(request):
+    """Each client that is installed: its name, its arm and its version."""
+    package, arm, version = CLIENTS[request.param]
+    pytest.importorskip(package)
+    return request.param, arm, version
+
+
+def drive(arm, cycles, share=0.02, pause=lambda k: None):
+    """Command a slow wave, a share of tau_max; return t, q, dq, tau_J and tau_J_d after each cycle, (cycles, 29)."""
+    rows = []
+    for k in range(cycles):
+        pause(k)
+        arm.command(share * arm.robot.tau_max * np.sin(2 * np.pi * (k + 1) * SIM_DT))
+        s = arm.read()
+        rows.append(np.concatenate([[s.t], s.q, s.dq, s.tau_J, s.tau_J_d]))
+    return np.array(rows)
+
+
+def test_a_motion_is_bit_identical_and_the_arms_own(client, servers, panda):
+    """0.3 s in lock-step twice, once with a client that dawdles, and a third time without any wire."""
+    name, make, version = client
+    motions = []
+    for address, dawdle in zip(servers[name], (0.0, 0.03), strict=True):
+        arm = make(panda, address)
+        arm.move_to(panda.q_home)  # it is there
+        motions.append(drive(arm, CYCLES, pause=lambda k, s=dawdle: time.sleep(s) if k % 50 == 0 else None))
+        arm.stop()
+        arm.close()
+    assert np.array_equal(*motions)
+    twin = Twin(panda, SEED)
+    twin.move_to(panda.q_home)
+    direct = drive(twin, CYCLES)
+    if version == 10:  # its states have single precision
+        direct[:, 1:] = direct[:, 1:].astype(np.float32)
+    assert np.array_equal(motions[0], direct)
+
+
+def test_every_fault_is_a_stop_with_a_name(client, servers, panda):
+    """A few lost packets are borne; each fault ends the motion with libfranka's reason, and can be cleared."""
+    name, make, _ = client
+    asked = []
+    arm = make(panda, servers[name][1], clear=lambda reason: asked.append(reason) is None)
+    here = arm.read().q
+    arm.move_to(here)
+    seen = drive(arm, 60)
+    steps = np.diff(seen[:, 0])
+    assert np.flatnonzero(steps > 1.5 * SIM_DT).tolist() == [18]  # row 18 has the state of cycle 19
+    assert steps[18] == pytest.approx(7 * SIM_DT)  # six states were lost
+    held = (seen[1:, 22:] == seen[:-1, 22:]).all(axis=1)
+    assert np.flatnonzero(held).tolist() == [4, 5, 6, 7, 8, 9]  # six answers came too late
+    reasons = [
+        "communication_constraints_violation", "communication_constraints_violation",
+        "controller_torque_discontinuity", "joint_position_limits_violation",
+    ]  # fmt: skip
+    for reason in reasons:
+        arm.move_to(arm.read().q)
+        with pytest.raises(ArmStopped, match=f"reflex.*{reason}"):
+            drive(arm, 60)
+        assert arm.read().t <= 31 * SIM_DT
+        with pytest.raises(ArmStopped, match=f"the arm is stopped: .*{reason}"):
+            arm.command(np.zeros(7))
+    arm.move_to(arm.read().q)
+    assert [r for r in reasons if not any(r in line for line in asked)] == []
+    with pytest.raises(ArmStopped, match=r"User Stop|user stop|emergency"):
+        drive(arm, 60)
+    with pytest.raises(ArmStopped, match="user stopped"):
+        arm.move_to(here)
+    assert len(asked) == len(reasons)
+    arm.close()
+
+
+def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
+    """Without consent `move_to` refuses; what the arm would not take is refused before it is sent."""
+    _, make, version = client
+    with Emulator(partial(Bare, panda), version=version, faults=[Fault("joint_limit", 3)]) as address:
+        arm = make(panda, address)
+        arm.move_to(panda.q_home)
+        with pytest.raises(ArmStopped, match="joint_position_limits_violation"):
+            drive(arm, 10, BARE)
+        with pytest.raises(ArmStopped, match=r"nobody cleared that: .*joint_position_limits_violation"):
+            arm.move_to(panda.q_home)
+        arm.close()
+        arm = make(panda, address, clear=lambda reason: True)  # the reflex outlives the connection
+        target = panda.q_home + np.array([0, 0, 0, 0, 0, 0, 0.05])
+        assert np.abs(arm.move_to(target).q - target).max() < 2e-3
+        for bad, reason in ((np.full(7, np.nan), "nan, must be finite"), (np.full(7, 2.0), r"steps by \+2.000 Nm")):
+            arm.move_to(arm.read().q)
+            drive(arm, 2, BARE)
+            with pytest.raises(ArmStopped, match=reason):
+                arm.command(bad)
+        assert np.abs(arm.read().dq).max() < 0.05  # it was brought to rest
+        with pytest.raises(ArmStopped, match="joint 2: position 3"):
+            arm.move_to(np.array([0, 3, 0, -2, 0, 1, 0]))
+        arm.close()
+
+
+def test_real_time_does_not_wait(client, panda):
+    """At 1 kHz a client that stalls loses its motion; a machine that stalls a little does not."""
+    _, make, version = client
+    with Emulator(partial(Bare, panda), version=version, realtime=True, patience=400) as address:
+        arm = make(panda, address, clear=lambda reason: True)
+        arm.move_to(panda.q_home)
+        drive(arm, 200, BARE)
+        arm.stop()
+        assert arm.read().q == pytest.approx(panda.q_home, abs=0.1)
+        arm.move_to(arm.read().q)
+        drive(arm, 10, BARE)
+        time.sleep(0.6)
+        with pytest.raises(ArmStopped, match="communication_constraints_violation"):
+            drive(arm, 500, BARE)
+        arm.close()
+
+
+def test_the_other_robot_and_nobody(client, servers, panda):
+    """A wrong version, and an address where nothing answers, give one line with libfranka's reason."""
+    name, make, version = client
+    other = 15 - version
+    for address in servers["fr3" if name == "panda" else "panda"]:
+        with pytest.raises(UserError, match=rf"arm={name}: .*version:? {other}") as wrong:
+            make(panda, address)
+        assert "\n" not in str(wrong.value)
+    with pytest.raises(UserError, match=f"arm={name}: no connection to 127.1.2.3: libfranka") as nobody:
+        make(panda, "127.1.2.3")
+    assert "\n" not in str(nobody.value)
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_a_missing_package_is_named(name, panda, monkeypatch):
+    """Without its client package an adapter says which extra to install."""
+    package, make, _ = CLIENTS[name]
+    for module in (package, package.split(".")[0]):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UserError, match=rf"arm={name} needs the package .*r2s\[{name}\]"):
+        make(panda, "127.0.0.1")
+
+
+def alive(process):
+    """Return whether a process runs; one that nobody has buried does not."""
+    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+
+
+def test_the_process_dies_with_its_parent(tmp_path):
+    """Even a parent that is killed leaves no server behind."""
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, sys, time\n"
+        "from functools import partial\n"
+        "from test_emulator import Bare, Emulator, conf, load_robot\n"
+        "if __name__ == '__main__':\n"
+        "    emulator = Emulator(partial(Bare, load_robot(**conf('robot/panda'))), version=5)\n"
+        "    emulator.__enter__()\n"
+        "    print(emulator._process.pid, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True, env=env) as parent:
+        assert parent.stdout is not None
+        child = psutil.Process(int(parent.stdout.readline()))
+        assert alive(child)
+        parent.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 5
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(child)
+
+
+def test_what_the_emulator_does_not_speak(panda):
+    """A wrong version, address or fault is one line; a free address is found, a taken one is said."""
+    with pytest.raises(UserError, match="version 5, 10, not 7"):
+        Emulator(partial(Bare, panda), version=7)
+    with pytest.raises(UserError, match=r"'192.168.0.1' must be a loopback one"):
+        Emulator(partial(Bare, panda), version=5, address="192.168.0.1")
+    with pytest.raises(UserError, match=r"fault 'e-stop': allowed are .*; did you mean 'estop'"):
+        Fault("e-stop", 3)
+    with pytest.raises(UserError, match="cycle=-1"):
+        Fault("late", -1)
+    with listen() as one, listen() as other:
+        assert one.getsockname()[0] != other.getsockname()[0]
+        taken = one.getsockname()[0]
+        emulator = Emulator(partial(Bare, panda), version=5, address=taken)
+        with pytest.raises(UserError, match=f"port 1337 is not free on {taken}"):
+            emulator.__enter__()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--address", "10.0.0.1"], "emulator: address '10.0.0.1' must be a loopback one"),
+        (["--fault", "drop", "soon"], "--fault drop soon: it is KIND CYCLE"),
+        (["--fault", "late"], "--fault late: it is KIND CYCLE"),
+        (["--robot", "no.yaml"], "--robot no.yaml: No such file"),
+    ],
+)
+def test_by_hand_a_mistake_is_one_line(arguments, line, capsys):
+    """`python -m r2s.arm.emulator` says what is wrong and exits with 2."""
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(line)
+    assert said.count("\n") == 1
+
+
+def test_layout_of_the_wire():
+    """Sizes and places are those that both clients were seen to accept."""
+    for version, size, command, q, tau, mode in ((5, 2373, 370, 1184, 1016, 2364), (10, 1377, 371, 596, 512, 1372)):
+        state = fci.STATE[version]
+        assert (state.itemsize, fci.COMMAND[version].itemsize) == (size, command)
+        assert [state.fields[name][1] for name in ("q", "tau_J", "robot_mode")] == [q, tau, mode]
+    assert [fci.REQUESTS[5].index(name) for name in ("SetLoad", "LoadModelLibrary")] == [10, 13]
+    assert [fci.REQUESTS[10].index(name) for name in ("SetLoad", "GetRobotModel")] == [9, 11]
+
+
+def test_the_model_that_is_served_is_the_arm(panda):
+    """The URDF that a client of version 10 gets has the arm's kinematics and inertia."""
+    served = mujoco.MjModel.from_xml_string(fci.urdf(panda))
+    ours = panda.model(gravity=True)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = rng.uniform(panda.q_min, panda.q_max)
+        mass, gravity = [], []
+        for model in (served, ours):
+            data = mujoco.MjData(model)
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            full = np.empty((7, 7))
+            mujoco.mj_fullM(model, data, full)
+            mass.append(full - np.diag(model.dof_armature))
+            gravity.append(data.qfrc_bias.copy())
+        assert np.abs(mass[0] - mass[1]).max() < 1e-9
+        assert np.abs(gravity[0] - gravity[1]).max() < 1e-9
+
+
+def begun(robot, version=5):
+    """Return a Control in its first motion, and its arm."""
+    arm = Bare(robot)
+    control = Control(arm, version)
+    control.begin()
+    control.first_answer()
+    return control, arm
+
+
+def near_limit(robot, room):
+    """Return a robot that starts `room` rad before the upper limit of its last joint."""
+    return replace(robot, q_home=np.array([0, 0, 0, -2, 0, 1, robot.q_max[6] - room]))
+
+
+@pytest.mark.parametrize(
+    ("place", "torque"),
+    [
+        (fci.TORQUE_DISCONTINUITY, lambda k: 1.4),
+        (fci.TORQUE_RANGE, lambda k: 0.9 * k),
+        (fci.JOINT_VELOCITY, lambda k: -0.5),
+        (fci.JOINT_POSITION_LIMITS, lambda k: 0.02),
+    ],
+)
+def test_reflexes_have_libfrankas_names(place, torque, panda):
+    """Whichever of its limits an arm names, the error has the place that libfranka gives it; and can be cleared."""
+    control, _ = begun(replace(near_limit(panda, 0.005), tau_max=np.full(7, 1.5)))
+    for k in range(200):
+        if control.running:
+            control.cycle(torque(k) * np.eye(7)[6])
+    assert np.flatnonzero(control.state["errors"]).tolist() == [place]
+    assert np.flatnonzero(control.state["reflex_reason"]).tolist() == [place]
+    assert control.state["robot_mode"] == fci.REFLEX
+    assert not control.can_move
+    assert control.recover()
+    assert control.can_move
+    assert not control.state["errors"].any()
+
+
+def test_an_fr3_brakes_before_its_limits(panda):
+    """Version 10 refuses a speed near a position limit that version 5 takes."""
+    for version, goes_on in ((5, True), (10, False)):
+        control, _ = begun(near_limit(panda, 0.02), version)
+        for _ in range(50):
+            if control.running:
+                control.cycle(0.05 * np.eye(7)[6])
+        assert control.running == goes_on
+    assert np.flatnonzero(control.state["errors"]).tolist() == [fci.JOINT_VELOCITY]
+
+
+def test_a_missed_answer_repeats_the_last_torque(panda):
+    """19 in a row are borne with the last torque, the 20th ends the motion."""
+    control, arm = begun(panda)
+    control.cycle(np.full(7, 0.5))
+    for _ in range(19):
+        control.cycle(None)
+    assert control.running
+    assert np.array_equal(arm.commands, np.full((20, 7), 0.5))
+    control.cycle(np.full(7, 0.6))
+    for _ in range(20):
+        control.cycle(None)
+    assert not control.running
+    assert "20 cycles in a row" in control.stopped_by
