@@ -1,4 +1,4 @@
-"""The driver's torque path, one millisecond at a time: low-pass, clip, rate limit; and its soft limits.
+"""The torque path, one millisecond at a time: the driver's low-pass, clip and rate limit, then the motors' delay.
 
 Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. The soft
 limits need feedback every millisecond: in simulation they act inside the physics step (r2s/friction.py), on an arm
@@ -91,4 +91,56 @@ class Actuation:
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
         _condition(target, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
+        return out
+
+
+MAX_DELAY = 0.02  # s, the longest pure delay that is kept in mind
+
+
+@njit(cache=True)
+def _feel(tau, delay, lag, steps, line, motor, out):
+    """Delay each arm's commands by `delay` steps (fractions interpolate), then lag them by a first order."""
+    history = line.shape[1]
+    for i in range(tau.shape[0]):
+        whole = int(delay[i])
+        late = delay[i] - whole
+        for k in range(steps):
+            newer, older = k - whole, k - whole - 1
+            for j in range(tau.shape[2]):
+                a = tau[i, newer, j] if newer >= 0 else line[i, history + newer, j]
+                b = tau[i, older, j] if older >= 0 else line[i, history + older, j]
+                motor[i, j] += lag[i] * ((1.0 - late) * a + late * b - motor[i, j])
+                out[i, k, j] = motor[i, j]
+        for k in range(history):
+            from_tau = steps - history + k
+            for j in range(tau.shape[2]):
+                line[i, k, j] = tau[i, from_tau, j] if from_tau >= 0 else line[i, k + steps, j]
+
+
+class Motors:
+    """What the joints of m arms feel of their commands: a pure delay, then a first-order lag; keeps both states."""
+
+    def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
+        self._line, self._motor = np.zeros((m, int(MAX_DELAY / SIM_DT) + 2, n)), np.zeros((m, n))
+        self._delay, self._gain = np.zeros(m), np.ones(m)
+        self.set(delay, lag)
+
+    def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
+        """Give the arms `ids` (all by default) delay and lag, s, one for all of them or (m,)."""
+        at = slice(None) if ids is None else ids
+        self._delay[at] = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT)
+        self._gain[at] = -np.expm1(-SIM_DT / np.maximum(lag, 1e-9))
+
+    def reset(self, ids: np.ndarray | None = None, tau: np.ndarray | float = 0.0) -> None:
+        """Let the arms `ids` (all by default) have felt the constant torque `tau` (m, n) Nm for long."""
+        at = slice(None) if ids is None else ids
+        self._motor[at] = tau
+        self._line[at] = np.asarray(tau)[..., None, :] if np.ndim(tau) else tau
+
+    def __call__(self, tau: np.ndarray) -> np.ndarray:
+        """Return (m, nstep, n) Nm at the joints for commands (m, nstep, n) Nm, one per ms."""
+        if not self._delay.any() and (self._gain == 1.0).all():
+            return tau
+        out = np.empty(tau.shape)
+        _feel(tau, self._delay, self._gain, tau.shape[1], self._line, self._motor, out)
         return out

@@ -1,7 +1,7 @@
 """The task: reach a point with joint torques. A batch-locked TorchRL environment on one Simulator.
 
 A step, for all arms at once: action -> target torque (fraction of the limits) -> low-pass, clip, rate limit each
-ms -> physics with soft limits at 1 kHz for one control period -> kinematics -> observation, reward
+ms -> delay and lag -> physics with soft limits at 1 kHz for one control period -> kinematics -> observation, reward
 terms, truncation. Episodes never terminate, they are cut off (`truncated`): values bootstrap through their end.
 """
 
@@ -16,7 +16,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s import rewards
-from r2s.actuation import Actuation, SoftLimits
+from r2s.actuation import Actuation, Motors, SoftLimits
 from r2s.errors import UserError
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
@@ -169,6 +169,7 @@ class ReachEnv(EnvBase):
         self.sim = Simulator(robot, draw(self.rng, nsim), nsim, nthread)
         self.sim.set_soft_limits(SoftLimits.of(robot, task.torque(robot)))
         self.actuation = Actuation(robot, nsim, cutoff_hz=task.cutoff_hz)
+        self.motors = Motors(nsim, robot.n)
         self.weights = rewards.PAPER
         self._torque = task.torque(robot)
         self._stagger = stagger
@@ -193,6 +194,7 @@ class ReachEnv(EnvBase):
         at = slice(None) if ids is None else ids
         self.sim.reset(q, np.zeros_like(q), ids)
         self.actuation.reset(ids)
+        self.motors.reset(ids)
         self.goal[at], self._dq[at], self._count[at] = goal, 0.0, 0
         self._distance0[at] = np.maximum(np.linalg.norm(goal - self.sim.ee[at], axis=-1), 1e-3)
 
@@ -200,7 +202,9 @@ class ReachEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         ids = np.arange(self.sim.nsim) if mask is None else np.flatnonzero(mask.numpy().reshape(-1))
         if len(ids):
-            self.sim.set_dynamics(self.draw(self.rng, len(ids)), ids)
+            drawn = self.draw(self.rng, len(ids))
+            self.sim.set_dynamics(drawn, ids)
+            self.motors.set(drawn.delay, drawn.lag, ids)
             spread = self.task.start_spread
             q = self.robot.q_home + self.rng.uniform(-spread, spread, (len(ids), self.robot.n))
             self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
@@ -231,7 +235,8 @@ class ReachEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].numpy().astype(np.float64)
-        self.sim.rollout(self.actuation(np.clip(action, -1.0, 1.0) * self._torque, self.task.substeps))
+        command = self.actuation(np.clip(action, -1.0, 1.0) * self._torque, self.task.substeps)
+        self.sim.rollout(self.motors(command))
         self.sim.kinematics()
         dq = self.sim.dq.copy()
         ddq = (dq - self._dq) * self.task.ctrl_hz

@@ -1,27 +1,39 @@
-"""Joint friction: the paper's sigmoid (eq. 5), its breakaway dead zone (eq. 6) and torque offsets.
+"""Joint friction: three families of one interface, breakaway (eq. 6), offsets, and what gravity compensation misses.
 
-Two forms of one law. `friction_torque`, `friction_slope` and `passive_torque` are NumPy, for readers and as the
-tests' oracle. `install()` puts the same law into MuJoCo as a native passive force that reads its parameters from
-`jnt_user`, so that `mujoco.batch.Batch` gives every simulation its own arm at full speed. The same callback holds the
-soft limits of the driver (r2s/actuation.py), which need feedback every millisecond, too.
+Two forms of one law. `Family.torque`, `Family.slope` and `passive_torque` are NumPy, for readers and as the tests'
+oracle. `install()` puts the same law into MuJoCo as a native passive force that reads its parameters from `jnt_user`,
+so that `mujoco.batch.Batch` gives every simulation its own arm at full speed. The same callback holds the soft limits
+of the driver (r2s/actuation.py), which need feedback every millisecond, too.
 
-The native force is linearly implicit. With D = d tau_f / dv at the current velocity it adds D v - tau_f to
+The native force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
 qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D: exact to first order, and stable
 where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
 """
 
 import ctypes
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import mujoco
 import numpy as np
+from numba import njit
+
+from r2s.errors import UserError, choices, nearest
+
+WIDTH_DQ = 0.01  # rad/s, over which the sign of Coulomb friction turns: inside the dead zone
+GRAVITY = 9.81  # m/s^2, of an upright base
+PHI = 6  # most parameters of a family
+MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
 
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
-MARK, PHI1, PHI2, PHI3, OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(9)
-Q_LOW, Q_HIGH, Q_GAIN, DQ_SOFT, DQ_GAIN = range(9, 14)  # the driver's soft limits; gains of 0: none
-WIDTH = 14
-MARKER = 7_202_019.0
+MARK, FAMILY, P1 = range(3)
+OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
+MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
+Q_LOW, Q_HIGH, Q_GAIN, DQ_SOFT, DQ_GAIN = range(MOMENT + 3, MOMENT + 8)  # soft limits; gains of 0: none
+WIDTH = DQ_GAIN + 1
+MARKER = 7_202_020.0
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -30,30 +42,114 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
     return np.where(x >= 0, 1.0, e) / (1.0 + e)
 
 
-def friction_torque(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Return the dynamic friction torque of eq. (5), Nm; zero at rest, positive for positive velocity.
+@dataclass(frozen=True)
+class Family:
+    """A friction law of one joint with K parameters; `code` is what the native form calls it.
+
+    sigmoid, eq. (5) of the paper and a viscous term that may be left out (K = 3):
+        tau_f = phi1 (s(phi2 (v + phi3)) - s(phi2 phi3)) + viscous v,  s the logistic function
+    coulomb, level and viscous term, asymmetric:
+        tau_f = coulomb (1 +- asymmetry) tanh(v / 0.01) + viscous v,  + for v > 0
+    stribeck, falling from rest over stribeck_velocity:
+        the same with coulomb (1 + rise exp(-(v / stribeck_velocity)^2)) as its level
+    bristle, Stribeck's with a memory (Dahl 1968; LuGre without its own damping term): z in place of the tanh,
+        dz/dt = (v - |v| z) / presliding: the sign turns over a distance, and a joint at rest is held by a spring.
+        It needs no dead zone: what it holds is its level at rest.
+    """
+
+    name: str
+    code: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+    def torque(self, dq: np.ndarray, phi: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
+        """Return the friction torque, Nm; zero at rest, positive for positive velocity.
+
+        Args:
+            dq: (..., n) rad/s.
+            phi: (..., n, K), in the order of `names`.
+            turn: (..., n), in place of tanh(v / 0.01) where it is known better (`presliding`); the sigmoid has none.
+        """
+        p = [phi[..., i] for i in range(phi.shape[-1])]
+        if self.name == "sigmoid":
+            viscous = p[3] * dq if len(p) > 3 else 0.0
+            return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + viscous
+        turn = np.tanh(dq / WIDTH_DQ) if turn is None else turn
+        level = p[0] * (1 + np.sign(turn) * p[1])
+        if self.name in ("stribeck", "bristle"):
+            level = level * (1 + p[3] * np.exp(-((dq / p[4]) ** 2)))
+        return level * turn + p[2] * dq
+
+    def slope(self, dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
+        """Return d torque / d dq, Nm s/rad, for the arguments of `torque`."""
+        p = [phi[..., i] for i in range(phi.shape[-1])]
+        if self.name == "sigmoid":
+            s = sigmoid(p[1] * (dq + p[2]))
+            return p[0] * p[1] * s * (1.0 - s) + (p[3] if len(p) > 3 else 0.0)
+        turn = np.tanh(dq / WIDTH_DQ)
+        level, fall = p[0] * (1 + np.sign(dq) * p[1]), np.zeros_like(dq)
+        if self.name in ("stribeck", "bristle"):
+            bump = p[3] * np.exp(-((dq / p[4]) ** 2))
+            level, fall = level * (1 + bump), level * bump * -2 * dq / p[4] ** 2
+        return level * (1 - turn**2) / WIDTH_DQ + fall * turn + p[2]
+
+    def level(self, phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
+        """Return (..., n) Nm: the mean magnitude of friction at plus and minus `dq_max` (..., n) rad/s."""
+        return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
+
+    def like(self, other: "Family", phi: np.ndarray) -> np.ndarray:
+        """Return (..., n, K) parameters of this family with the level at 1 rad/s of `other` (..., n, K')."""
+        if other == self:
+            return phi
+        one = np.ones(phi.shape[:-1])
+        level, zero = other.level(phi, one), np.zeros(phi.shape[:-1])
+        if self.name == "sigmoid":
+            return np.stack([2 * level, 20 * one, zero], -1)
+        phi = np.stack([level, zero, zero, 0.1 * one, 0.1 * one, 1e-3 * one], -1)
+        return phi[..., : len(self.names)]
+
+
+@njit(cache=True)
+def presliding(dq: np.ndarray, dt: float, distance: float) -> np.ndarray:
+    """Return (T, n) in [-1, 1]: the sign of friction where it turns over a distance, not over a velocity.
+
+    Dahl 1968: dz/dt = (v - |v| z) / distance, stepped exactly, z = 0 at the start.
 
     Args:
-        dq: (..., n) rad/s.
-        phi: (..., n, 3): phi1 Nm, phi2 s/rad, phi3 rad/s.
+        dq: (T, n) rad/s, dt s apart. distance: rad; about 1 mrad on a Panda.
     """
-    phi1, phi2, phi3 = phi[..., 0], phi[..., 1], phi[..., 2]
-    return phi1 * (sigmoid(phi2 * (dq + phi3)) - sigmoid(phi2 * phi3))
+    z = np.zeros(dq.shape[1])
+    out = np.empty_like(dq)
+    for k in range(len(dq)):
+        for j in range(len(z)):
+            s = 1.0 if dq[k, j] > 0 else -1.0
+            z[j] = s + (z[j] - s) * np.exp(-abs(dq[k, j]) * dt / distance)
+            out[k, j] = z[j]
+    return out
 
 
-def friction_slope(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Return d friction_torque / d dq, Nm s/rad, for the arguments of `friction_torque`."""
-    s = sigmoid(phi[..., 1] * (dq + phi[..., 2]))
-    return phi[..., 0] * phi[..., 1] * s * (1.0 - s)
+SIGMOID = Family("sigmoid", 0, ("phi1", "phi2", "phi3", "viscous"), ("Nm", "s/rad", "rad/s", "Nm s/rad"))
+COULOMB = Family("coulomb", 1, ("coulomb", "asymmetry", "viscous"), ("Nm", "1", "Nm s/rad"))
+STRIBECK = Family(
+    "stribeck",
+    2,
+    ("coulomb", "asymmetry", "viscous", "rise", "stribeck_velocity"),
+    ("Nm", "1", "Nm s/rad", "1", "rad/s"),
+)
+BRISTLE = Family("bristle", 3, (*STRIBECK.names, "presliding"), (*STRIBECK.units, "rad"))
+FAMILIES = (SIGMOID, COULOMB, STRIBECK, BRISTLE)
 
 
-def friction_level(phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
-    """Return (..., n) Nm: the mean magnitude of friction at plus and minus `dq_max` (..., n) rad/s."""
-    return 0.5 * (friction_torque(dq_max, phi) - friction_torque(-dq_max, phi))
+def family(name: str) -> Family:
+    """Return the family of that name; UserError if there is none."""
+    names = [f.name for f in FAMILIES]
+    if name not in names:
+        raise UserError(f"friction.family: no family '{name}'; allowed: {choices(names)}{nearest(str(name), names)}")
+    return FAMILIES[names.index(name)]
 
 
 def passive_torque(
-    dq: np.ndarray, tau: np.ndarray, phi: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float
+    dq: np.ndarray, tau: np.ndarray, friction: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float
 ) -> np.ndarray:
     """Return what the joints feel beside the command `tau`, Nm: offset - friction, or the dead zone's hold.
 
@@ -61,36 +157,49 @@ def passive_torque(
     the action is nullified (the joint feels neither command nor offset).
 
     Args:
-        dq, tau, offset: (..., n) rad/s, Nm, Nm.
-        phi: (..., n, 3).
+        dq, tau: (..., n) rad/s, Nm. friction: (..., n) Nm, of a family at dq.
+        offset: (..., n) Nm, whatever else pulls: drag and gravity error included.
         breakaway: (..., n, 2) Nm, negative and positive.
         dq_min: rad/s.
     """
     drive = tau + offset
     held = (np.abs(dq) < dq_min) & (drive > breakaway[..., 0]) & (drive < breakaway[..., 1])
-    return np.where(held, -tau, offset) - friction_torque(dq, phi)
-
-
-def pack(
-    phi: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float, damping: np.ndarray
-) -> np.ndarray:
-    """Return the first columns of `jnt_user`, (..., n, Q_LOW), for the arguments of `passive_torque`.
-
-    damping is the MJCF's own (n,) Nm s/rad.
-    """
-    rows = np.empty((*np.broadcast_shapes(phi.shape[:-1], offset.shape, breakaway.shape[:-1]), Q_LOW))
-    rows[..., MARK] = MARKER
-    rows[..., PHI1 : PHI3 + 1] = phi
-    rows[..., OFFSET] = offset
-    rows[..., BREAK_NEG : BREAK_POS + 1] = breakaway
-    rows[..., DQ_MIN] = dq_min
-    rows[..., DAMPING] = damping
-    return rows
+    return np.where(held, -tau, offset) - friction
 
 
 def install() -> None:
     """Put the native law into MuJoCo, once per process. Models without our marker in `jnt_user` are untouched."""
     _callback()
+
+
+@njit(inline="always")
+def _law(code, p, v, h, memory):
+    """Return friction torque and slope of one joint; p (PHI,) of its family. `memory` (1,), z, moves on by v h."""
+    if code == 0:
+        x = p[1] * (v + p[2])
+        e = np.exp(-abs(x))
+        s = (1.0 if x >= 0 else e) / (1.0 + e)
+        x = p[1] * p[2]
+        e = np.exp(-abs(x))
+        s0 = (1.0 if x >= 0 else e) / (1.0 + e)
+        return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
+    if code == 3:
+        s = 1.0 if v > 0 else -1.0
+        z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
+        memory[0] = z
+        level = p[0] * (1.0 + p[1] if z > 0 else 1.0 - p[1]) * (1.0 + p[3] * np.exp(-((v / p[4]) ** 2)))
+        stiff = level / p[5]
+        rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
+        # what the coming step will do to it, at the present velocity
+        return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
+    turn = np.tanh(v / WIDTH_DQ)
+    level = p[0] * (1.0 + np.sign(v) * p[1])
+    fall = 0.0
+    if code == 2:
+        bump = p[3] * np.exp(-((v / p[4]) ** 2))
+        fall = level * bump * -2.0 * v / p[4] ** 2
+        level *= 1.0 + bump
+    return level * turn + p[2] * v, level * (1.0 - turn * turn) / WIDTH_DQ + fall * turn + p[2]
 
 
 @cache
@@ -104,6 +213,9 @@ def _callback() -> Any:
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
     qpos_at, qvel_at = at["qpos"] // 8, at["qvel"] // 8
     applied_at, passive_at = at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
+    memory_at = at["userdata"] // 8
+    xpos_at, xmat_at = at["xpos"] // 8, at["xmat"] // 8
+    anchor_at, axis_at, nbody_at = at["xanchor"] // 8, at["xaxis"] // 8, at["nbody"] // 8
     model_words, data_words = (
         max(at[k] for k in _MODEL_FIELDS) // 8 + 1,
         max(at[k] for k in _DATA_FIELDS) // 8 + 1,
@@ -121,7 +233,7 @@ def _callback() -> Any:
         model = carray(model_ptr, (model_words,))
         if model[nuser_at] != WIDTH:
             return
-        n = model[nv_at]
+        n, nbody = model[nv_at], model[nbody_at]
         user = carray(as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
         damping = carray(as_doubles(model[damping_at]), (n,))  # type: ignore[call-arg]
         data = carray(data_ptr, (data_words,))
@@ -129,49 +241,77 @@ def _callback() -> Any:
         qvel = carray(as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
         applied = carray(as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
         qfrc_passive = carray(as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
-        for j in range(n):
+        memory = carray(as_doubles(data[memory_at]), (n,))  # type: ignore[call-arg]
+        xpos = carray(as_doubles(data[xpos_at]), (nbody, 3))  # type: ignore[call-arg]
+        xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
+        anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
+        axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
+        # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
+        em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(n - 1, -1, -1):
             if user[j, MARK] != MARKER:
                 return
-            phi1, phi2, phi3 = user[j, PHI1], user[j, PHI2], user[j, PHI3]
             v = qvel[j]
-            x = phi2 * (v + phi3)
-            e = np.exp(-abs(x))
-            s = (1.0 if x >= 0 else e) / (1.0 + e)
-            y = phi2 * phi3
-            e = np.exp(-abs(y))
-            s0 = (1.0 if y >= 0 else e) / (1.0 + e)
-            slope = phi1 * phi2 * s * (1.0 - s)
+            friction, slope = _law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
+            pull = user[j, OFFSET]
+            if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
+                pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
+            if user[j, LINK] != 0.0:
+                body = int(user[j, BODY])
+                m, h0, h1, h2 = (
+                    user[j, MASS_ERROR],
+                    user[j, MASS_ERROR + 1],
+                    user[j, MASS_ERROR + 2],
+                    user[j, MASS_ERROR + 3],
+                )
+                em += m
+                ex += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
+                ey += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
+                pull += GRAVITY * (axis[j, 1] * (ex - em * anchor[j, 0]) - axis[j, 0] * (ey - em * anchor[j, 1]))
+                m, h0, h1, h2 = user[j, MASS], user[j, MASS + 1], user[j, MASS + 2], user[j, MASS + 3]
+                lm += m
+                lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
+                ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
+                load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
+                turn = np.tanh(v / WIDTH_DQ)
+                friction += user[j, LOAD] * abs(load) * turn
+                slope += user[j, LOAD] * abs(load) * (1.0 - turn * turn) / WIDTH_DQ
+            slope = max(slope, 0.0)  # an implicit falling branch would take inertia away
             # mj_passive has already subtracted dof_damping * v with the slope of the step before: put it right
-            force = (damping[j] - user[j, DAMPING]) * v - phi1 * (s - s0)
+            force = (damping[j] - user[j, DAMPING]) * v - friction
             damping[j] = user[j, DAMPING] + slope
-            drive = applied[j] + user[j, OFFSET]
-            held = abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            drive = applied[j] + pull
+            held = (
+                user[j, FAMILY] != 3 and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            )
             if user[j, DQ_GAIN] > 0.0 and abs(v) > user[j, DQ_SOFT]:
                 damping[j] += user[j, DQ_GAIN]
                 force -= user[j, DQ_GAIN] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
             beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
             force -= user[j, Q_GAIN] * beyond
-            qfrc_passive[j] += force + (-applied[j] if held else user[j, OFFSET])
+            qfrc_passive[j] += force + (-applied[j] if held else pull)
 
     mujoco.set_mjcb_passive(passive.ctypes)
     return passive  # kept alive by the cache: MuJoCo holds only the address
 
 
-_MODEL_FIELDS = ("nv", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive")
+_MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
+_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "userdata", "xpos", "xmat", "xanchor", "xaxis")
 
 
 def _struct_offsets() -> dict[str, int]:
     """Return byte offsets within mjModel and mjData, found in live structs rather than written down.
 
-    Pointers are found by the address of their NumPy view; nv and nuser_jnt by values no other leading size has.
+    Pointers are found by the address of their NumPy view, sizes by their place in mjModel's introspection.
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
-    spec = mujoco.MjSpec.from_string(f"<mujoco><size nuser_jnt='{WIDTH}'/><worldbody>{joints}</worldbody></mujoco>")
+    spec = mujoco.MjSpec.from_string(
+        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='3'/><worldbody>{joints}</worldbody></mujoco>"
+    )
     model = spec.compile()
     data = mujoco.MjData(model)
     sizes = [f.name for f in _size_fields()]
-    offsets = {"nv": 8 * sizes.index("nv"), "nuser_jnt": 8 * sizes.index("nuser_jnt")}
+    offsets = {name: 8 * sizes.index(name) for name in ("nv", "nbody", "nuser_jnt")}
 
     def scan(struct: Any, names: tuple[str, ...]) -> None:
         word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))

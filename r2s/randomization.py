@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from r2s.parameters import ParameterSpace
 from r2s.simulator import Dynamics
 
 TRIES = 64
@@ -25,7 +26,7 @@ def draw(
         phi_relative, inertia_relative: half widths; 0 keeps the centre.
     """
     n = len(center.offset)
-    phi = center.phi * rng.uniform(1 - phi_relative, 1 + phi_relative, (m, n, 3))
+    phi = center.phi * rng.uniform(1 - phi_relative, 1 + phi_relative, (m, *center.phi.shape))
     inertia = np.broadcast_to(center.inertia, (m, n, 3, 3)).copy()
     todo = np.ones((m, n), dtype=bool) if inertia_relative else np.zeros((m, n), dtype=bool)
     for _ in range(TRIES):
@@ -39,6 +40,14 @@ def draw(
         todo[arm, link] = ~physical(tensor)
     inertia[todo] = np.broadcast_to(center.inertia, (m, n, 3, 3))[todo]  # after 64 tries: the centre, which is valid
     return replace(center, phi=phi, inertia=inertia)
+
+
+def draw_identified(rng: np.random.Generator, space: ParameterSpace, samples: np.ndarray, m: int) -> Dynamics:
+    """Return m dynamics drawn from what identification says of the arm: rows of `samples` (S, P), so correlated.
+
+    Every row is physical: scales of tensors are positive, and the full parametrisation has no other values.
+    """
+    return space.dynamics(samples[rng.integers(len(samples), size=m)])
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:

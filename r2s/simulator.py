@@ -1,7 +1,8 @@
 """Many copies of the arm at once: `mujoco.batch.Batch` with the friction law inside the physics step.
 
 The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation, so
-the commanded simulator has no gravity and what the compensation gets wrong is the torque offset.
+the commanded simulator has no gravity. What the compensation gets wrong (it believes the nominal masses and centres)
+acts as a torque of its own (r2s/friction.py).
 """
 
 from dataclasses import dataclass, replace
@@ -12,19 +13,27 @@ import numpy as np
 
 from r2s import friction
 from r2s.actuation import SoftLimits
+from r2s.friction import SIGMOID, Family
 from r2s.robot import SIM_DT, Robot
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What identification finds and domain randomization draws; any leading batch shape.
+    """What identification finds and domain randomization draws; any leading batch shape, each field its own.
 
     Attributes:
-        phi: (..., n, 3), eq. (5): Nm, s/rad, rad/s.
+        phi: (..., n, K), the parameters of `family`; the paper's are Nm, s/rad, rad/s of eq. (5).
         offset: (..., n) Nm, added to every command.
-        breakaway: (..., n, 2) Nm, negative and positive edge of the dead zone.
+        breakaway: (..., n, 2) Nm, negative and positive edge of the dead zone, of command and offset together.
         dq_min: rad/s, speed below which the dead zone may hold.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
+        mass: (..., n) kg, com: (..., n, 3) m, link frame; None: the robot's.
+        family: of the friction.
+        load: (..., n), friction per torque that gravity loads the joint with; None: 0.
+        drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's; None: 0.
+        gain: (..., n), relative error of the link-side torque sensor; None: 0. Only a measured torque knows it.
+        delay, lag: (...) s, of the actuation: pure, and first order. The simulator does not apply them: whoever
+            makes the commands does (`Motors` of r2s/actuation.py).
     """
 
     phi: np.ndarray
@@ -32,6 +41,18 @@ class Dynamics:
     breakaway: np.ndarray
     dq_min: float
     inertia: np.ndarray
+    mass: np.ndarray | None = None
+    com: np.ndarray | None = None
+    family: Family = SIGMOID
+    load: np.ndarray | None = None
+    drag: np.ndarray | None = None
+    gain: np.ndarray | None = None
+    delay: np.ndarray | float = 0.0
+    lag: np.ndarray | float = 0.0
+
+    def friction(self, dq: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
+        """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `turn`: Family.torque."""
+        return self.family.torque(dq, self.phi, turn)
 
     def scaled(self, scale: np.ndarray) -> "Dynamics":
         """Return these dynamics with link tensors times `scale` (..., n): the paper's inertia genes."""
@@ -56,8 +77,10 @@ class Simulator:
         self._damping = self.batch.expand("dof_damping")  # the friction law writes it: must not be shared by threads
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
+        self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
+        self._memory = self.batch.bind("userdata")
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
         self._site_xpos = self.batch.bind("site_xpos")
         self.set_dynamics(dynamics)
@@ -68,20 +91,45 @@ class Simulator:
         With repeat > 1 each of the given dynamics goes to that many consecutive arms.
         """
         arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
-        d = dynamics
-        rows = friction.pack(d.phi, d.offset, d.breakaway, d.dq_min, self.model.dof_damping)
-        moments, axes = np.linalg.eigh(d.inertia)
+        moments, axes = np.linalg.eigh(dynamics.inertia)
         axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
-        quaternions = _quaternions(axes)
+        mass = self.robot.mass if dynamics.mass is None else dynamics.mass
+        com = self.robot.com if dynamics.com is None else dynamics.com
 
-        def spread(a: np.ndarray) -> np.ndarray:
-            return np.repeat(a, repeat, axis=0) if a.ndim == 3 and repeat > 1 else a
+        def spread(a: np.ndarray, without: int) -> np.ndarray:
+            return np.repeat(a, repeat, axis=0) if a.ndim > without and repeat > 1 else a
 
-        self._user[arms, :, : friction.Q_LOW] = spread(rows)
+        at = arms[:, None], self._bodies
+        self._user[arms, :, : friction.Q_LOW] = spread(self._rows(dynamics, mass, com), 2)
         self._damping[arms] = self.model.dof_damping
-        self._inertia[arms[:, None], self._bodies] = spread(moments)
-        self._iquat[arms[:, None], self._bodies] = spread(quaternions)
+        self._inertia[at] = spread(moments, 2)
+        self._iquat[at] = spread(_quaternions(axes), 2)
+        self._mass[at] = spread(mass, 1)
+        self._com[at] = spread(com, 2)
         self.batch.set_const(ids)
+
+    def _rows(self, d: Dynamics, mass: np.ndarray, com: np.ndarray) -> np.ndarray:
+        """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
+        robot, f = self.robot, friction
+        moment = mass[..., None] * com
+        load = np.zeros(robot.n) if d.load is None else d.load
+        drag = np.zeros((robot.n, 2)) if d.drag is None else d.drag
+        arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], load, drag[..., 0])
+        rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
+        rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, d.family.code
+        rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
+        rows[..., f.OFFSET] = d.offset
+        rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
+        rows[..., f.DQ_MIN], rows[..., f.DAMPING] = d.dq_min, self.model.dof_damping
+        rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = drag
+        rows[..., f.LOAD], rows[..., f.BODY] = load, self._bodies
+        rows[..., f.STEP] = self.model.opt.timestep
+        nominal = robot.mass[:, None] * robot.com
+        rows[..., f.MASS_ERROR] = mass - robot.mass
+        rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = moment - nominal
+        rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
+        rows[..., f.LINK] = d.load is not None or d.mass is not None or d.com is not None
+        return rows
 
     def set_soft_limits(self, limits: SoftLimits) -> None:
         """Let the driver's soft limits act in all arms; without this call there are none."""
@@ -89,12 +137,18 @@ class Simulator:
         for i, column in zip(range(friction.Q_LOW, friction.WIDTH), columns, strict=True):
             self._user[:, :, i] = column
 
-    def reset(self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics."""
+    def reset(
+        self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, turn: np.ndarray | float = 0.0
+    ) -> None:
+        """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics.
+
+        turn (m, n) in [-1, 1] is what friction with a memory remembers: how far its bristles are bent.
+        """
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         at = slice(None) if ids is None else ids
         self.q[at] = q
         self.dq[at] = dq
+        self._memory[at] = turn
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 

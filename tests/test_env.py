@@ -24,7 +24,8 @@ K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/table
 @pytest.fixture(scope="module")
 def draw(panda):
     center = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-    return lambda rng, m: randomization.draw(rng, center, m, **conf("dr/paper"))
+    widths = {k: v for k, v in conf("dr/paper").items() if k != "name"}
+    return lambda rng, m: randomization.draw(rng, center, m, **widths)
 
 
 @pytest.fixture(scope="module")

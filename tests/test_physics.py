@@ -2,13 +2,15 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
 from r2s.actuation import SoftLimits
-from r2s.friction import friction_slope, friction_torque, passive_torque
+from r2s.errors import UserError
+from r2s.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
 from r2s.robot import load_robot
 from r2s.simulator import Dynamics, Simulator
 
@@ -29,9 +31,11 @@ DAMPED_ARM = """
   <compiler angle="radian"/>
   <worldbody>
     <body pos="0 0 0.3"><inertial pos="0 0.02 0.1" mass="2" diaginertia="0.03 0.03 0.02"/>
-      <joint name="j1" axis="0 0 1" range="-2 2" damping="0.3" armature="0.05" actuatorfrcrange="-20 20"/>
+      <joint name="j1" axis="0.6 0 0.8" pos="0.03 0 -0.05" range="-2 2" damping="0.3" armature="0.05"
+        actuatorfrcrange="-20 20"/>
       <body pos="0 0 0.2"><inertial pos="0.02 0 0.1" mass="1" fullinertia="0.01 0.01 0.004 0.001 0 0"/>
-        <joint name="j2" axis="0 1 0" range="-2 2" damping="0.1" actuatorfrcrange="-10 10"/>
+        <joint name="j2" axis="0 1 0" pos="0 0.02 0.04" range="-2 2" damping="0.1" actuatorfrcrange="-10 10"/>
+        <body pos="0.05 0 0.15"><inertial pos="0.01 0 0" mass="0.4" diaginertia="0.001 0.001 0.001"/></body>
         <site name="tip" pos="0 0 0.2"/>
       </body>
     </body>
@@ -54,14 +58,71 @@ def damped(tmp_path_factory):
     return load_robot(str(path))
 
 
-def some_dynamics(robot, nsim, seed=0):
-    """Return dynamics with every part of the law active, other ones in every simulation."""
+RANGES = {
+    "phi1": (0.3, 4.0), "phi2": (2.0, 30.0), "phi3": (-0.06, 0.06), "viscous": (0.0, 1.0), "coulomb": (0.2, 3.0),
+    "asymmetry": (-0.5, 0.5), "rise": (0.0, 1.0), "stribeck_velocity": (0.02, 0.3), "presliding": (2e-4, 5e-3),
+}  # fmt: skip
+THREE = (SIGMOID, COULOMB, STRIBECK)
+OF_ARMS = ("phi", "offset", "breakaway", "inertia", "mass", "com", "load", "drag")
+
+
+def named(f):
+    return f.name
+
+
+def some_phi(law, shape, rng):
+    """Return (*shape, K) parameters of a family."""
+    return np.stack([rng.uniform(*RANGES[name], shape) for name in law.names], -1)
+
+
+def some_dynamics(robot, nsim, seed=0, law=SIGMOID):
+    """Return dynamics with the dead zone and offsets active, other ones in every simulation."""
     rng = np.random.default_rng(seed)
     shape = (nsim, robot.n)
-    phi = np.stack([rng.uniform(0.3, 4, shape), rng.uniform(2, 30, shape), rng.uniform(-0.06, 0.06, shape)], -1)
     breakaway = np.stack([-rng.uniform(0.2, 1.5, shape), rng.uniform(0.2, 1.5, shape)], -1)
     inertia = np.broadcast_to(robot.inertia, (*shape, 3, 3))
-    return Dynamics(phi, rng.uniform(-0.6, 0.6, shape), breakaway, 0.02, inertia)
+    return Dynamics(some_phi(law, shape, rng), rng.uniform(-0.6, 0.6, shape), breakaway, 0.02, inertia, family=law)
+
+
+def with_everything(robot, d, seed=7):
+    """Return the dynamics with load, drag and links of other mass, centre and tensor as well."""
+    rng = np.random.default_rng(seed)
+    shape = d.offset.shape
+    return replace(
+        d,
+        mass=robot.mass * rng.uniform(0.8, 1.2, shape),
+        com=robot.com + rng.uniform(-0.02, 0.02, (*shape, 3)),
+        inertia=d.inertia * rng.uniform(0.5, 2.0, shape)[..., None, None],
+        load=rng.uniform(0, 0.05, shape),
+        drag=rng.uniform(-0.3, 0.3, (*shape, 2)),
+    )
+
+
+def arms_of(d, at):
+    """Return the dynamics of some of the arms."""
+    return replace(d, **{name: value[at] for name in OF_ARMS if (value := getattr(d, name)) is not None})
+
+
+def set_links(model, mass, com, inertia):
+    """Give a compiled model's links these masses, centres and tensors."""
+    for body, m, c, tensor in zip(model.jnt_bodyid, mass, com, inertia, strict=True):
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = m, c, moments
+        mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def weight(model, data, mass, com):
+    """Return (n,) Nm that gravity pulls with at masses at `com` of the links, by Jacobians of those points."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    jacobian, out = np.empty((3, model.nv)), np.zeros(model.nv)
+    for body, m, c in zip(model.jnt_bodyid, mass, com, strict=True):
+        point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ c
+        mujoco.mj_jac(model, data, jacobian, None, point, body)
+        out -= 9.81 * m * jacobian[2]
+    return out
 
 
 def some_motion(robot, nsim, steps, seed=1):
@@ -76,20 +137,30 @@ def some_motion(robot, nsim, steps, seed=1):
 
 def oracle(robot, dynamics, k, q, dq, tau, soft=None):
     """Return (steps, n) angles and velocities of simulation k, and how often a joint was held, in a Python loop."""
-    model = robot.model(gravity=False)
+    model, d = robot.model(gravity=False), arms_of(dynamics, k)
+    mass, com = robot.mass if d.mass is None else d.mass, robot.com if d.com is None else d.com
+    set_links(model, mass, com, d.inertia)
     data = mujoco.MjData(model)
     base = model.dof_damping.copy()
     data.qpos[:], data.qvel[:] = q[k], dq[k]
-    phi, offset, breakaway, dq_min = dynamics.phi[k], dynamics.offset[k], dynamics.breakaway[k], dynamics.dq_min
     qs, dqs, held = [], [], 0
     for torque in tau[k]:
-        slope = friction_slope(data.qvel, phi)
-        passive = passive_torque(data.qvel, torque, phi, offset, breakaway, dq_min)
-        held += int(np.sum(np.isclose(passive + friction_torque(data.qvel, phi), -torque, atol=1e-12)))
+        v, pull, turn = data.qvel.copy(), d.offset.copy(), np.tanh(data.qvel / WIDTH_DQ)
+        friction, slope = d.friction(v), d.family.slope(v, d.phi)
+        if d.drag is not None:
+            pull += d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos)
+        if d.mass is not None:
+            nominal = weight(model, data, robot.mass, robot.com)
+            pull += weight(model, data, mass, com) - nominal
+            friction = friction + d.load * np.abs(nominal) * turn
+            slope = slope + d.load * np.abs(nominal) * (1 - turn**2) / WIDTH_DQ
+        slope = np.maximum(slope, 0.0)
+        passive = passive_torque(v, torque, friction, pull, d.breakaway, d.dq_min)
+        held += int(np.sum(np.isclose(passive + friction, -torque, atol=1e-12)))
         if soft is not None:
-            passive = passive + soft(data.qpos, data.qvel)
-            slope = slope + soft.dq_gain * (np.abs(data.qvel) > soft.dq_soft)
-        data.qfrc_applied[:] = torque + passive + slope * data.qvel
+            passive = passive + soft(data.qpos, v)
+            slope = slope + soft.dq_gain * (np.abs(v) > soft.dq_soft)
+        data.qfrc_applied[:] = torque + passive + slope * v
         model.dof_damping[:] = base + slope
         mujoco.mj_step(model, data)
         qs.append(data.qpos.copy())
@@ -97,12 +168,17 @@ def oracle(robot, dynamics, k, q, dq, tau, soft=None):
     return np.array(qs), np.array(dqs), held
 
 
-@pytest.mark.parametrize("which", ["panda", "damped"])
-def test_native_friction_is_the_numpy_law(which, request):
-    """Sigmoid, offset and dead zone agree to 1e-12 over 60 steps, each simulation with parameters of its own."""
+@pytest.mark.parametrize("law", THREE, ids=named)
+@pytest.mark.parametrize(("which", "everything"), [("panda", False), ("panda", True), ("damped", True)])
+def test_native_friction_is_the_numpy_law(which, everything, law, request):
+    """Family, offset and dead zone agree to 1e-12 over 40 steps, each simulation with parameters of its own.
+
+    With everything: load, drag, and what gravity compensation by nominal masses leaves, too.
+    """
     robot = request.getfixturevalue(which)
-    nsim, steps = 6, 60
-    dynamics = some_dynamics(robot, nsim)
+    nsim, steps = 4, 40
+    dynamics = some_dynamics(robot, nsim, law=law)
+    dynamics = with_everything(robot, dynamics) if everything else dynamics
     q, dq, tau = some_motion(robot, nsim, steps)
     sim = Simulator(robot, dynamics, nsim, 1)
     sim.reset(q, dq)
@@ -114,6 +190,59 @@ def test_native_friction_is_the_numpy_law(which, request):
         np.testing.assert_allclose(out["qpos"][k], qs, rtol=0, atol=1e-12)
         np.testing.assert_allclose(out["qvel"][k], dqs, rtol=0, atol=1e-11)
     assert 0.02 < held / tau.size < 0.98  # the dead zone took part, and so did the rest
+
+
+@pytest.mark.parametrize("law", THREE, ids=named)
+def test_one_step_of_the_native_law(panda, law):
+    """A single step from any state, joints at rest included, agrees with the NumPy law to 1e-12."""
+    nsim = 12
+    dynamics = with_everything(panda, some_dynamics(panda, nsim, seed=11, law=law))
+    q, dq, _ = some_motion(panda, nsim, 1, seed=12)
+    dq *= 10.0 ** np.random.default_rng(13).uniform(-4, 1, dq.shape)
+    tau = np.random.default_rng(14).uniform(-3, 3, (nsim, 1, panda.n))
+    sim = Simulator(panda, dynamics, nsim, 1)
+    sim.reset(q, dq)
+    out = sim.rollout(tau, record=("qvel",))["qvel"]
+    for k in range(nsim):
+        np.testing.assert_allclose(out[k], oracle(panda, dynamics, k, q, dq, tau)[1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("which", ["panda", "damped"])
+def test_what_gravity_compensation_misses(which, request):
+    """A step is that of MuJoCo with the true links under gravity and the nominal arm's gravity torque commanded.
+
+    What is welded to a link is part of both, so it is compensated.
+    """
+    robot, nsim = request.getfixturevalue(which), 4
+    d = with_everything(robot, some_dynamics(robot, nsim))
+    d = replace(d, phi=0 * d.phi, offset=0 * d.offset, breakaway=0 * d.breakaway, load=None, drag=None)
+    q, dq, _ = some_motion(robot, nsim, 1, seed=3)
+    sim = Simulator(robot, d, nsim, 1)
+    sim.reset(q, dq)
+    out = sim.rollout(np.zeros((nsim, 1, robot.n)), record=("qvel",))["qvel"][:, 0]
+    nominal, true = robot.model(gravity=True), robot.model(gravity=True)
+    for k in range(nsim):
+        believed, arm = mujoco.MjData(nominal), mujoco.MjData(true)
+        set_links(true, d.mass[k], d.com[k], d.inertia[k])
+        believed.qpos[:] = q[k]
+        mujoco.mj_forward(nominal, believed)  # at rest: the bias is gravity
+        arm.qpos[:], arm.qvel[:], arm.qfrc_applied[:] = q[k], dq[k], believed.qfrc_bias
+        mujoco.mj_step(true, arm)
+        np.testing.assert_allclose(out[k], arm.qvel, rtol=0, atol=1e-12)
+        assert np.abs(out[k] - dq[k]).max() > 1e-4
+
+
+def test_the_dead_zone_holds_what_gravity_compensation_misses(panda):
+    """An arm with a mass error sinks, but not where its breakaway is wider than what that error pulls with."""
+    heavy = replace(some_dynamics(panda, 2), mass=panda.mass * 1.1, offset=np.zeros((2, 7)))
+    wide = np.broadcast_to([-50.0, 50.0], (7, 2))
+    sim = Simulator(panda, replace(heavy, breakaway=np.stack([wide, 0 * wide])), 2, 1)
+    sim.reset(np.tile(panda.q_home, (2, 1)), np.zeros((2, 7)))
+    before = sim.ee.copy()
+    sim.rollout(np.zeros((2, 100, 7)))
+    sim.kinematics()
+    assert np.array_equal(sim.q[0], panda.q_home)
+    assert sim.ee[1, 2] < before[1, 2] - 1e-4
 
 
 def test_native_soft_limits_are_those_of_the_driver(panda):
@@ -167,7 +296,7 @@ def test_a_reset_forgets_the_motion_before(panda):
 def test_a_stiff_light_joint_comes_to_rest_without_chatter(light):
     """10 Nm s/rad on 0.005 kg m^2 at 1 kHz: the velocity only decays, where the explicit form chatters."""
     phi = np.array([[1.0, 40.0, 0.0]])
-    assert friction_slope(np.zeros(1), phi) == pytest.approx(10.0)
+    assert SIGMOID.slope(np.zeros(1), phi) == pytest.approx(10.0)
     still = Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia)
     sim = Simulator(light, still, 1, 1)
     sim.reset(np.zeros((1, 1)), np.full((1, 1), 0.3))
@@ -181,7 +310,7 @@ def test_a_stiff_light_joint_comes_to_rest_without_chatter(light):
     data.qvel[:] = 0.3
     explicit = []
     for _ in range(200):
-        data.qfrc_applied[:] = -friction_torque(data.qvel, phi)
+        data.qfrc_applied[:] = -SIGMOID.torque(data.qvel, phi)
         mujoco.mj_step(model, data)
         explicit.append(float(data.qvel[0]))
     assert np.sum(np.diff(np.sign(explicit[-50:])) != 0) > 40
@@ -198,7 +327,7 @@ def test_dead_zone_holds_below_its_edges_and_lets_go_above(panda):
 
     def moved(drive):
         sim.reset(np.tile(panda.q_home, (nsim, 1)), np.zeros((nsim, n)))
-        sim.rollout(np.repeat((drive - dynamics.offset)[:, None], 20, axis=1))
+        sim.rollout(np.repeat((drive - dynamics.offset)[:, None], 5, axis=1))
         return sim.q - panda.q_home
 
     assert np.array_equal(moved(0.98 * below), np.zeros((nsim, n)))
@@ -209,27 +338,32 @@ def test_dead_zone_holds_below_its_edges_and_lets_go_above(panda):
     assert np.array_equal(np.sign(shift), np.where(rows < n, -1, 1))
 
 
-def test_friction_takes_energy_out():
-    """friction_torque has the sign of the velocity, whatever phi3, and is zero at rest."""
+@pytest.mark.parametrize("law", FAMILIES, ids=named)
+def test_friction_takes_energy_out(law):
+    """The torque has the sign of the velocity, whatever the asymmetry, and is zero at rest."""
     rng = np.random.default_rng(3)
     shape = (20000, 3)
-    phi = np.stack([rng.uniform(0, 10, shape), rng.uniform(0, 60, shape), rng.uniform(-0.3, 0.3, shape)], -1)
+    phi = some_phi(law, shape, rng)
+    if law is SIGMOID:
+        phi[..., 2] *= 5
     dq = rng.normal(size=shape) * 10.0 ** rng.uniform(-6, 1, shape)
-    assert (friction_torque(dq, phi) * dq).min() >= -1e-15
-    assert np.array_equal(friction_torque(np.zeros(shape), phi), np.zeros(shape))
+    assert (law.torque(dq, phi) * dq).min() >= -1e-15
+    assert np.array_equal(law.torque(np.zeros(shape), phi), np.zeros(shape))
 
 
-def test_a_free_arm_only_slows_down(panda):
-    """Without command and offset the kinetic energy of the simulated arm never rises."""
-    d = some_dynamics(panda, 4)
-    d = Dynamics(d.phi, np.zeros_like(d.offset), d.breakaway, d.dq_min, d.inertia)
-    sim = Simulator(panda, d, 4, 1)
-    q, dq, _ = some_motion(panda, 4, 1)
+@pytest.mark.parametrize("law", THREE, ids=named)
+def test_a_free_arm_only_slows_down(panda, law):
+    """Without command and offset the kinetic energy of the arm never rises; load makes it fall more."""
+    d = some_dynamics(panda, 3, law=law)
+    level = np.array([1.0, 1.0, 1.0, 1.0, 0.2, 0.2, 0.05])[:, None] ** (np.arange(len(law.names)) == 0)
+    d = replace(d, phi=d.phi * level, offset=np.zeros_like(d.offset), load=np.full((3, 7), 0.02))
+    sim = Simulator(panda, d, 3, 1)
+    q, dq, _ = some_motion(panda, 3, 1)
     sim.reset(q, dq)
     model, full = panda.model(gravity=False), np.empty((7, 7))
     data = mujoco.MjData(model)
-    out = sim.rollout(np.zeros((4, 150, 7)), record=("qpos", "qvel"))
-    for k in range(4):
+    out = sim.rollout(np.zeros((3, 100, 7)), record=("qpos", "qvel"))
+    for k in range(3):
         energy = []
         for q_now, dq_now in zip(out["qpos"][k], out["qvel"][k], strict=True):
             data.qpos[:] = q_now
@@ -237,26 +371,101 @@ def test_a_free_arm_only_slows_down(panda):
             mujoco.mj_fullM(model, data, full)
             energy.append(0.5 * dq_now @ full @ dq_now)
         assert np.all(np.diff(energy) <= 1e-9)
+        assert energy[-1] < 0.9 * energy[0]
 
 
-def test_friction_slope_is_the_derivative():
-    """friction_slope equals the central difference of friction_torque."""
+@pytest.mark.parametrize("law", FAMILIES, ids=named)
+def test_the_slope_is_the_derivative(law):
+    """Family.slope equals the central difference of Family.torque."""
     rng = np.random.default_rng(4)
     shape = (500, 2)
-    phi = np.stack([rng.uniform(0.1, 5, shape), rng.uniform(1, 30, shape), rng.uniform(-0.1, 0.1, shape)], -1)
-    dq, h = rng.normal(size=shape), 1e-6
-    numerical = (friction_torque(dq + h, phi) - friction_torque(dq - h, phi)) / (2 * h)
-    np.testing.assert_allclose(friction_slope(dq, phi), numerical, rtol=1e-6, atol=1e-8)
+    phi = some_phi(law, shape, rng)
+    dq, h = rng.normal(size=shape) * 10.0 ** rng.uniform(-2, 0, shape), 1e-7
+    dq += np.sign(dq) * 1e-4  # asymmetric laws have a kink at rest
+    numerical = (law.torque(dq + h, phi) - law.torque(dq - h, phi)) / (2 * h)
+    np.testing.assert_allclose(law.slope(dq, phi), numerical, rtol=1e-5, atol=1e-6)
 
 
-def test_the_law_is_finite_at_any_speed(light):
+@pytest.mark.parametrize("other", FAMILIES, ids=named)
+@pytest.mark.parametrize("law", FAMILIES, ids=named)
+def test_a_family_converted_has_the_same_level(law, other):
+    """`like` keeps the mean friction at plus and minus 1 rad/s, and parameters of the same family as they are."""
+    phi = some_phi(law, (20, 7), np.random.default_rng(5))
+    new, one = other.like(law, phi), np.ones((20, 7))
+    np.testing.assert_allclose(other.level(new, one), law.level(phi, one), rtol=1e-7)
+    if law is other:
+        assert np.array_equal(new, phi)
+    else:
+        assert new.shape == (20, 7, 3 if other is SIGMOID else len(other.names))
+
+
+def test_the_viscous_term_of_the_sigmoid_may_be_left_out():
+    """Three parameters are four with a viscous term of zero; the fourth adds itself times the velocity."""
+    rng = np.random.default_rng(6)
+    phi, dq = some_phi(SIGMOID, (50, 2), rng), rng.normal(size=(50, 2))
+    three = SIGMOID.torque(dq, phi[..., :3])
+    np.testing.assert_allclose(SIGMOID.torque(dq, phi), three + phi[..., 3] * dq, rtol=1e-12)
+    np.testing.assert_allclose(SIGMOID.slope(dq, phi), SIGMOID.slope(dq, phi[..., :3]) + phi[..., 3], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("law", "at_rest"), [(COULOMB, 1.2), (STRIBECK, 1.2 * 1.5)], ids=("coulomb", "stribeck"))
+def test_levels_are_what_the_parameters_say(law, at_rest):
+    """1 Nm with 20 % asymmetry, and a half more at rest: both show beside the turn, and the rise is gone at speed."""
+    phi = np.array([1.0, 0.2, 0.3, 0.5, 0.1])[: len(law.names)]
+    slow = np.array([0.06, -0.06])
+    rise = at_rest / 1.2 - 1
+    np.testing.assert_allclose(
+        law.torque(slow, phi) - 0.3 * slow, [1.2 * (1 + rise * np.exp(-0.36)), -0.8 * (1 + rise * np.exp(-0.36))],
+        rtol=1e-4,
+    )  # fmt: skip
+    np.testing.assert_allclose(law.torque(np.array([1.0, -1.0]), phi), [1.5, -1.1], rtol=1e-9)
+    np.testing.assert_allclose(law.torque(np.zeros(2), phi, turn=np.array([1.0, -1.0])), [at_rest, -at_rest / 1.5])
+
+
+def test_presliding_goes_by_the_distance():
+    """The sign turns as 1 - exp(-distance / scale), at any speed and step; after a reversal from 1 to -1."""
+    for speed, dt in ((0.01, 1e-3), (0.1, 1e-3), (0.02, 5e-3)):
+        path = np.full((200, 1), speed)
+        z = presliding(path, dt, 1e-3)[:, 0]
+        np.testing.assert_allclose(z, 1 - np.exp(-speed * dt * np.arange(1, 201) / 1e-3), rtol=0, atol=1e-12)
+    wave = np.sin(0.01 * np.arange(2000))[:, None] * np.array([0.3, 1.0, 3.0])
+    z = presliding(wave, 1e-3, 1e-3)
+    assert np.abs(z).max() <= 1
+    fast = np.abs(wave) > 0.9 * np.abs(wave).max(0)
+    assert np.array_equal(np.sign(z[fast]), np.sign(wave[fast]))
+    assert not presliding(np.zeros((5, 2)), 1e-3, 1e-3).any()
+
+
+def test_an_unknown_family_is_named():
+    """One line with the nearest of those that exist."""
+    assert all(family(f.name) is f for f in FAMILIES)
+    with pytest.raises(UserError, match=r"^friction\.family: no family 'stribek'; allowed: .*mean 'stribeck'\?$"):
+        family("stribek")
+
+
+@pytest.mark.parametrize("law", FAMILIES, ids=named)
+def test_the_law_is_finite_at_any_speed(light, law):
     """Neither form overflows at a million rad/s."""
-    phi = np.array([[2.0, 60.0, 0.1]])
+    phi = np.array([[RANGES[name][1] for name in law.names]])
     for v in (-1e6, 1e6):
-        assert np.isfinite(friction_torque(np.array([v]), phi)).all()
-    sim = Simulator(light, Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia), 1, 1)
+        assert np.isfinite(law.torque(np.array([v]), phi)).all()
+        assert np.isfinite(law.slope(np.array([v]), phi)).all()
+    sim = Simulator(light, Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia, family=law), 1, 1)
     sim.reset(np.zeros((1, 1)), np.full((1, 1), 1e6))
     assert np.isfinite(sim.rollout(np.zeros((1, 1, 1)), record=("qvel",))["qvel"]).all()
+
+
+@pytest.mark.parametrize("law", FAMILIES, ids=named)
+def test_a_pushed_joint_reaches_the_speed_at_which_friction_balances(light, law):
+    """Native laws end where command = Family.torque, with its asymmetry, in both directions and in every family."""
+    phi = np.array([[{"viscous": 0.5, "coulomb": 1.0, "phi1": 2.0, "asymmetry": 0.2, "presliding": 1e-3}.get(
+        name, 0.5 * sum(RANGES[name])) for name in law.names]])  # fmt: skip
+    speed = np.array([[1.0], [-1.0]])
+    push = law.torque(speed, np.broadcast_to(phi, (2, 1, phi.shape[-1])))
+    sim = Simulator(light, Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia, family=law), 2, 1)
+    sim.reset(np.zeros((2, 1)), 0.9 * speed)
+    dq = sim.rollout(np.repeat(push[:, None], 400, 1), record=("qvel",))["qvel"]
+    np.testing.assert_allclose(dq[:, -1], speed, rtol=1e-6)
 
 
 UNTOUCHED = """
@@ -298,37 +507,32 @@ def random_tensors(rng, count):
     return (squares - points[..., :, None] * points[..., None, :]).sum(1)
 
 
-def test_tensors_of_set_dynamics_make_the_mass_matrix(panda):
-    """Each arm's mass matrix is the nominal one plus what its tensors add, sum J^T R (I - I0) R^T J."""
-    nsim, n = 5, panda.n
+def test_links_of_set_dynamics_make_the_mass_matrix(panda):
+    """Each arm's mass matrix is sum m Jc^T Jc + Jr^T R I R^T Jr of its own masses, centres and tensors."""
+    nsim, n = 4, panda.n
     rng = np.random.default_rng(5)
-    d = some_dynamics(panda, nsim)
-    inertia = random_tensors(rng, nsim * n).reshape(nsim, n, 3, 3)
-    sim = Simulator(panda, d, nsim, 1)
-    sim.set_dynamics(Dynamics(d.phi, d.offset, d.breakaway, d.dq_min, inertia))
-    nominal = panda.model(gravity=False)
-    data, jacobian = mujoco.MjData(nominal), np.empty((3, n))
+    d = with_everything(panda, some_dynamics(panda, nsim))
+    d = replace(d, inertia=random_tensors(rng, nsim * n).reshape(nsim, n, 3, 3))
+    sim = Simulator(panda, some_dynamics(panda, nsim), nsim, 1)
+    sim.set_dynamics(d)
     for k in range(nsim):
-        q = rng.uniform(panda.q_min, panda.q_max)
-        expected, found = np.empty((n, n)), np.empty((n, n))
+        model, q = sim.batch.get_model(k), rng.uniform(panda.q_min, panda.q_max)
+        data, place, turn = mujoco.MjData(model), np.empty((3, n)), np.empty((3, n))
+        expected, found = np.zeros((n, n)), np.empty((n, n))
         data.qpos[:] = q
-        mujoco.mj_forward(nominal, data)
-        mujoco.mj_fullM(nominal, data, expected)
-        for i, body in enumerate(nominal.jnt_bodyid):
-            mujoco.mj_jacBody(nominal, data, None, jacobian, body)
-            local = data.xmat[body].reshape(3, 3).T @ jacobian
-            expected += local.T @ (inertia[k, i] - panda.inertia[i]) @ local
-        model = sim.batch.get_model(k)
-        own = mujoco.MjData(model)
-        own.qpos[:] = q
-        mujoco.mj_forward(model, own)
-        mujoco.mj_fullM(model, own, found)
+        mujoco.mj_forward(model, data)
+        for i, body in enumerate(model.jnt_bodyid):
+            frame = data.xmat[body].reshape(3, 3)
+            mujoco.mj_jac(model, data, place, turn, data.xpos[body] + frame @ d.com[k, i], body)
+            expected += d.mass[k, i] * place.T @ place + turn.T @ frame @ d.inertia[k, i] @ frame.T @ turn
+        mujoco.mj_fullM(model, data, found)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
 def test_dynamics_go_to_the_arms_that_are_named(panda):
     """set_dynamics with ids leaves the other arms alone, and with repeat serves blocks of consecutive arms."""
-    six, three = some_dynamics(panda, 6), some_dynamics(panda, 3, seed=9)
+    six = some_dynamics(panda, 6)
+    three = with_everything(panda, some_dynamics(panda, 3, seed=9, law=STRIBECK))
     q, dq, tau = some_motion(panda, 6, 30)
 
     def run(change):
@@ -338,17 +542,13 @@ def test_dynamics_go_to_the_arms_that_are_named(panda):
         return sim.rollout(tau)["qpos"]
 
     base = run(lambda sim: None)
-    two = Dynamics(three.phi[:2], three.offset[:2], three.breakaway[:2], three.dq_min, three.inertia[:2])
-    part = run(lambda sim: sim.set_dynamics(two, np.array([1, 4])))
+    part = run(lambda sim: sim.set_dynamics(arms_of(three, slice(2)), np.array([1, 4])))
     assert np.array_equal(part[[0, 2, 3, 5]], base[[0, 2, 3, 5]])
     assert np.abs(part[[1, 4]] - base[[1, 4]]).max(axis=(1, 2)).min() > 1e-6
-    whole = Dynamics(
-        *(np.repeat(x, 2, 0) for x in (three.phi, three.offset, three.breakaway)),
-        three.dq_min,
-        np.repeat(three.inertia, 2, 0),
-    )
+    whole = arms_of(three, np.repeat(np.arange(3), 2))
     blocks = run(lambda sim: sim.set_dynamics(three, repeat=2))
     assert np.array_equal(blocks, run(lambda sim: sim.set_dynamics(whole)))
+    assert np.array_equal(run(lambda sim: (sim.set_dynamics(three, repeat=2), sim.set_dynamics(six))), base)
 
 
 def test_a_command_excludes_gravity(panda):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from r2s.actuation import Motors
 from r2s.arm.interface import ArmState, Reflexes
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
@@ -21,6 +22,7 @@ class SimulatedArm:
     ):
         self.robot = robot
         self._sim = Simulator(robot, dynamics, 1, 1)
+        self._motors = Motors(1, robot.n, dynamics.delay, dynamics.lag)
         self._noise = position_noise, velocity_noise
         self._rng = np.random.default_rng(seed)
         self._reflexes = Reflexes(robot)
@@ -30,6 +32,7 @@ class SimulatedArm:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Place the arm at rest at q (n,) rad; the clock starts again."""
         self._sim.reset(np.asarray(q, dtype=float)[None], np.zeros((1, self.robot.n)))
+        self._motors.reset()
         self._cycle, self._last = 0, np.zeros(self.robot.n)
         return self._sense()
 
@@ -41,7 +44,7 @@ class SimulatedArm:
         """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as the real arm's reflexes would."""
         self._reflexes.command(tau, self._last)
         self._last = np.array(tau, dtype=float)
-        self._sim.rollout(self._last[None, None])
+        self._sim.rollout(self._motors(self._last[None, None]))
         self._reflexes.state(self._sim.q[0], self._sim.dq[0])
         self._cycle += 1
         self._sense()
@@ -49,6 +52,7 @@ class SimulatedArm:
     def stop(self) -> None:
         """End the motion: the arm stands where it is, without command."""
         self._sim.reset(self._sim.q.copy(), np.zeros((1, self.robot.n)))
+        self._motors.reset()
         self._last = np.zeros(self.robot.n)
         self._sense()
 
