@@ -1,12 +1,16 @@
-"""What a person reads: figures (PNG), tables for the terminal, and the same tables in a report.md.
+"""What a person reads: figures (PNG), tables for the terminal, and the same in report.md and report.html.
 
-A table is a DataFrame of strings first, so that the terminal and the report say the same.
+A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
+identification has is in r2s/report_identification.py.
 """
 
 import os
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape as escape_html
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,26 +22,32 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from r2s.friction import friction_torque
-from r2s.identify import Identified
-from r2s.parameters import UNITS
-from r2s.robot import SIM_DT, Robot
-from r2s.simulator import Dynamics
+from r2s.friction import BRISTLE
+from r2s.identify import SHARPER, Identified
+from r2s.parameters import LINK, UNITS, WHOLE_ARM, Estimate, ParameterSpace, inertia_scale
+from r2s.robot import Robot
 from r2s.viewer import Episode, colours
 
 DPI = 120
 MOST_POINTS = 4000  # of a line or a cloud in a figure
+LONGEST = 30.0  # s of torque in a figure: more is a solid band
+PAUSE = 0.1  # s on a figure's axis, for a pause of any length
 SUCCESS = {
     "success_5cm": "5 cm, %",
     "success_2cm": "2 cm, %",
     "success_1cm": "1 cm, %",
     "success_5mm": "5 mm, %",
 }
-LEGEND = "in brackets: 95 % interval; ?: the data cannot tell this value"
+UNSEEN = "nominal, unseen"
+LEGEND = (
+    f"[ ]: 95 % interval; ?: it is wider than {2 / SHARPER:g} standard deviations of the belief before; "
+    f"{UNSEEN}: kept, the data hardly speak of it"
+)
+Item = str | list[str] | pd.DataFrame | Path  # of a report: paragraph, bullets, table, picture
 
 
 @contextmanager
-def _panels(path: Path, count: int, columns: int, title: str, height: float = 2.3) -> Iterator[list[Axes]]:
+def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3) -> Iterator[list[Axes]]:
     """Give `count` axes in a grid, with one legend for all, and save the figure to `path`."""
     rows = -(-count // columns)
     figure = Figure(figsize=(12, 0.9 + height * rows), dpi=DPI, layout="constrained")
@@ -57,11 +67,12 @@ def _panels(path: Path, count: int, columns: int, title: str, height: float = 2.
     figure.savefig(path)
 
 
-def _joint_panels(path: Path, n: int, title: str):
-    return _panels(path, n, 2 if n > 3 else 1, title)
+def joint_panels(path: Path, n: int, title: str):
+    """Give `panels` for n joints."""
+    return panels(path, n, 2 if n > 3 else 1, title)
 
 
-def _log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
     """Make y logarithmic, with numbers that people read at these `ticks` of every decade."""
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=ticks))
@@ -69,114 +80,50 @@ def _log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _thin(count: int, most: int = MOST_POINTS) -> slice:
+def thin(count: int, most: int = MOST_POINTS) -> slice:
+    """Return what leaves at most `most` of `count` rows."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def torque_figure(
     path: Path, t: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray], title: str
 ) -> Path:
-    """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s: the paper's fig. 4."""
-    colour, some = colours(["measured", *predicted]), _thin(len(t))
-    with _joint_panels(path, measured.shape[1], title) as axes:
+    """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s: the paper's fig. 4.
+
+    The first `LONGEST` seconds are drawn, pauses cut short; the RMSE in the titles is over everything.
+    """
+    colour, (clock, pauses) = colours(["measured", *predicted]), clock_of(t)
+    rows = np.flatnonzero(clock <= LONGEST)
+    title += f" (the first {LONGEST:g} s of {clock[-1]:.0f} s)" if len(rows) < len(t) else ""
+    rows = rows[thin(len(rows))]
+    breaks = np.searchsorted(rows, pauses[pauses <= rows[-1]])  # no line over a pause
+
+    def line(values: np.ndarray) -> np.ndarray:
+        return np.insert(values[rows], breaks, np.nan)
+
+    with joint_panels(path, measured.shape[1], title) as axes:
         for j, axis in enumerate(axes):
-            axis.plot(
-                t[some],
-                measured[some, j],
-                color=colour["measured"],
-                linewidth=2.2,
-                alpha=0.7,
-                label="measured",
-            )
+            x = line(clock)
+            axis.plot(x, line(measured[:, j]), color=colour["measured"], linewidth=2.2, alpha=0.7, label="measured")
             scores = []
             for label, tau in predicted.items():
-                axis.plot(t[some], tau[some, j], color=colour[label], linewidth=0.9, label=label)
+                axis.plot(x, line(tau[:, j]), color=colour[label], linewidth=0.9, label=label)
                 scores.append(f"{label} {np.sqrt(np.mean((tau[:, j] - measured[:, j]) ** 2)):.3g}")
             axis.set_title(f"joint {j + 1}: RMSE {', '.join(scores)} Nm", loc="left")
-            axis.set(xlabel="time, s", ylabel="torque, Nm", xlim=(t[0], t[-1]))
+            seconds = "time, s, pauses cut short" if len(pauses) else "time, s"
+            axis.set(xlabel=seconds, ylabel="torque, Nm", xlim=(0, clock[rows[-1]]))
     return path
 
 
-def position_figure(
-    path: Path, windows_q: np.ndarray, predicted: Mapping[str, np.ndarray], dt: float = SIM_DT
-) -> Path:
-    """Draw the open-loop joint error of predicted {label: (W, S, n)} rad against windows_q (W, S, n).
+def clock_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
 
-    Lines are medians over the W windows, bands hold 90 % of them; one of the S rows per `dt` s.
+    A pause is a step of more than five usual ones, or a clock that starts again.
     """
-    colour, t = colours(predicted), dt * np.arange(1, windows_q.shape[1] + 1)
-    title = f"open-loop error over {len(windows_q)} windows: median and 90 % band"
-    early = windows_q.shape[1] // 20  # before that the error is still the noise of the start
-    with _joint_panels(path, windows_q.shape[2], title) as axes:
-        for j, axis in enumerate(axes):
-            bottom = np.inf
-            for label, q in predicted.items():
-                error = 1e3 * np.abs(q[..., j] - windows_q[..., j])
-                low, median, high = np.quantile(error, [0.05, 0.5, 0.95], axis=0)
-                axis.fill_between(t, low, high, color=colour[label], alpha=0.2, linewidth=0)
-                axis.plot(t, median, color=colour[label], label=label)
-                bottom = min(bottom, max(median[early], 1e-3) / 5)
-            _log_axis(axis, ticks=(1.0,))
-            axis.set_ylim(bottom=bottom)
-            axis.set_title(f"joint {j + 1}", loc="left")
-            axis.set(xlabel="time since the measured start, s", ylabel="error, mrad", xlim=(0, t[-1]))
-    return path
-
-
-def friction_figure(
-    path: Path,
-    dynamics: Mapping[str, Dynamics],
-    dq_max: np.ndarray,
-    data: tuple[np.ndarray, np.ndarray] | None = None,
-) -> Path:
-    """Draw friction over speed up to dq_max (n,) rad/s, and bars at rest for the breakaway edges.
-
-    `data` is (dq (T, n) rad/s, friction torque (T, n) Nm) from a recording.
-    """
-    colour = colours(dynamics)
-    with _joint_panels(path, len(dq_max), "friction over speed") as axes:
-        for j, axis in enumerate(axes):
-            if data is not None:
-                some = _thin(len(data[0]))
-                cloud = {"marker": ".", "linestyle": "", "color": "#9aa0a6", "alpha": 0.35}
-                axis.plot(data[0][some, j], data[1][some, j], markersize=2.5, markeredgewidth=0, **cloud)
-                axis.plot([], [], markersize=9, label="recording", **cloud)
-            speed = np.linspace(-dq_max[j], dq_max[j], 801)
-            for label, d in dynamics.items():
-                axis.plot(speed, friction_torque(speed, d.phi[j]), color=colour[label], label=label)
-                if np.any(d.breakaway[j]):
-                    edges = {
-                        "marker": "_",
-                        "markersize": 14,
-                        "markeredgewidth": 2,
-                        "linewidth": 1,
-                        "linestyle": ":",
-                    }
-                    axis.plot([0, 0], d.breakaway[j], color=colour[label], label=f"breakaway, {label}", **edges)
-            axis.set_title(f"joint {j + 1}", loc="left")
-            axis.set(xlabel="speed, rad/s", ylabel="friction, Nm", xlim=(-dq_max[j], dq_max[j]))
-    return path
-
-
-def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost over seconds, a colour per search; what has no cost (the breakaway scan) is shaded."""
-    stages = (history["search"] != history["search"].shift()).cumsum()
-    colour = colours(history["search"])
-    with _panels(path, 1, 1, "convergence of the identification", height=4.2) as (axis,):
-        began = 0.0
-        for _, rows in history.groupby(stages):
-            label, ended = rows["search"].iloc[0], rows["seconds"].iloc[-1]
-            cost = rows.get("cost", pd.Series(dtype=float)).dropna()
-            if len(cost):
-                name = f"{label}: {rows['evaluations'].iloc[-1]:.0f} evaluations"
-                seconds = rows.loc[cost.index, "seconds"]
-                axis.plot(seconds, cost, label=name, color=colour[label], marker="o", markersize=3.5)
-            else:
-                axis.axvspan(began, ended, color=colour[label], alpha=0.2, label=label)
-            began = ended
-        axis.set_yscale("log")
-        axis.set(xlabel="seconds", ylabel="cost (sum of squared, weighted residuals)")
-    return path
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    jump = (steps <= 0) | (steps > 5 * usual)
+    return np.concatenate([[0.0], np.cumsum(np.where(jump, PAUSE, steps))]), np.flatnonzero(jump) + 1
 
 
 def learning_figure(path: Path, runs: Mapping[str, pd.DataFrame]) -> Path:
@@ -188,7 +135,7 @@ def learning_figure(path: Path, runs: Mapping[str, pd.DataFrame]) -> Path:
         "return_paper": "return, eq. (2) over 4 s",
     }
     colour = colours(runs)
-    with _panels(path, len(shown), 2, "learning", height=3.0) as axes:
+    with panels(path, len(shown), 2, "learning", height=3.0) as axes:
         for axis, (column, title) in zip(axes, shown.items(), strict=True):
             scale = 100 if column in SUCCESS else 1
             for label, table in runs.items():
@@ -206,7 +153,7 @@ def reach_figure(path: Path, episodes: Mapping[str, Sequence[Episode]]) -> Path:
     """Draw the distance to up to four goals over time, one line per label: MuJoCo against the arm."""
     colour = colours(episodes)
     count = max(1, min(4, max((len(e) for e in episodes.values()), default=0)))
-    with _panels(path, count, min(count, 2), "distance to the goal", height=3.0) as axes:
+    with panels(path, count, min(count, 2), "distance to the goal", height=3.0) as axes:
         for k, axis in enumerate(axes):
             shown = {label: sequence[k] for label, sequence in episodes.items() if k < len(sequence)}
             for label, episode in shown.items():
@@ -214,23 +161,113 @@ def reach_figure(path: Path, episodes: Mapping[str, Sequence[Episode]]) -> Path:
                 axis.plot(episode.t - episode.t[0], distance, color=colour[label], label=label)
             for level in (5, 2, 1):
                 axis.axhline(level, color="#555555", linewidth=0.7, linestyle=":")
-            _log_axis(axis)
+            log_axis(axis)
             goal = next((f" at ({', '.join(f'{x:.2f}' for x in e.goal)}) m" for e in shown.values()), "")
             axis.set_title(f"goal {k + 1}{goal}", loc="left")
             axis.set(xlabel="time, s", ylabel="distance, cm")
     return path
 
 
+class Value(NamedTuple):
+    """One number of a table: nominal, identified, 95 % interval, whether the data could tell or were silent."""
+
+    old: float
+    new: float
+    low: float
+    high: float
+    known: bool = True
+    unseen: bool = False
+
+    def times(self, factor: float) -> "Value":
+        """Return the value in another unit."""
+        old, new, low, high = (factor * x for x in self[:4])
+        return Value(old, new, low, high, self.known, self.unseen)
+
+    @property
+    def cell(self) -> str:
+        """Return "old → new" over "[low, high]"; "?" where it is not identifiable."""
+        if self.unseen:
+            return f"{number(self.old)}\n{UNSEEN}"
+        return f"{number(self.old)} → {self.found}\n{self.interval}"
+
+    @property
+    def found(self) -> str:
+        """Return the new value, with "?" where it is not identifiable."""
+        return number(self.new) + ("" if self.known else " ?")
+
+    @property
+    def interval(self) -> str:
+        """Return "[low, high]"."""
+        return UNSEEN if self.unseen else f"[{number(self.low)}, {number(self.high)}]"
+
+
+def values(space: ParameterSpace, found: Estimate, block: str, unseen: Sequence[str] = ()) -> list[Value]:
+    """Return what is known of a block: a `Value` per joint or link, or one of the whole arm."""
+    silent = np.isin(space.names, list(unseen))
+    parts = (space.start, found.x, found.low, found.high, found.identifiable, silent)
+    return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
+
+
+def named(block: str) -> str:
+    """Return the title of a block's column, with its unit."""
+    return block if UNITS[block] == "1" else f"{block}\n{UNITS[block]}"
+
+
+def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
+    """Return a table of n cells a column, a row per joint or link."""
+    return pd.DataFrame(dict(columns), index=pd.Index([str(j + 1) for j in range(robot.n)], name=index))
+
+
 def identification_tables(robot: Robot, identified: Identified, summary: Mapping) -> dict[str, pd.DataFrame]:
-    """Return {title: table}: parameters and, where `summary` (summary.json) has them, prediction errors."""
-    joints = [str(j + 1) for j in range(robot.n)]
-    parameters = pd.DataFrame(_parameter_cells(identified), index=pd.Index(joints, name="joint"))
-    blocks = [parameters.iloc[:, i : i + 5] for i in range(0, parameters.shape[1], 5)]
-    tables = {f"parameters, nominal → identified{' (continued)' * (i > 0)}": b for i, b in enumerate(blocks)}
+    """Return {title: table} for the terminal: parameters and, where `summary` (summary.json) has them, errors."""
+    space, found, tables = identified.space, identified.found, {}
+    own = [b for b in space.blocks if b not in WHOLE_ARM and b not in LINK]
+    cells = {named(b): [v.cell for v in values(space, found, b, identified.unseen)] for b in own}
+    blocks = per_joint(robot, cells)
+    for i in range(0, blocks.shape[1], 5):
+        tables[f"parameters, nominal → identified{' (continued)' * (i > 0)}"] = blocks.iloc[:, i : i + 5]
+    arm = {b: values(space, found, b, identified.unseen)[0].times(1e3).cell for b in space.blocks if b in WHOLE_ARM}
+    if arm:
+        index = pd.Index([f"{b}, ms" for b in arm], name="whole arm")
+        tables["actuation"] = pd.DataFrame({"nominal → identified": list(arm.values())}, index=index)
+    if set(LINK) & set(space.blocks):
+        tables["links, nominal → identified"] = _links(robot, identified)
     edges = identified.dynamics.breakaway
-    if np.any(edges):
-        shown = {f"joint {j}": [f"{edge:.3g}" for edge in edges[i]] for i, j in enumerate(joints)}
+    if np.any(edges) and identified.dynamics.family != BRISTLE:  # bristles hold without a dead zone
+        shown = {f"joint {j + 1}": [number(edge) for edge in edges[j]] for j in range(robot.n)}
         tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(["negative", "positive"], name="edge"))
+    return tables | error_tables(robot, summary)
+
+
+def _links(robot: Robot, identified: Identified) -> pd.DataFrame:
+    """Return one line per link: mass, how far its centre moved, and the scale of its tensor's trace."""
+    space = identified.space
+    before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
+
+    def each(d):
+        mass = robot.mass if d.mass is None else d.mass
+        com = robot.com if d.com is None else d.com
+        shift = 1e3 * np.linalg.norm(com - (robot.com if before.com is None else before.com), axis=-1)
+        return mass, shift, inertia_scale(d.inertia, before.inertia)
+
+    (mass, _, _), found = each(before), each(after)
+    spans = [np.quantile(part, [0.025, 0.975], axis=0) for part in each(draws)]
+    intervals = [[f"[{number(low)}, {number(high)}]" for low, high in span.T] for span in spans]
+    known = dict(zip(space.names, identified.found.identifiable, strict=True))
+    doubt = ["" if known.get(f"link_alpha[{j + 1}]", True) else " ?" for j in range(robot.n)]  # mass: alpha alone
+    columns = {
+        "mass, kg": [f"{number(a)} → {number(b)}{k}" for a, b, k in zip(mass, found[0], doubt, strict=True)],
+        "95 %": intervals[0],
+        "centre moved\nmm": [number(x, "{:.2f}") for x in found[1]],
+        "tensor's trace\nof nominal": [number(x) for x in found[2]],
+        "95 % ": intervals[2],
+    }
+    return per_joint(robot, columns, "link")
+
+
+def error_tables(robot: Robot, summary: Mapping) -> dict[str, pd.DataFrame]:
+    """Return {title: table} of the prediction errors in `summary` (summary.json): nominal, identified, ratio."""
+    joints, tables = [str(j + 1) for j in range(robot.n)], {}
     sides = {side: summary[side] for side in ("train", "validation") if side in summary}
     for key, title in (
         ("torque_rmse_Nm", "torque RMSE, Nm"),
@@ -254,20 +291,6 @@ def identification_tables(robot: Robot, identified: Identified, summary: Mapping
     return tables
 
 
-def _parameter_cells(identified: Identified) -> dict[str, list[str]]:
-    """Return {block with unit: n cells "old → new, interval, ? where the data could not tell"}."""
-    space, cells = identified.space, {}
-    for block in space.blocks:
-        parts = (space.start, identified.x, *identified.interval, identified.identifiable)
-        rows = zip(*(space.block(part, block) for part in parts), strict=True)
-        unit = "" if UNITS[block] == "1" else f", {UNITS[block]}"
-        cells[f"{block}{unit}"] = [
-            f"{old:.3g} → {new:.3g}{'' if known else ' ?'}\n[{low:.3g}, {high:.3g}]"
-            for old, new, low, high, known in rows
-        ]
-    return cells
-
-
 def _pair(errors: Mapping, key: str) -> tuple[list[float], list[float]]:
     """Return (nominal, identified), their means appended."""
     before, after = errors.get(f"nominal_{key}", [np.nan] * len(errors[key])), errors[key]
@@ -278,15 +301,16 @@ def _before_after(columns: Mapping[str, tuple[Sequence[float], Sequence[float]]]
     """Return nominal, identified and their ratio, for each side of the split."""
     table = {}
     for side, (before, after) in columns.items():
-        table[f"{side}\nnominal"] = [_number(b) for b in before]
-        table[f"{side}\nidentified"] = [_number(a) for a in after]
+        table[f"{side}\nnominal"] = [number(b) for b in before]
+        table[f"{side}\nidentified"] = [number(a) for a in after]
         table[f"{side}\nratio"] = [
-            _number(a / b if b else np.nan, "{:.2f}") for b, a in zip(before, after, strict=True)
+            number(a / b if b else np.nan, "{:.2f}") for b, a in zip(before, after, strict=True)
         ]
     return pd.DataFrame(table, index=index)
 
 
-def _number(value: float | None, form: str = "{:.3g}") -> str:
+def number(value: float | None, form: str = "{:.3g}") -> str:
+    """Return a number as tables show it; "-" where there is none."""
     return "-" if value is None or not np.isfinite(value) else form.format(value)
 
 
@@ -301,12 +325,12 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
     table = {}
     for label, row in rows.items():
         cells = {
-            title: _number(100 * row[key] if row.get(key) is not None else None, "{:.1f}")
+            title: number(100 * row[key] if row.get(key) is not None else None, "{:.1f}")
             for key, title in SUCCESS.items()
         }
         distance = row.get("distance_median_m")
-        cells["median distance, mm"] = _number(None if distance is None else 1e3 * distance, "{:.1f}")
-        cells["return"] = _number(row.get("return_paper"), "{:.1f}")
+        cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
+        cells["return"] = number(row.get("return_paper"), "{:.1f}")
         table[label] = cells
     return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
 
@@ -317,7 +341,7 @@ def reach_table(console: Console, rows: Mapping[str, Mapping], title: str) -> No
 
 
 def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str | None = None) -> None:
-    """Print a table of strings; cells that end in "?" on their first line are dimmed."""
+    """Print a table of strings; what is uncertain is dimmed."""
     table = Table(
         title=title,
         caption=caption,
@@ -331,14 +355,17 @@ def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str 
         table.add_column(str(column), justify="right")
     for label, row in frame.iterrows():
         cells = [escape(str(cell)) for cell in row]
-        table.add_row(
-            escape(str(label)), *(f"[dim]{c}[/dim]" if c.split("\n")[0].endswith("?") else c for c in cells)
-        )
+        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if _doubtful(c) else c for c in cells))
     console.print(table)
 
 
-def report_markdown(path: Path, sections: Mapping[str, Sequence[str | pd.DataFrame | Path]]) -> Path:
-    """Write report.md: {heading: paragraphs, tables and figures}; the first heading is the title.
+def _doubtful(cell: str) -> bool:
+    """Whether a cell is of a value that the data tell little of."""
+    return cell.split("\n")[0].endswith("?") or cell.endswith(UNSEEN)
+
+
+def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
+    """Write report.md: {heading: paragraphs, bullets, tables and figures}; the first heading is the title.
 
     Figures are linked relative to the report, so that the run folder can be moved.
     """
@@ -347,16 +374,86 @@ def report_markdown(path: Path, sections: Mapping[str, Sequence[str | pd.DataFra
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]
         for item in items:
             lines += [_markdown(item, path.parent), ""]
-    path.write_text("\n".join(lines).rstrip() + "\n")
+    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     return path
 
 
-def _markdown(item: str | pd.DataFrame | Path, folder: Path) -> str:
+def _markdown(item: Item, folder: Path) -> str:
     if isinstance(item, Path):
         return f"![{item.stem}]({Path(os.path.relpath(item, folder)).as_posix().replace(' ', '%20')})"
     if isinstance(item, str):
         return item
-    head = [str(item.index.name or ""), *map(str, item.columns)]
-    body = [[str(label), *map(str, row)] for label, row in zip(item.index, item.to_numpy(), strict=True)]
+    if isinstance(item, list):
+        return "\n".join(f"- {line}" for line in item)
+    head, *body = _rows(item)
     rows = [head, ["---", *["---:"] * len(item.columns)], *body]
     return "\n".join("| " + " | ".join(c.replace("|", "\\|").replace("\n", "<br>") for c in r) + " |" for r in rows)
+
+
+def _rows(table: pd.DataFrame) -> list[list[str]]:
+    """Return a table's cells, the header first, the index in front."""
+    head = [str(table.index.name or ""), *map(str, table.columns)]
+    return [head, *([str(k), *map(str, row)] for k, row in zip(table.index, table.to_numpy(), strict=True))]
+
+
+STYLE = """
+body { margin: 2rem auto; max-width: 80rem; padding: 0 1.5rem; color: #1f2328; background: #fff;
+  font: 15px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+h1 { font-size: 1.7rem; margin: 0 0 1rem; }
+h2 { font-size: 1.2rem; margin: 2.6rem 0 .6rem; padding-top: .8rem; border-top: 1px solid #d8dee4; }
+nav { margin: 1.2rem 0; padding: .7rem 1rem; background: #f6f8fa; border-radius: 6px; }
+nav a { margin-right: 1.2rem; white-space: nowrap; color: #0969da; text-decoration: none; }
+p, ul { max-width: 56rem; }
+.wide { overflow-x: auto; margin: .8rem 0 1.4rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e8ec; }
+th { vertical-align: bottom; border-bottom: 2px solid #afb8c1; }
+th:first-child, td:first-child { text-align: left; }
+small { color: #59636e; }
+td.doubtful, td.doubtful small { color: #8c959f; }
+figure { margin: 1rem 0 1.6rem; }
+img { max-width: 100%; height: auto; }
+"""
+
+
+def report_html(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
+    """Write report.html: what `report_markdown` takes as one file, pictures inside; no script, nothing is loaded."""
+    title, *rest = sections
+    names = {heading: f"s{i}" for i, heading in enumerate(rest, 1)}
+    parts = [
+        f"<!DOCTYPE html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n<title>{escape_html(title)}</title>",
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
+        f"<style>{STYLE}</style>\n</head>\n<body>",
+    ]
+    links = "\n".join(f"<a href='#{name}'>{escape_html(heading)}</a>" for heading, name in names.items())
+    for heading, items in sections.items():
+        tag = f"h2 id='{names[heading]}'" if heading in names else "h1"
+        parts.append(f"<{tag}>{escape_html(heading)}</{tag[:2]}>")
+        parts += [_html(item) for item in items]
+        if heading == title and rest:
+            parts.append(f"<nav>\n{links}\n</nav>")
+    path.write_text("\n".join([*parts, "</body>", "</html>"]) + "\n", encoding="utf-8")
+    return path
+
+
+def _html(item: Item) -> str:
+    if isinstance(item, Path):
+        picture = b64encode(item.read_bytes()).decode()
+        return f"<figure><img alt='{escape_html(item.stem)}' src='data:image/png;base64,{picture}'></figure>"
+    if isinstance(item, str):
+        return f"<p>{escape_html(item)}</p>"
+    if isinstance(item, list):
+        return "<ul>\n" + "\n".join(f"<li>{escape_html(line)}</li>" for line in item) + "\n</ul>"
+    head, *body = _rows(item)
+    lines = ["<div class='wide'><table>", "<tr>" + "".join(f"<th>{_broken(c)}</th>" for c in head) + "</tr>"]
+    for row in body:
+        kinds = [" class='doubtful'" if _doubtful(c) else "" for c in row]
+        cells = (f"<td{kind}>{_broken(c, small=True)}</td>" for kind, c in zip(kinds, row, strict=True))
+        lines.append("<tr>" + "".join(cells) + "</tr>")
+    return "\n".join([*lines, "</table></div>"])
+
+
+def _broken(cell: str, small: bool = False) -> str:
+    """Return a cell's lines one below the other, those after the first in small print."""
+    first, *rest = map(escape_html, cell.split("\n"))
+    return "<br>".join([first, *(f"<small>{line}</small>" if small else line for line in rest)])

@@ -1,6 +1,7 @@
 """What a stage leaves to look at: figures/*.png, recording.rrd and report.md of its run folder."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,18 @@ import pandas as pd
 
 from r2s import report
 from r2s.evaluate import Episodes
-from r2s.friction import friction_torque
+from r2s.friction import SIGMOID
 from r2s.identify import Identified
 from r2s.parameters import parameter_space
 from r2s.recording import Recording
+from r2s.report_figures import (
+    convergence_figure,
+    friction_figure,
+    position_figure,
+    whiteness_figure,
+    whiteness_table,
+)
+from r2s.report_identification import identification_sections
 from r2s.residual import TorqueResidual, cut_windows, replay
 from r2s.robot import Robot
 from r2s.runs import Run
@@ -19,6 +28,7 @@ from r2s.simulator import Dynamics
 from r2s.viewer import Episode, Overlay, write_recording
 
 SHOWN = 4  # episodes, as in the paper's figures
+BLOCK_S = 0.5  # s, of TorqueResidual: what the bootstrap draws where there are no windows
 
 
 def identification(
@@ -32,33 +42,46 @@ def identification(
     window_s: float,
     cutoff_hz: float,
 ) -> None:
-    """Draw torque and position before and after, friction over the data, convergence; all on validation motion."""
+    """Write figures, report.md, report.html and recording.rrd; everything is shown on validation motion."""
     space = parameter_space(robot, nominal, {"offset": [-1.0, 1.0]})
     torque = TorqueResidual(robot, space, validation, cutoff_hz=cutoff_hz)
     motion, both = torque.motion, {"nominal": nominal, "identified": found.dynamics}
-    predicted = {label: torque.predict(d) for label, d in both.items()}
-    kind = "link-side torque" if validation.torque == "measured" else "commanded torque"
+    commanded = validation.torque == "commanded"
+    error = {label: torque.off(d) for label, d in both.items()}
+    predicted = {label: motion.tau + e for label, e in error.items()}  # beside the recorded torque, delay undone
+    kind = "commanded torque" if commanded else "link-side torque"
     title = f"{kind} of validation motion, low-pass {cutoff_hz:g} Hz"
-    pictures = [report.torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)]
-    if validation.torque == "commanded":
+    pictures = {"torque": report.torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)}
+    if commanded:
         windows = cut_windows(validation, max(window_s, 0.5) if validation.duration > 1.0 else window_s)
         replays = {label: replay(robot, d, windows) for label, d in both.items()}
-        pictures.append(report.position_figure(run.figure("position"), windows.q, replays))
-    rigid = predicted["identified"] - friction_torque(motion.dq, found.dynamics.phi)
-    visited = np.quantile(np.abs(motion.dq), 0.995, axis=0)
-    cloud = motion.dq, motion.tau - rigid
-    pictures.append(report.friction_figure(run.figure("friction"), both, visited, cloud))
-    pictures.append(report.convergence_figure(run.figure("convergence"), found.history))
+        pictures["position"] = position_figure(run.figure("position"), windows.q, replays)
+    fastest = np.maximum(np.quantile(np.abs(motion.dq), 0.995, axis=0), 0.02)
+    without = replace(found.dynamics, family=SIGMOID, phi=np.zeros((robot.n, 3)))
+    friction = torque.predict(found.dynamics) - torque.predict(without) - error["identified"]
+    draws = found.space.dynamics(found.found.samples).phi
+    pictures["friction"] = friction_figure(run.figure("friction"), both, fastest, (motion.dq, friction), draws)
+    block_s = window_s if commanded else BLOCK_S
+    pictures["whiteness"] = whiteness_figure(run.figure("whiteness"), motion.t, error, cutoff_hz, block_s)
+    pictures["convergence"] = convergence_figure(run.figure("convergence"), found.history)
     np.savez_compressed(run.folder / "torque.npz", t=motion.t, measured=motion.tau, **predicted)  # type: ignore[arg-type]
     overlay = Overlay(motion.t, motion.tau, predicted)
-    named = {p.stem: p for p in pictures if p.stem in ("friction", "convergence")}
-    write_recording(run.folder / "recording.rrd", robot, overlays={kind: overlay}, figures=named)
-    tables = report.identification_tables(robot, found, summary)
-    sections: dict[str, Sequence] = {
-        f"Identification of {robot.name}": [f"Recording: {validation.name}; torque: {kind}."]
-    }
-    sections |= {title: [table] for title, table in tables.items()}
-    report.report_markdown(run.folder / "report.md", sections | {"Figures": pictures})
+    timeless = {name: p for name, p in pictures.items() if name != "torque"}
+    write_recording(run.folder / "recording.rrd", robot, overlays={kind: overlay}, figures=timeless)
+    sections = identification_sections(
+        robot,
+        nominal,
+        found,
+        validation,
+        summary,
+        pictures=pictures,
+        fastest=fastest,
+        whiteness=whiteness_table(motion.t, error["identified"], cutoff_hz),
+        window_s=window_s,
+        cutoff_hz=cutoff_hz,
+    )
+    report.report_markdown(run.folder / "report.md", sections)
+    report.report_html(run.folder / "report.html", sections)
 
 
 def training(run: Run, robot: Robot) -> None:

@@ -1,9 +1,14 @@
 """What people read: figures that show something, tables that hold the numbers given, a recording to open."""
 
+import base64
+import re
 import subprocess
 import sys
+from dataclasses import replace
+from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -14,10 +19,11 @@ from matplotlib.image import imread
 from rerun.chunk import RrdReader
 from rich.console import Console
 
-from r2s import report, viewer
-from r2s.friction import friction_torque
-from r2s.identify import Identified
-from r2s.parameters import nominal_dynamics, parameter_space
+from r2s import report, report_figures, report_identification, tell, viewer
+from r2s.friction import BRISTLE
+from r2s.identify import Identified, prediction_errors
+from r2s.parameters import LINK, Estimate, nominal_dynamics, of_family, parameter_space
+from r2s.recording import Recording
 from r2s.robot import Robot, load_robot
 from r2s.viewer import Episode, Overlay
 
@@ -65,17 +71,51 @@ def make_overlay(n: int, rows: int = 400) -> Overlay:
     return Overlay(t, measured, {"nominal": 0.7 * measured, "identified": measured + 0.01})
 
 
+def make_identified(robot: Robot, bounds: dict, family: str = "sigmoid") -> Identified:
+    """A result: every third parameter not identifiable, the fifth unseen, draws of 1 % of the bounds."""
+    nominal = of_family(nominal_dynamics(robot, phi1=0.5, phi2=8.0, phi3=0.01), family)
+    space = parameter_space(robot, nominal, bounds)
+    rng = np.random.default_rng(0)
+    u = space.to_unit(space.start)
+    u = np.where(np.arange(len(u)) == 4, u, u + 0.05)
+    x, samples = space.from_unit(u), space.from_unit(u + 0.01 * rng.normal(size=(400, len(u))))
+    low, high = np.quantile(samples, [0.025, 0.975], axis=0)
+    found = Estimate(x, low, high, np.arange(len(x)) % 3 > 0, samples)
+    rows = [{"search": f"family {f}", "evaluations": 0, "cost": 9.0, "done": k, "total": 3, "seconds": 0.2 * k}
+            for k, f in enumerate(("sigmoid", "coulomb", "stribeck"), 1)]  # fmt: skip
+    for search, count, start in (("ga", 8, 1.0), ("torque", 3, 9.0), ("torque", 3, 12.0), ("breakaway", 3, 15.0)):
+        for k in range(1, count + 1):
+            row = {"search": search, "evaluations": 10 * k, "done": k, "total": count, "seconds": start + k}
+            rows.append(row if search == "breakaway" else row | {"cost": 100.0 / k})
+    null = [(0.97, {"phi1[2]": -0.8, "phi2[2]": 0.6}), (0.9, {space.names[4]: 1.0})]
+    families = {"sigmoid": 1.0, "coulomb": 1.21, "stribeck": 1.01}
+    return Identified(space, found, pd.DataFrame(rows), families, null, [space.names[4]])
+
+
+BOUNDS = {"phi1": [0.05, 5], "phi2": [1, 50], "offset": [-1, 1], "delay": [0, 0.01]}
+SCALES = BOUNDS | {"inertia_scale": [0.2, 5]}
+LINKS = BOUNDS | {name: [-0.5, 0.5] for name in LINK}
+
+
 @pytest.fixture(scope="module")
 def identified(panda) -> Identified:
-    nominal = nominal_dynamics(panda, phi1=0.5, phi2=8.0, phi3=0.01)
-    bounds = {"phi1": [0.05, 5], "phi2": [1, 50], "inertia_scale": [0.2, 5], "offset": [-1, 1]}
-    space = parameter_space(panda, nominal, bounds)
-    x = space.from_unit(space.to_unit(space.start) + 0.05)
-    known = np.arange(len(x)) % 3 > 0
-    rows = [{"search": "ga", "evaluations": 10 * k, "cost": 100.0 / k, "seconds": k} for k in range(1, 9)]
-    rows += [{"search": "breakaway", "evaluations": 9, "seconds": 9.0 + k} for k in range(3)]
-    rows += [{"search": "least_squares", "evaluations": 9, "cost": 5.0 / k, "seconds": 12.0 + k} for k in (1, 2)]
-    return Identified(space, x, (x - 0.123, x + 0.123), known, pd.DataFrame(rows))
+    return make_identified(panda, SCALES)
+
+
+@pytest.fixture(scope="module")
+def recording(panda) -> Recording:
+    """Two trajectories of a sway about home, with a pause between them."""
+    t = 1e-3 * np.arange(1200)
+    w = 2 * np.pi * (0.6 + 0.1 * np.arange(panda.n))
+    q = panda.q_home + 0.2 * np.sin(w * t[:, None])
+    tau = np.tanh(5 * np.cos(w * t[:, None])) + 0.01 * np.random.default_rng(0).normal(size=q.shape)
+    both = {
+        "q": np.tile(q, (2, 1)),
+        "dq": np.tile(0.2 * w * np.cos(w * t[:, None]), (2, 1)),
+        "tau": np.tile(tau, (2, 1)),
+    }
+    trajectory = np.repeat([0, 1], len(t))
+    return Recording(t=np.r_[t, t + 20], **both, torque="commanded", trajectory=trajectory, name="sway")
 
 
 @pytest.fixture
@@ -105,14 +145,17 @@ def figures(folder: Path, robot: Robot, found: Identified) -> list[Path]:
     windows = rng.normal(size=(9, 40, robot.n))
     near = {"nominal": windows + 0.01 * rng.normal(size=windows.shape), "identified": windows}
     dq = rng.uniform(-2, 2, (300, robot.n))
-    cloud = dq, friction_torque(dq, found.dynamics.phi)
+    cloud = dq, found.dynamics.friction(dq)
     laws = {"nominal": found.space.nominal, "identified": found.dynamics}
+    draws = found.space.dynamics(found.found.samples).phi
     episodes = {"mujoco": [make_episode(robot, k) for k in range(5)], "arm": [make_episode(robot, 9)]}
+    errors = {name: tau - overlay.measured for name, tau in overlay.predicted.items()}
     return [
         report.torque_figure(folder / "torque.png", overlay.t, overlay.measured, overlay.predicted, "torque"),
-        report.position_figure(folder / "position.png", windows, near),
-        report.friction_figure(folder / "friction.png", laws, robot.dq_max, cloud),
-        report.convergence_figure(folder / "convergence.png", found.history),
+        report_figures.position_figure(folder / "position.png", windows, near),
+        report_figures.friction_figure(folder / "friction.png", laws, robot.dq_max, cloud, draws),
+        report_figures.convergence_figure(folder / "convergence.png", found.history),
+        report_figures.whiteness_figure(folder / "whiteness.png", overlay.t, errors, 10.0, 0.4),
         report.learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
         report.reach_figure(folder / "reach.png", episodes),
     ]
@@ -204,19 +247,238 @@ def test_colours_are_fixed_by_meaning_and_differ():
     assert found["twin, nominal"] == viewer.colours(["nominal"])["nominal"]
 
 
+SUMMARY = {
+    "torque_rmse_Nm": [0.111] * 7,
+    "nominal_torque_rmse_Nm": [0.444] * 6 + [0.1],
+    "position_rmse_mrad": [1.5] * 7,
+    "nominal_position_rmse_mrad": [6.25] * 7,
+    "ee_error_mm": {"0.1": 0.81, "2": 77.0},
+    "nominal_ee_error_mm": {"0.1": 4.21, "2": 451.0},
+}
+
+
 def test_the_identification_table_holds_the_numbers_in_110_columns(console, panda, identified):
-    errors = {"torque_rmse_Nm": [0.111] * 7, "nominal_torque_rmse_Nm": [0.444] * 7}
-    commanded = {"position_rmse_mrad": [1.5] * 7, "nominal_position_rmse_mrad": [6.25] * 7}
-    reached = {"ee_error_mm": {"0.1": 0.81, "2": 77.0}, "nominal_ee_error_mm": {"0.1": 4.21, "2": 451.0}}
-    summary = {"train": errors | commanded | reached, "validation": errors}
-    report.identification_table(console, panda, identified, summary)
+    report.identification_table(console, panda, identified, {"train": SUMMARY, "validation": SUMMARY})
     text = printed(console)
     assert max(map(len, text.splitlines())) <= 110
-    x = identified.space.block(identified.x, "phi1")[1]
-    parameters = (f"0.5 → {x:.3g}", f"[{x - 0.123:.3g}, {x + 0.123:.3g}]")
-    for expected in (*parameters, "0.111", "0.444", "0.25", "6.25", "0.81", "451", "mean"):
+    f = identified.found
+    parameters = (f"0.5 → {f.x[1]:.3g}", f"[{f.low[1]:.3g}, {f.high[1]:.3g}]", f"0 → {1e3 * f.x[21]:.3g}")
+    for expected in (*parameters, "0.111", "0.444", "0.25", "6.25", "0.81", "451", "mean", "delay, ms"):
         assert expected in text
-    assert text.count(" ? ") == np.sum(~identified.identifiable)
+    assert text.count(report.UNSEEN) == 1 + text.count("?: it is wider")
+    assert text.count(" ? ") == np.sum(~f.identifiable)
+
+
+def test_ten_numbers_per_link_take_one_line_in_the_terminal(console, panda):
+    found = make_identified(panda, LINKS)
+    report.identification_table(console, panda, found, {})
+    text = printed(console)
+    assert max(map(len, text.splitlines())) <= 110
+    assert "link_" not in text
+    assert f"{panda.mass[3]:.3g} → {found.dynamics.mass[3]:.3g}" in text
+    assert len(text.splitlines()) < 60
+
+
+def everything(robot, found, recording, **more) -> dict:
+    how = {
+        "pictures": {},
+        "fastest": np.ones(robot.n),
+        "whiteness": pd.DataFrame(),
+        "window_s": 0.2,
+        "cutoff_hz": 10.0,
+    }
+    summary = {"train": SUMMARY | {"seconds": 8.0}, "validation": SUMMARY | {"seconds": 2.0}}
+    nominal = more.pop("nominal", found.space.nominal)
+    return report_identification.identification_sections(robot, nominal, found, recording, summary, **how | more)
+
+
+def words_of(sections: dict) -> str:
+    """Everything that is not a table."""
+    items = [i for section in sections.values() for i in section]
+    return "\n".join(line for i in items if isinstance(i, (str, list)) for line in ([i] if isinstance(i, str) else i))
+
+
+def tables_of(sections: dict, title: str) -> list[pd.DataFrame]:
+    return [
+        i for heading, items in sections.items() if title in heading for i in items if isinstance(i, pd.DataFrame)
+    ]
+
+
+def test_tables_one_to_four_hold_old_new_and_interval(panda, identified, recording):
+    sections, f, space = everything(panda, identified, recording), identified.found, identified.space
+    offsets = tables_of(sections, "Table I:")[0]
+    assert offsets["new"].str.removesuffix(" ?").astype(float).to_numpy() == pytest.approx(
+        space.block(f.x, "offset"), rel=6e-3
+    )
+    assert offsets.loc["2", "95 % interval"] == f"[{f.low[15]:.3g}, {f.high[15]:.3g}]"
+    scales, tensors = tables_of(sections, "Table III")
+    assert list(tensors.columns) == ["Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"]
+    assert tensors.loc["3", "Ixz"].startswith(f"{1e3 * panda.inertia[2, 0, 2]:.3g} → ")
+    assert scales.loc["3", "new"].split()[0] == f"{space.block(f.x, 'inertia_scale')[2]:.3g}"
+    friction = tables_of(sections, "Table IV")[0]
+    assert friction.loc["5", "phi1\nNm"] == f"0.5\n{report.UNSEEN}"
+    assert friction.loc["1", "phi1\nNm"].split("\n")[0].endswith(" ?")
+
+
+def test_mass_and_centre_carry_the_interval_of_the_joint_distribution(panda, recording):
+    """The mass goes with exp(2 alpha), and is told where alpha is."""
+    found = make_identified(panda, LINKS)
+    links, tensors = tables_of(everything(panda, found, recording), "Table III")
+    alpha = found.space.block(found.found.samples, "link_alpha")
+    low, high = panda.mass[1] * np.exp(2 * np.quantile(alpha[:, 1], [0.025, 0.975]))
+    value, interval = links.loc["2", "mass, kg"].split("\n")
+    assert [float(x) for x in interval.strip("[]").split(", ")] == pytest.approx([low, high], rel=6e-3)
+    known = dict(zip(found.space.names, found.found.identifiable, strict=True))
+    assert value.endswith("?") == (not known["link_alpha[2]"])
+    assert len(tensors.columns) == 6
+
+
+def test_breakaway_is_told_as_it_was_measured(panda, identified, recording):
+    edges = np.stack([np.full(7, -0.3), np.full(7, 0.4)], -1)
+    old = identified.space.nominal
+    scanned = replace(identified, space=replace(identified.space, nominal=replace(old, breakaway=edges)))
+    sections = everything(panda, scanned, recording, nominal=old)
+    assert tables_of(sections, "Table II:")[0].loc["1"].tolist() == ["0", "-0.3", "0", "0.4"]
+    assert "looked for in the recording" in words_of(sections)
+    spread = np.full((7, 2), 0.01)
+    spread[6, 1] = np.nan
+    ramped = tables_of(everything(panda, replace(scanned, break_spread=spread), recording, nominal=old), "Table II:")[
+        0
+    ]
+    assert ramped.loc["1", "negative\n95 % interval"] == "[-0.32, -0.28]"
+    assert ramped.loc["1", "positive\nrepeatability"] == "0.01"
+    assert ramped.loc["7", "positive\nrepeatability"] == ramped.loc["7", "positive\n95 % interval"] == "-"
+    measured = replace(recording, torque="measured")
+    assert not tables_of(everything(panda, scanned, measured, nominal=old), "Table II:")
+
+
+def test_bristles_hold_without_a_dead_zone(panda, recording):
+    bounds = {"coulomb": [0.05, 5], "asymmetry": [-0.5, 0.5], "viscous": [0, 5], "rise": [0, 1]}
+    found = make_identified(panda, bounds, "bristle")
+    p = found.dynamics.phi[2]
+    held = tables_of(everything(panda, found, recording), "Table II:")[0]
+    assert held.loc["3", "negative\nnew"] == f"{-p[0] * (1 - p[1]) * (1 + p[3]):.3g}"
+    assert found.dynamics.family == BRISTLE
+
+
+def test_what_the_data_cannot_tell_is_said_in_words(panda, identified, recording):
+    text = words_of(everything(panda, identified, recording))
+    assert "97 %: 0.80 phi1 of joint 2 - 0.60 phi2 of joint 2" in text
+    assert "phi1 of joint 5" in text
+    assert "and 1 more, mostly of the numbers kept nominal" in text
+    assert "worse than nominal: joint 7 (1.11)" in text
+    assert "low-passed at 10 Hz" in text
+    assert "40 Hz (4 times the cutoff)" in text
+    everywhere = [f"{b}[{j}]" for b in ("phi3", "link_d1") for j in range(1, 8)] + ["delay"]
+    assert report_identification._grouped(everywhere, 7) == "phi3 of all joints; d1 of all links; delay"
+
+
+def test_the_family_that_was_chosen_is_named(panda, identified, recording):
+    families = tables_of(everything(panda, identified, recording), "families")[0]
+    assert families.loc["coulomb"].tolist() == ["1.210", ""]
+    assert families.loc["sigmoid"].tolist() == ["1.000", "chosen"]
+
+
+def test_filtered_white_noise_is_called_white_and_a_drift_is_not():
+    """In 40 draws, far lags leave the band as often as they should; pauses do not matter."""
+    rng, t = np.random.default_rng(1), 1e-3 * np.arange(30_000)
+    noise = rng.normal(size=(len(t), 40))
+    zero = np.zeros((len(t), 40))
+    motion = Recording(t=t, q=zero, dq=zero, tau=noise, torque="measured", trajectory=np.zeros(len(t)))
+    tau, t = motion.smooth(10.0).tau[::10], t[::10]
+    paused = t + 5.0 * (t > 12.0)
+    column = "far lags outside the band, %"
+    for clock in (t, paused):
+        outside = report_figures.whiteness_table(clock, tau, 10.0)[column].astype(float)
+        assert 2 < outside.mean() < 9
+    slow = tau + 0.3 * np.sin(2 * np.pi * 0.2 * t)[:, None]
+    table = report_figures.whiteness_table(t, slow, 10.0)
+    assert table[column].astype(float).min() > 50
+    assert float(table.loc["1", "mean, Nm"]) == pytest.approx(slow[:, 0].mean(), rel=1e-2, abs=1e-3)
+
+
+def test_autocorrelation_does_not_cross_a_pause():
+    t = np.r_[np.arange(50), 500 + np.arange(50)] * 0.01
+    x = np.repeat([1.0, -1.0], 50)[:, None]
+    assert report_figures.autocorrelation(t, x, 30)[:, 0] == pytest.approx(np.ones(30))
+    assert report_figures.autocorrelation(0.01 * np.arange(100), x, 30)[-1, 0] < 0.6
+
+
+def test_seconds_of_a_resumed_run_go_on():
+    assert report_figures._running(np.array([1.0, 2.0, 0.5, 1.5])).tolist() == [1.0, 2.0, 2.5, 3.5]
+
+
+def test_pauses_are_cut_short():
+    clock, pauses = report.clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
+    assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
+    assert pauses.tolist() == [3, 5]
+
+
+class Page(HTMLParser):
+    """Collects tags, attributes and text, and checks that what opens closes."""
+
+    def __init__(self):
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[tuple[str, dict]] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):  # noqa: D102
+        self.seen.append((tag, dict(attrs)))
+        if tag not in ("meta", "br", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):  # noqa: D102
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):  # noqa: D102
+        self.text += data
+
+
+def test_the_html_report_is_one_file_that_loads_nothing(tmp_path, panda, identified):
+    picture = report_figures.convergence_figure(tmp_path / "convergence.png", identified.history)
+    table = pd.DataFrame({"a <b>": ["1 ?\n[0, 2]", "x & y"]}, index=pd.Index(["1", "2"], name="joint"))
+    sections = {"Title <script>": ["5 < 6"], "Numbers": [table, ["one", "two"], picture], "Last": ["end"]}
+    text = report.report_html(tmp_path / "report.html", sections).read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    assert page.open == []
+    for expected in ("Title <script>", "5 < 6", "a <b>", "1 ?", "[0, 2]", "x & y", "one", "end"):
+        assert expected in page.text
+    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.seen}
+    assert not re.search(r"https?:|url\(|@import", text)
+    sources = [a["src"] for tag, a in page.seen if tag == "img"]
+    assert base64.b64decode(sources[0].removeprefix("data:image/png;base64,")) == picture.read_bytes()
+    assert [a.get("src") for _, a in page.seen if "src" in a] == sources
+    targets = {a["href"].removeprefix("#") for _, a in page.seen if "href" in a}
+    assert targets == {a["id"] for _, a in page.seen if "id" in a} == {"s1", "s2"}
+
+
+@pytest.mark.parametrize("torque", ["commanded", "measured"])
+def test_identification_tells_everything_at_once(tmp_path, panda, identified, recording, torque):
+    """Figures, both reports and the recording; the torque shown misses by what summary.json says."""
+    recording, nominal = replace(recording, torque=torque), identified.space.nominal
+    how = {"window_s": 0.2, "cutoff_hz": 10.0}
+    errors = prediction_errors(panda, nominal, identified.dynamics, recording, nthread=1, **how)
+
+    def figure(name: str) -> Path:
+        return tmp_path / f"{name}.png"
+
+    run = SimpleNamespace(folder=tmp_path, figure=figure)
+    summary = {"train": errors, "validation": errors}
+    tell.identification(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
+    with np.load(tmp_path / "torque.npz") as saved:
+        for name, key in (("identified", "torque_rmse_Nm"), ("nominal", "nominal_torque_rmse_Nm")):
+            assert np.sqrt(((saved[name] - saved["measured"]) ** 2).mean(0)) == pytest.approx(errors[key])
+    drawn = {"torque", "friction", "whiteness", "convergence"} | ({"position"} if torque == "commanded" else set())
+    assert {p.stem for p in tmp_path.glob("*.png")} == drawn
+    assert {f"/figures/{name}" for name in drawn - {"torque"}} <= entities(tmp_path / "recording.rrd")
+    html, text = ((tmp_path / f"report.{end}").read_text(encoding="utf-8") for end in ("html", "md"))
+    assert html.count("<img ") == text.count("![") == len(drawn)
+    assert "sway" in html
+    for title in ("Table I:", "Table II:", "Table III:", "Table IV:", "What the data cannot tell"):
+        assert title in html
+        assert f"## {title}" in text
 
 
 def test_the_reach_table_shows_percent_and_dashes_for_what_is_missing(console):
@@ -237,5 +499,7 @@ def test_the_markdown_report_links_figures_relative_and_holds_the_tables(tmp_pat
     assert "](figures/a%20b.png)" in text
     assert str(tmp_path) not in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert len(rows) == panda.n + 2
-    assert len({line.count("|") for line in rows}) == 1
+    assert len(rows) == sum(len(table) + 2 for table in tables.values())
+    for table in tables.values():
+        own, rows = rows[: len(table) + 2], rows[len(table) + 2 :]
+        assert {line.count("|") for line in own} == {len(table.columns) + 2}
