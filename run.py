@@ -26,7 +26,8 @@ def make_dynamics(cfg, robot):
     from r2s.parameters import load_parameters, nominal_dynamics
 
     if cfg.calibration:
-        return load_parameters(cfg.calibration, robot)
+        space, x = load_parameters(cfg.calibration, robot)
+        return space.dynamics(x)
     return nominal_dynamics(robot, **plain(cfg.friction), inertia_scale=plain(cfg.inertia.scale))
 
 
@@ -38,11 +39,19 @@ def make_task(cfg):
     return Task(**settings)  # type: ignore[arg-type]
 
 
-def make_draw(cfg, center):
+def make_draw(cfg, robot, center):
     """Return the domain randomization of conf/dr about `center`: (rng, m) -> Dynamics."""
     from r2s import randomization
+    from r2s.errors import UserError
+    from r2s.parameters import load_parameters, load_posterior
 
     settings = plain(cfg.dr)
+    if settings.pop("name") == "identified":
+        if not cfg.calibration:
+            raise UserError("dr=identified draws from what was identified: give calibration=RUN_FOLDER as well")
+        space, _ = load_parameters(cfg.calibration, robot)
+        samples = load_posterior(cfg.calibration, space)
+        return lambda rng, m: randomization.draw_identified(rng, space, samples, m)
     return lambda rng, m: randomization.draw(rng, center, m, **settings)
 
 
@@ -73,6 +82,7 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         threads=cfg.threads,
         inputs=inputs,
         parents=parents,
+        resume=cfg.resume,
     )
 
 
@@ -90,6 +100,16 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 110)
 
 
+def learner(name):
+    """Return the class of conf/algo."""
+    from r2s.ddpg import DDPG
+    from r2s.sac import SAC
+    from r2s.td3 import TD3
+    from r2s.tqc import TQC
+
+    return {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC}[name]
+
+
 def set_threads(cfg):
     """Give torch its threads and seed; the physics gets its own from cfg.threads."""
     import torch
@@ -101,73 +121,146 @@ def set_threads(cfg):
 # --- stages ---------------------------------------------------------------------------------------------------
 
 
+def make_source(cfg, robot, seed):
+    """Return what is recorded: conf/arm, or a simulated arm of known truth."""
+    if cfg.data.kind != "simulated":
+        return make_arm(cfg, robot)
+    from dataclasses import replace
+
+    from omegaconf import OmegaConf
+
+    from r2s.arm.simulated import SimulatedArm
+    from r2s.parameters import nominal_dynamics
+
+    truth = plain(OmegaConf.load(CONF / "friction" / f"{cfg.data.truth}.yaml"))
+    scale = plain(OmegaConf.load(CONF / "inertia" / f"{cfg.data.truth}.yaml"))["scale"]
+    dynamics = replace(nominal_dynamics(robot, **truth, inertia_scale=scale), delay=cfg.data.delay, lag=cfg.data.lag)
+    noise = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
+    return SimulatedArm(robot, dynamics, **noise, seed=seed)
+
+
 def record_motion(cfg, robot, seed, label):
-    """Return a recording of an excitation on conf/arm, or on a simulated arm of known truth."""
-    from r2s.arm.interface import ArmStopped
+    """Return a recording of an excitation, the motion of data.excitation or an optimised one."""
     from r2s.arm.record import record
-    from r2s.errors import UserError
-    from r2s.excitation import fourier
+    from r2s.excitation import fourier, load
     from r2s.runs import Progress
 
-    if cfg.data.kind == "simulated":
-        from omegaconf import OmegaConf
-
-        from r2s.arm.simulated import SimulatedArm
-        from r2s.parameters import nominal_dynamics
-
-        truth = plain(OmegaConf.load(CONF / "friction" / f"{cfg.data.truth}.yaml"))
-        scale = plain(OmegaConf.load(CONF / "inertia" / f"{cfg.data.truth}.yaml"))["scale"]
-        noise = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
-        arm = SimulatedArm(robot, nominal_dynamics(robot, **truth, inertia_scale=scale), **noise, seed=seed)
-    else:
-        arm = make_arm(cfg, robot)
     progress = Progress(label)
-    motion = fourier(robot, duration=cfg.data.seconds, seed=seed)
-    try:
-        out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
-    except ArmStopped as stop:
-        raise UserError(f"the arm stopped while it was recorded: {stop}") from None
+    if cfg.data.excitation and seed == cfg.data.excitation_seed:
+        motion = load(cfg.data.excitation, robot)
+    else:
+        motion = fourier(robot, duration=cfg.data.seconds, seed=seed)
+    arm = make_source(cfg, robot, seed)
+    out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
+    return motion, out
+
+
+def record_ramps(cfg, robot):
+    """Return the ramps of the breakaway protocol about the home posture, or None where none are asked for."""
+    import numpy as np
+
+    from r2s.arm.ramp import ramp
+    from r2s.runs import Progress
+
+    if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
+        return None
+    progress = Progress("ramp the joints until they move")
+    turn = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
+    poses = [robot.q_home + k * turn for k in range(cfg.data.ramp_poses)]
+    poses = np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
+    out = ramp(
+        make_source(cfg, robot, cfg.data.excitation_seed + 2),
+        poses,
+        progress=lambda k, n: progress(k / n, f"{k} ramps"),
+    )
+    progress.close(f"{out.recording.duration:.1f} s of ramps")
     return out
+
+
+def read_motion(cfg, robot):
+    """Return training and validation motion of data.path and data.validation; they must not share motion."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from r2s.errors import UserError
+    from r2s.identify import check_recording
+    from r2s.readers import read
+
+    how = {k: plain(cfg.data[k]) for k in ("torque", "columns", "period", "max_gap_s", "topic", "joints")}
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
+    recording = read(cfg.data.path, **how)
+    check_recording(robot, recording)
+    if not cfg.data.validation:
+        if how["period"] is None and (period := recording.repeats_after()):
+            print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
+            recording = replace(recording, period=period)
+        return recording.split(cfg.identify.validation_fraction)
+    if os.path.realpath(cfg.data.validation) == os.path.realpath(cfg.data.path):
+        raise UserError("data.validation is the training file itself: it must hold other motion")
+    validation = read(cfg.data.validation, **how)
+    check_recording(robot, validation)
+    rows = {row.tobytes() for row in np.column_stack([recording.q, recording.dq])}
+    same = sum(row.tobytes() in rows for row in np.column_stack([validation.q, validation.dq]))
+    if same > 0.01 * len(validation.t):
+        raise UserError(
+            f"data.validation: {same} of its {len(validation.t)} rows are rows of the training file; it must hold "
+            "other motion"
+        )
+    return recording, validation
 
 
 def identify(cfg, overrides):
     """Recording -> parameters.yaml, errors on training and validation motion, figures."""
-    from dataclasses import replace
-
     from hydra.utils import instantiate
 
     from r2s import report, tell
+    from r2s.arm.interface import ArmStopped
+    from r2s.breakaway import Ramps
     from r2s.errors import UserError
+    from r2s.excitation import load
+    from r2s.identify import check_choices, prediction_errors
     from r2s.identify import identify as run_identify
-    from r2s.identify import prediction_errors
     from r2s.parameters import save_parameters
-    from r2s.readers import read
+    from r2s.readers import files_of, read
     from r2s.runs import Progress
 
     robot, settings = make_robot(cfg), plain(cfg.identify)
     nominal = make_dynamics(cfg, robot)
-    inputs = []
+    for terms in settings["terms"].values():
+        check_choices(cfg.friction.family, terms)
+    inputs, ramps = [], None
     if cfg.data.kind == "recording":
-        how = {k: plain(cfg.data[k]) for k in ("torque", "columns", "period", "max_gap_s")} | {"n_joints": robot.n}
-        recording = read(cfg.data.path, **how)
-        if how["period"] is None and not cfg.data.validation and (period := recording.repeats_after()):
-            print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
-            recording = replace(recording, period=period)
-        inputs = [cfg.data.path]
-        if cfg.data.validation:
-            if os.path.realpath(cfg.data.validation) == os.path.realpath(cfg.data.path):
-                raise UserError("data.validation is the training file itself: it must hold other motion")
-            train, validation = recording, read(cfg.data.validation, **how)
-            inputs.append(cfg.data.validation)
-        else:
-            train, validation = recording.split(settings["validation_fraction"])
+        train, validation = read_motion(cfg, robot)
+        inputs = [f for p in (cfg.data.path, cfg.data.validation) if p for f in files_of(p)]
+        if cfg.data.ramps:
+            ramps = Ramps.load(cfg.data.ramps)
+            inputs.append(cfg.data.ramps)
+    elif cfg.data.excitation:
+        load(cfg.data.excitation, robot)  # a wrong file is said before a folder is made
+        inputs = [cfg.data.excitation]
     with open_run(cfg, overrides, inputs) as run:
         if cfg.data.kind != "recording":
-            train = record_motion(cfg, robot, cfg.data.excitation_seed, "record training motion")
-            validation = record_motion(cfg, robot, cfg.data.excitation_seed + 1, "record validation motion")
-            train.save(run.folder / "train.npz")
-            validation.save(run.folder / "validation.npz")
+
+            def recorded(name, seed, label):
+                path = run.folder / f"{name}.npz"
+                if not path.is_file():
+                    motion, out = record_motion(cfg, robot, seed, label)
+                    motion.save(run.folder / f"excitation_{name}.csv")
+                    out.save(path)
+                return read(path, torque=cfg.data.torque)
+
+            try:
+                train = recorded("train", cfg.data.excitation_seed, "record training motion")
+                validation = recorded("validation", cfg.data.excitation_seed + 1, "record validation motion")
+                path = run.folder / "ramps.npz"
+                ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
+                if ramps is not None and not path.is_file():
+                    ramps.save(path)
+            except ArmStopped as stop:
+                raise UserError(f"the arm stopped while it was recorded: {stop}") from None
         progress = Progress("identify")
 
         def told(row):
@@ -183,13 +276,19 @@ def identify(cfg, overrides):
             [instantiate(s) for s in cfg.search],
             bounds=settings["bounds"],
             prior=settings["prior"][train.torque],
+            terms=settings["terms"][train.torque],
+            family=cfg.friction.family,
+            ramps=ramps,
             window_s=settings["window_s"],
             stride=settings["stride"],
             cutoff_hz=settings["cutoff_hz"],
-            breakaway=settings["breakaway"],
+            breakaway_max=settings["breakaway"],
             folds=settings["folds"],
+            keep_nominal=settings["keep_nominal"],
+            seed=cfg.seed,
             nthread=cfg.threads,
             report=told,
+            memo=run.memo,
         )
         progress.close()
         how = {"window_s": settings["window_s"], "cutoff_hz": settings["cutoff_hz"], "nthread": cfg.threads}
@@ -198,8 +297,12 @@ def identify(cfg, overrides):
             for side, data in (("train", train), ("validation", validation))
         }
         source = {"recording": train.name, "torque": train.torque, "run": str(run.folder)}
-        result = found.space, found.x, found.interval, found.identifiable
-        save_parameters(run.folder / "parameters.yaml", robot, *result, source)
+        note = {
+            "unseen_and_left_nominal": found.unseen,
+            "decided_by_the_prior": [{"share_of_prior_left": round(s, 2), **v} for s, v in found.null_directions],
+            "families_compared": found.families,
+        }
+        save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         run.summary(summary)
         drawn = {k: settings[k] for k in ("window_s", "cutoff_hz")}
@@ -221,7 +324,6 @@ def train(cfg, overrides):
     from r2s.policy import export_onnx, load_policy, save_policy
     from r2s.rewards import curriculum
     from r2s.runs import Progress
-    from r2s.tqc import TQC
     from r2s.train import Budget
     from r2s.train import train as run_train
 
@@ -229,7 +331,7 @@ def train(cfg, overrides):
         raise UserError("budget: set budget.minutes or budget.env_steps; a training needs an end")
     robot, task, settings = make_robot(cfg), make_task(cfg), plain(cfg.algo)
     center = make_dynamics(cfg, robot)
-    draw = make_draw(cfg, center)
+    draw = make_draw(cfg, robot, center)
     set_threads(cfg)
     loop = {k: settings.pop(k) for k in LOOP}
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
@@ -237,7 +339,7 @@ def train(cfg, overrides):
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
     torque = torch.from_numpy(task.torque(robot))
     mean, std = (torch.from_numpy(s) for s in observation_scale(robot, task))
-    algo = TQC((mean, std), torque, **settings)
+    algo = learner(name)((mean, std), torque, **settings)
     weights = partial(curriculum, **plain(cfg.reward))
     best: dict = {}
     last: dict = {}
@@ -307,7 +409,7 @@ def transfer(cfg, overrides):
     rows, episodes = {}, {}
     with open_run(cfg, overrides, parents=[str(source)]) as run:
         if cfg.simulator.name == "mujoco":
-            draw = make_draw(trained, make_dynamics(trained, robot))
+            draw = make_draw(trained, robot, make_dynamics(trained, robot))
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
         if cfg.arm.name != "none":
@@ -441,6 +543,29 @@ def check_overrides(words):
     GlobalHydra.instance().clear()
 
 
+def resumed(cfg, overrides):
+    """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
+    import json
+
+    from omegaconf import OmegaConf
+
+    from r2s.errors import UserError, nearest
+
+    folder = Path(cfg.resume)
+    if not (folder / "config.yaml").is_file():
+        names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
+        raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
+    if extra := [o for o in overrides if not o.startswith("resume=")]:
+        raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
+    before = OmegaConf.load(folder / "config.yaml")
+    if before.stage != "identify":
+        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify")
+    if json.loads((folder / "meta.json").read_text())["status"] == "done":
+        raise UserError(f"resume: {folder} is finished")
+    before.resume = str(folder)
+    return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
+
+
 def check_number(key, before, after):
     """Raise UserError where a number of the config was replaced by a word."""
     from omegaconf import OmegaConf
@@ -473,6 +598,8 @@ def main():
 
         overrides = list(HydraConfig.get().overrides.task)
         try:
+            if cfg.resume:
+                cfg, overrides = resumed(cfg, overrides)
             STAGES[cfg.stage](cfg, overrides)
         except (UserError, FloatingPointError) as error:
             sys.exit(stop(error))

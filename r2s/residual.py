@@ -6,24 +6,38 @@ candidates and windows at once on one Batch. Short windows keep the problem well
 drifts, and after seconds the error says more about the drift than about the parameters.
 
 Measured link-side torque (with gravity): there is no command to replay, so the residual is the torque that rigid
-dynamics, friction and offset predict at the measured motion, against the measured torque.
+dynamics, friction and offset predict at the measured motion, against the measured torque. It exists for commanded
+torque, too, where it is a fast start.
+
+Both are in units of their own standard deviation, as far as `adapt` could tell it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
-from scipy.signal import savgol_filter
+from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
+from scipy.sparse import csr_array
 
+from r2s.actuation import Motors
 from r2s.errors import UserError
-from r2s.friction import friction_torque
-from r2s.parameters import ParameterSpace
+from r2s.friction import BRISTLE, WIDTH_DQ, presliding
+from r2s.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
 from r2s.recording import Recording
+from r2s.regressor import GRAVITY, Links, regressor, rigid_body
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
 
-ENCODER_MRAD = 0.2  # what replays of 0.2 s miss through encoder noise in their start state
 VELOCITY_SAMPLES = 31  # Savitzky-Golay window for a window's start state, samples at 1 kHz
+PRESLIDING = 1e-3  # rad, over which friction turns, where it is not searched
+HISTORY = 40  # ms of commands before a window: what delay and lag still remember
+USUAL, HUBER = (
+    0.9,
+    1.5,
+)  # share of windows that noise is estimated from; size, over the median, from which less counts
+LONGEST = 40  # rows: a residual that drifts slowly is not one single row
+FRICTION_HZ = 500  # friction is evaluated this often, then filtered as the torque is
+FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over that of the torque
+Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite differences by start state and torque
 
 
 @dataclass(frozen=True)
@@ -32,6 +46,8 @@ class Windows:
 
     Attributes:
         t: (W,) s, start. q0, dq0: (W, n) rad, rad/s. tau: (W, S, n) Nm, one row per 1 ms step.
+        before: (W, HISTORY, n) Nm, the commands before the start. turn: (W, n), how far the motion before it bent the
+            bristles of friction with a memory.
         q: (W, S, n) rad, after each step.
     """
 
@@ -39,7 +55,15 @@ class Windows:
     q0: np.ndarray
     dq0: np.ndarray
     tau: np.ndarray
+    before: np.ndarray
     q: np.ndarray
+    turn: np.ndarray
+
+    def felt(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
+        """Return (W, S, n) Nm, what the joints feel of the commands after `delay` and `lag`, s."""
+        motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
+        motors.reset(tau=self.before[:, 0])
+        return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
 
 
 def cut_windows(recording: Recording, seconds: float, limit: int | None = None) -> Windows:
@@ -53,12 +77,15 @@ def cut_windows(recording: Recording, seconds: float, limit: int | None = None) 
     """
     grid = recording.resample(SIM_DT)
     steps = round(seconds / SIM_DT)
-    q, dq, starts = np.empty_like(grid.q), np.empty_like(grid.q), []
+    q, dq, turn, starts = np.empty_like(grid.q), np.empty_like(grid.q), np.empty_like(grid.q), []
+    first = np.empty(len(grid.t), dtype=int)
     for s in grid.stretches:
+        first[s] = s.start
         if s.stop - s.start <= max(steps, VELOCITY_SAMPLES):
             continue
         q[s] = savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, axis=0)
         dq[s] = savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
+        turn[s] = presliding(dq[s], SIM_DT, PRESLIDING)
         starts += list(range(s.start, s.stop - steps, steps))
     if not starts:
         longest = max(s.stop - s.start for s in grid.stretches) * SIM_DT
@@ -67,24 +94,37 @@ def cut_windows(recording: Recording, seconds: float, limit: int | None = None) 
     if limit is not None and len(at) > limit:
         at = at[np.linspace(0, len(at) - 1, limit).round().astype(int)]
     rows = at[:, None] + np.arange(steps)
-    return Windows(t=grid.t[at], q0=q[at], dq0=dq[at], tau=grid.tau[rows], q=grid.q[rows + 1])
+    earlier = np.maximum(at[:, None] - np.arange(HISTORY, 0, -1), first[at][:, None])
+    return Windows(
+        t=grid.t[at],
+        q0=q[at],
+        dq0=dq[at],
+        tau=grid.tau[rows],
+        before=grid.tau[earlier],
+        q=grid.q[rows + 1],
+        turn=turn[at],
+    )
 
 
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
     """Return q (W, S, n) rad that an arm with these dynamics does in each window."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
-    sim.reset(windows.q0, windows.dq0)
-    return sim.rollout(windows.tau)["qpos"]
+    sim.reset(windows.q0, windows.dq0, turn=windows.turn)
+    return sim.rollout(windows.felt(dynamics.delay, dynamics.lag))["qpos"]
 
 
 class ReplayResidual:
-    """Residual of a commanded recording: simulated minus recorded joint angles in mrad, every `stride` ms.
+    """Residual of a commanded recording: simulated minus recorded joint angles, every `stride` ms, made white.
 
-    With `limit`, that many windows. Within a window a joint counts until it is slower than `slowest` rad/s for the
-    first time.
+    Within a window a joint counts until it is slower than `slowest` rad/s for the first time: inside the dead zone
+    its angle jumps with the parameters. With `limit`, that many windows.
 
-    Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to (errors within a
-    window are correlated, so intervals count windows, not samples).
+    A window's error has three sources, and generalised least squares weighs rows by what they make together:
+        error = Z b + e,   b ~ N(0, diag(d)) start angle, start velocity and a torque that no candidate explains,
+        constant over the window, per joint;   e ~ N(0, s^2) encoder noise.
+    Z are finite differences about a candidate; d and s come from the recording, later from what is left (`adapt`).
+
+    Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to.
     """
 
     unit = "mrad"
@@ -107,51 +147,157 @@ class ReplayResidual:
         self.count = len(w.q0)
         self._every = slice(stride - 1, None, stride)
         self._target = w.q[:, self._every]
-        # once a joint was inside the dead zone its angle tells of breakaway, which is not searched: leave it out
         speed = np.abs(np.gradient(savgol_filter(w.q, VELOCITY_SAMPLES, 3, axis=1), SIM_DT, axis=1))
         still = np.maximum.accumulate(speed < slowest, axis=1)
         self._seen = ~still[:, self._every]
         self.clusters = np.repeat(np.arange(self.count), self._target[0].size)
         self._sim = Simulator(robot, space.nominal, batch * self.count, nthread)
-        self._q0, self._dq0, self._tau = (np.concatenate([a] * batch) for a in (w.q0, w.dq0, w.tau))
         self.candidates = 0
+        self._noise = _encoder_noise(recording)
+        smooth = np.linalg.norm(savgol_coeffs(VELOCITY_SAMPLES, 3))
+        slope = np.linalg.norm(savgol_coeffs(VELOCITY_SAMPLES, 3, deriv=1, delta=SIM_DT))
+        start = np.concatenate([smooth * self._noise, slope * self._noise])
+        self._least = np.concatenate([start, np.full(robot.n, 1e-4)])
+        self._spread = np.concatenate([start, np.full(robot.n, 0.05)])
+        self.adapt(space.start, fitted=False)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R) in mrad for candidates x (C, P)."""
+        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        return (self._white(self.error(x)) * self._trust[:, None]).reshape(len(x), -1)
+
+    def error(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, W, S' n) rad: simulated minus recorded angles where they count, else 0."""
         self.candidates += len(x)
         return np.concatenate([self._chunk(x[i : i + self._batch]) for i in range(0, len(x), self._batch)])
 
     def _chunk(self, x: np.ndarray) -> np.ndarray:
-        m = len(x) * self.count
-        ids = np.arange(m)
-        self._sim.set_dynamics(self.space.dynamics(x), ids, repeat=self.count)
-        self._sim.reset(self._q0[:m], self._dq0[:m], ids)
-        q = self._sim.rollout(self._tau[:m], ids=ids)["qpos"][:, self._every]
-        error = 1e3 * (q.reshape(len(x), *self._target.shape) - self._target) * self._seen
-        return np.nan_to_num(error.reshape(len(x), -1), nan=1e6, posinf=1e6, neginf=-1e6)
+        w, d = self.windows, self.space.dynamics(x)
+        timing = np.stack(np.broadcast_arrays(d.delay, d.lag, np.zeros(len(x)))[:2], -1)
+        kinds, kind = np.unique(timing, axis=0, return_inverse=True)
+        felt = np.stack([w.felt(*pair) for pair in kinds])
+        return self._simulate(d, felt[kind.ravel()], w.q0, w.dq0)
+
+    def _simulate(self, d: Dynamics, felt: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
+        """Return `error` of C candidates for torques felt (C, W, S, n) and starts (C, W, n) or (W, n)."""
+        count = len(felt)
+        ids = np.arange(count * self.count)
+        shape = (count, *self.windows.q0.shape)
+        self._sim.set_dynamics(d, ids, repeat=self.count)
+        n = q0.shape[-1]
+        q0, dq0, turn = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.turn))
+        self._sim.reset(q0, dq0, ids, turn)
+        q = self._sim.rollout(felt.reshape(-1, *felt.shape[2:]), ids=ids)["qpos"][:, self._every]
+        error = (q.reshape(count, *self._target.shape) - self._target) * self._seen
+        return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def adapt(self, x: np.ndarray, fitted: bool) -> None:
+        """Find Z about x (P,) and the whitening; with `fitted`, d and s as well, from what x leaves unexplained."""
+        w, n = self.windows, self.space.n
+        d = self.space.dynamics(x)
+        felt, eye = w.felt(d.delay, d.lag), np.eye(n)[:, None]
+        zero = np.zeros((n, 1, n))
+        q0 = np.concatenate([w.q0[None], w.q0 + Q_STEP * eye, w.q0 + zero, w.q0 + zero])
+        dq0 = np.concatenate([w.dq0[None], w.dq0 + zero, w.dq0 + DQ_STEP * eye, w.dq0 + zero])
+        push = np.concatenate([np.zeros((1 + 2 * n, 1, 1, n)), TAU_STEP * eye[:, None]])
+        parts, count = [], len(q0)
+        for i in range(0, count, self._batch):
+            at = slice(i, i + self._batch)
+            parts.append(self._simulate(d, felt + push[at], q0[at], dq0[at]))
+        at_x = np.concatenate(parts)
+        self.candidates += count
+        steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
+        z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
+        self._trust = np.ones(self.count)
+        if fitted:
+            usual = np.ones(self.count, dtype=bool)
+            for _ in range(2):  # a window in which something else happened tells nothing of the noise of the others
+                self._spread, self._noise = _random_effects(
+                    z[usual], at_x[0, usual], self._seen[usual], self._spread, self._noise, self._least
+                )
+                self._whiten(z)
+                size = self._window_size(at_x[0])
+                usual = size <= np.quantile(size, USUAL)
+            self._trust = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-9))
+        self._whiten(z)
+
+    def _window_size(self, error: np.ndarray) -> np.ndarray:
+        """Return (W,) the RMS of a window's white residual, of rows that count."""
+        r = self._white(error[None])[0]
+        return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
+
+    def _white(self, error: np.ndarray) -> np.ndarray:
+        """Return (C, W, R') in standard deviations."""
+        r = error / np.tile(self._noise, self._target.shape[1])
+        part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
+        return r - part[..., 0, :]
+
+    def _whiten(self, z: np.ndarray) -> None:
+        """Keep the axes and factors of (I + E E^T)^(-1/2) = I - A (1 - 1 / sqrt(1 + l^2)) A^T, E = z d / s."""
+        effect = z * self._spread / np.tile(self._noise, self._target.shape[1])[:, None]
+        self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
+        self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+
+    @property
+    def unexplained(self) -> np.ndarray:
+        """(n,) Nm, one standard deviation of the torque over a window that no candidate explains."""
+        return self._spread[2 * self.space.n :]
 
     def joint_error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, n) mrad^2: the mean square error of each joint."""
-        return (self(x).reshape(len(x), -1, self._target.shape[-1]) ** 2).mean(1)
+        return 1e6 * (self.error(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
 
-    def scale(self, x: np.ndarray, fitted: bool) -> np.ndarray:
-        """Return (n,) mrad: one standard deviation of a row, where a whole window says one thing.
 
-        Before a fit that is encoder noise alone; of a `fitted` x (P,) it is what the model leaves unexplained.
-        """
-        left = np.sqrt(self.joint_error(x[None])[0]) if fitted else 0.0
-        return np.sqrt(self._target.shape[1]) * np.maximum(ENCODER_MRAD, np.full(self._target.shape[-1], left))
+def _encoder_noise(recording: Recording) -> np.ndarray:
+    """Return (n,) rad: robust standard deviation of angles about their own 31 ms fit."""
+    grid = recording.resample(SIM_DT)
+    left = [
+        grid.q[s] - savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, axis=0)
+        for s in grid.stretches
+        if s.stop - s.start > VELOCITY_SAMPLES
+    ]
+    return np.maximum(1.48 * np.median(np.abs(np.concatenate(left)), axis=0), 3e-6)
 
-    def error(self, x: np.ndarray) -> np.ndarray:
-        """Return (C,) mrad: eq. (8) per sample, the mean over time of the norm over joints."""
-        n = self._target.shape[-1]
-        return np.linalg.norm(self(x).reshape(len(x), -1, n), axis=-1).mean(-1)
+
+def _random_effects(
+    z: np.ndarray,
+    error: np.ndarray,
+    seen: np.ndarray,
+    spread: np.ndarray,
+    noise: np.ndarray,
+    least: np.ndarray,
+    rounds: int = 30,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
+
+    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b), from
+    `spread` and `noise` on. No d falls below `least` (K,): of start angle and velocity what the encoder gives.
+    """
+    _, rows, k = z.shape
+    n = len(noise)
+    joint = np.tile(np.arange(n), rows // n)
+    counted = np.array([seen[..., j].sum() for j in range(n)])
+    for _ in range(rounds):
+        weighed = z / (noise[joint] ** 2)[:, None]
+        gram = weighed.transpose(0, 2, 1) @ z
+        scaled = spread[:, None] * gram * spread + np.eye(k)
+        inverse = np.linalg.inv(scaled)
+        mean = spread * np.einsum("wij,wj->wi", inverse, spread * np.einsum("wri,wr->wi", weighed, error))
+        covariance = spread[:, None] * inverse * spread
+        left = error - np.einsum("wri,wi->wr", z, mean)
+        uncertain = np.einsum("wri,wij,wrj->wr", z, covariance, z, optimize=True)
+        total = (left**2 + uncertain).sum(0)
+        new = np.array([total[joint == j].sum() for j in range(n)]) / np.maximum(counted, 1)
+        noise = np.maximum(np.where(counted > 0, np.sqrt(new), noise), 1e-6)
+        determined = 1.0 - np.einsum("wii->wi", covariance) / spread**2
+        spread = np.maximum(np.sqrt((mean**2).sum(0) / np.maximum(determined.sum(0), 1e-3)), least)
+    return spread, noise
 
 
 class TorqueResidual:
-    """Residual of any recording: predicted minus recorded torque in Nm, at `rate_hz`, zero-phase filtered.
+    """Residual of any recording: predicted minus recorded torque, zero-phase filtered, at `rate_hz`.
 
-    The prediction is linear in tensors and offsets, so it is a product with a regressor made once.
+    The rigid part is a product with a regressor made once. Friction is evaluated at less smoothed velocities and then
+    filtered as the torque was, because a filter rounds the step of friction at a reversal.
     """
 
     unit = "Nm"
@@ -165,110 +311,185 @@ class TorqueResidual:
         cutoff_hz: float = 10.0,
         rate_hz: float = 100.0,
         block_s: float = 0.5,
+        presliding_rad: float = PRESLIDING,
     ):
         self.space = space
-        self.motion = Motion.of(recording, cutoff_hz, rate_hz)
-        gravity = recording.torque == "measured"
-        self._rigid, self._regressor = inertia_regressor(robot, self.motion, gravity)
-        block = (self.motion.t / block_s).astype(int)
+        self.motion = m = Motion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+        self.commanded = recording.torque == "commanded"
+        gravity = None if self.commanded else GRAVITY
+        self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
+        self._y = y.reshape(*m.q.shape, -1)
+        still = np.zeros_like(m.q)
+        y = regressor(robot, m.q, still, still, GRAVITY)
+        self._gravity = y.reshape(*m.q.shape, -1)
+        self._nominal = Links(robot.mass, robot.com, robot.inertia).standard().ravel()
+        self._load = np.abs(self._gravity @ self._nominal)
+        block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
         self.candidates = 0
+        self._scale = np.ones(robot.n)
+        self.adapt(space.start, fitted=False)
 
     def predict(self, dynamics: Dynamics) -> np.ndarray:
-        """Return (..., T, n) Nm: rigid-body torque + friction - offset at the measured motion."""
-        tensors = six(dynamics.inertia).reshape(*dynamics.inertia.shape[:-3], -1)
-        rigid = self._rigid + np.einsum("tnk,...k->...tn", self._regressor, tensors)
-        friction = friction_torque(self.motion.dq, dynamics.phi[..., None, :, :])
-        return rigid + friction - dynamics.offset[..., None, :]
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return residuals (C, R) in Nm for candidates x (C, P)."""
-        self.candidates += len(x)
-        return (self.predict(self.space.dynamics(x)) - self.motion.tau).reshape(len(x), -1)
-
-    def scale(self, x: np.ndarray, fitted: bool) -> np.ndarray:
-        """Return (n,) Nm: one standard deviation of an independent row: RMS at a `fitted` x (P,), else half of it.
-
-        Real torque keeps that much unexplained whatever the parameters; the factor is how many rows in a row say
-        the same thing, so that a prior weighs against independent rows.
-        """
-        r = self.predict(self.space.dynamics(x)) - self.motion.tau
-        return (1.0 if fitted else 0.5) * np.sqrt((r**2).mean(0) * _correlation_length(r))
+        """Return (T, n) Nm: rigid-body torque + friction - offset at the measured motion, of one arm."""
+        d, m = dynamics, self.motion
+        standard = self._standard(d).ravel()
+        out = self._rest + self._y @ standard
+        if d.gain is not None and not self.commanded:
+            out = out * (1.0 + d.gain)
+        turn = m.turn if d.family == BRISTLE else None
+        out += m.filtered(d.friction(m.fast, turn)) - d.offset
+        if self.commanded and (d.mass is not None or d.com is not None):  # what the compensation leaves
+            out += self._gravity @ (standard - self._nominal)
+        if d.drag is not None:
+            out -= d.drag[:, 0] * np.sin(m.q) + d.drag[:, 1] * np.cos(m.q)
+        if d.load is not None:
+            out += d.load * self._load * m.filtered(np.tanh(m.fast / WIDTH_DQ) if turn is None else turn)
+        return out
 
     def error(self, x: np.ndarray) -> np.ndarray:
-        """Return (C,) Nm: eq. (8) per sample, the mean over time of the norm over joints."""
-        n = self.motion.tau.shape[-1]
-        return np.linalg.norm(self(x).reshape(len(x), -1, n), axis=-1).mean(-1)
+        """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
+        self.candidates += len(x)
+        out = np.empty((len(x), *self.motion.q.shape))
+        d = self.space.dynamics(x)
+        for i in range(len(x)):
+            out[i] = self.off(_pick(d, i))
+        return out
+
+    def off(self, dynamics: Dynamics) -> np.ndarray:
+        """Return (T, n) Nm, predicted minus recorded, of one arm."""
+        late = float(dynamics.delay) + float(dynamics.lag) if self.commanded else 0.0
+        return self.predict(dynamics) - self.motion.tau_at(late)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        return (self.error(x) / self._scale).reshape(len(x), -1)
+
+    def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
+        """Return (R, P): what the residual at x (P,) changes by as each value in turn goes to `stepped` (P,).
+
+        The same as P calls with one value changed, but joints do not see each other's friction and the torque is
+        linear in standard parameters, so a dozen evaluations do.
+        """
+        space, n = self.space, self.space.n
+        d = space.dynamics(x)
+        base, out = self.off(d), np.zeros((*self.motion.q.shape, len(x)))
+        reach = self._y * (np.ones(n) if d.gain is None or self.commanded else 1.0 + d.gain)[:, None]
+        reach = reach + self._gravity if self.commanded else reach
+        before = self._standard(d).ravel()
+        for block in space.blocks:
+            at = space.where(block)
+            if block in OF_LINKS:
+                trials = np.repeat(x[None], n, axis=0)
+                trials[np.arange(n), at] = stepped[at]
+                after = self._standard(space.dynamics(trials)).reshape(n, -1)
+                out[..., at] = reach @ (after - before).T
+                continue
+            trial = x.copy()
+            trial[at] = stepped[at]
+            moved = self.off(space.dynamics(trial)) - base
+            if block in WHOLE_ARM:
+                out[..., at[0]] = moved
+            else:
+                out[:, np.arange(n), at] = moved
+        return (out / self._scale[:, None]).reshape(-1, len(x))
+
+    def _standard(self, d: Dynamics) -> np.ndarray:
+        """Return (..., n, 10) standard parameters."""
+        robot = self.space.robot
+        mass = robot.mass if d.mass is None else d.mass
+        return Links(mass, robot.com if d.com is None else d.com, d.inertia).standard()
+
+    def adapt(self, x: np.ndarray, fitted: bool) -> None:
+        """Set what counts as one standard deviation of an independent row, per joint.
+
+        It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing.
+        """
+        r = self.error(x[None])[0]
+        self._scale = (1.0 if fitted else 0.5) * np.sqrt((r**2).mean(0) * np.minimum(_correlation_length(r), LONGEST))
+
+
+def _pick(d: Dynamics, i: int) -> Dynamics:
+    """Return the i-th of a batch of dynamics; fields without a batch stay."""
+    depth = {"phi": 2, "offset": 1, "breakaway": 2, "inertia": 3, "mass": 1, "com": 2, "load": 1, "drag": 2}
+    depth |= {"gain": 1, "delay": 0, "lag": 0}
+    one = {k: getattr(d, k) for k in depth}
+    return replace(d, **{k: v[i] for k, v in one.items() if v is not None and np.ndim(v) > depth[k]})
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A recording made smooth enough to differentiate: t (T,) s; q, dq, ddq, tau (T, n)."""
+    """A recording made smooth enough to differentiate, on T moments.
+
+    Attributes:
+        t: (T,) s. q, dq, ddq, tau: (T, n), low-passed both ways.
+        fast: (F, n) rad/s at FRICTION_HZ, less smoothed. turn: (F, n), its presliding sign. low_pass: (T, F), sparse:
+            what `filtered` multiplies with.
+        late: (T, L, n) Nm, tau at the moment and each ms before it.
+    """
 
     t: np.ndarray
     q: np.ndarray
     dq: np.ndarray
     ddq: np.ndarray
     tau: np.ndarray
+    fast: np.ndarray
+    turn: np.ndarray
+    low_pass: csr_array
+    late: np.ndarray
 
     @staticmethod
-    def of(recording: Recording, cutoff_hz: float, rate_hz: float) -> "Motion":
-        """Resample on logged time, low-pass both ways, differentiate, keep `rate_hz`; edges of 50 ms are dropped.
+    def of(recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: float = PRESLIDING) -> "Motion":
+        """Resample on logged time, low-pass both ways, differentiate, keep `rate_hz`; edges are dropped.
 
         Raises:
             UserError: nothing is left.
         """
-        smooth = recording.resample(SIM_DT).smooth(cutoff_hz)
-        ddq, keep = smooth.acceleration(), []
-        step, edge = round(1 / (rate_hz * SIM_DT)), round(0.05 / SIM_DT)
+        grid = recording.resample(SIM_DT)
+        smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
+        kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
+        every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
+        ddq, keep, rows, fast, turn = smooth.acceleration(), [], [], [], []
+        step, edge, base = round(1 / (rate_hz * SIM_DT)), round(0.05 / SIM_DT), 0
         for s in smooth.stretches:
-            keep += list(range(s.start + edge, s.stop - edge, step))
-        if not keep:
+            some = np.arange(s.start + edge, s.stop - edge, step)
+            at = np.arange(s.start, s.stop, every)
+            near = np.clip((some[:, None] - s.start) // every + np.arange(-reach, reach + 1), 0, len(at) - 1)
+            keep.append(some)
+            rows.append(base + near)
+            fast.append(quick.dq[at])
+            turn.append(presliding(quick.dq[s], SIM_DT, presliding_rad)[::every])
+            base += len(at)
+        kept = np.concatenate(keep)
+        if not len(kept):
             raise UserError(f"no trajectory is longer than 0.1 s; the recording lasts {recording.duration:g} s")
-        return Motion(smooth.t[keep], smooth.q[keep], smooth.dq[keep], ddq[keep], smooth.tau[keep])
+        columns = np.concatenate(rows)
+        ends = len(kernel) * np.arange(len(kept) + 1)
+        low_pass = csr_array((np.tile(kernel, len(kept)), columns.ravel(), ends), shape=(len(kept), base))
+        late = np.stack([smooth.tau[np.maximum(kept - k, 0)] for k in range(edge)], 1)
+        return Motion(
+            smooth.t[kept], smooth.q[kept], smooth.dq[kept], ddq[kept], smooth.tau[kept],
+            np.concatenate(fast), np.concatenate(turn), low_pass, late,
+        )  # fmt: skip
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return (T, n): the low-pass of x (F, n) at the moments."""
+        return self.low_pass @ x
+
+    def tau_at(self, delay: float) -> np.ndarray:
+        """Return (T, n) Nm: the torque `delay` s before each moment."""
+        at = min(max(delay / SIM_DT, 0.0), self.late.shape[1] - 2)
+        k = int(at)
+        return self.late[:, k] + (at - k) * (self.late[:, k + 1] - self.late[:, k])
 
 
-def six(tensor: np.ndarray) -> np.ndarray:
-    """Return (..., 6) xx, yy, zz, xy, xz, yz of symmetric tensors (..., 3, 3)."""
-    return tensor[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-
-
-def inertia_regressor(robot: Robot, motion: Motion, gravity: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque without link tensors (T, n) Nm and what each tensor component adds (T, n, 6 n).
-
-    Inverse dynamics is linear in the tensors; point masses carry the rest (masses and centres of mass).
-    """
-    model = robot.model(gravity=gravity)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-    data = mujoco.MjData(model)
-    bodies = model.jnt_bodyid
-    samples, n = motion.q.shape
-    omega, alpha = np.empty((samples, n, 3)), np.empty((samples, n, 3))
-    jac = np.empty((samples, n, 3, n))
-    jacp, jacr = np.empty((3, n)), np.empty((3, n))
-    rigid = np.empty((samples, n))
-    velocity = np.empty(6)
-    for i in range(samples):
-        data.qpos, data.qvel, data.qacc = motion.q[i], motion.dq[i], motion.ddq[i]
-        mujoco.mj_inverse(model, data)
-        mujoco.mj_rnePostConstraint(model, data)
-        rigid[i] = data.qfrc_inverse
-        for k, body in enumerate(bodies):
-            rotation = data.xmat[body].reshape(3, 3)
-            mujoco.mj_jacBody(model, data, jacp, jacr, body)
-            jac[i, k] = rotation.T @ jacr
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 1)
-            omega[i, k] = velocity[:3]
-            mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 1)
-            alpha[i, k] = velocity[:3]
-    # torque of a link's tensor alone, in link axes: J_r^T (I alpha + omega x I omega)
-    basis = np.zeros((6, 3, 3))
-    for c, (a, b) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
-        basis[c, a, b] = basis[c, b, a] = 1.0
-    spin = np.einsum("cab,tkb->tkca", basis, alpha)
-    spin += np.cross(omega[:, :, None], np.einsum("cab,tkb->tkca", basis, omega))
-    regressor = np.einsum("tkan,tkca->tnkc", jac, spin).reshape(samples, n, 6 * n)
-    return rigid - regressor @ six(robot.inertia).ravel(), regressor
+def _impulse_response(cutoff_hz: float, rate_hz: float) -> np.ndarray:
+    """Return the two-sided kernel of `Recording.smooth` at a rate, cut where it has faded; its sum is 1."""
+    reach = int(1.5 * rate_hz / cutoff_hz)
+    pulse = np.zeros(8 * reach + 1)
+    pulse[4 * reach] = 1.0
+    kernel = sosfiltfilt(butter(4, cutoff_hz, fs=rate_hz, output="sos"), pulse)[3 * reach : 5 * reach + 1]
+    return kernel / kernel.sum()
 
 
 def _correlation_length(r: np.ndarray) -> np.ndarray:

@@ -13,11 +13,13 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
+
+import numpy as np
 
 from r2s.errors import UserError
 
@@ -43,6 +45,7 @@ class Run:
         config: the composed config as YAML. overrides: what the user typed.
         seed: of the run. threads: as asked for.
         inputs: files it reads, for their sha256. parents: run folders it starts from.
+        resume: a run folder to go on in, instead of making one; its inputs must be what they were.
     """
 
     def __init__(
@@ -57,12 +60,13 @@ class Run:
         threads: int,
         inputs: Iterable[str | Path] = (),
         parents: Iterable[str | Path] = (),
+        resume: str | Path | None = None,
     ):
         overrides = list(overrides)
-        self.folder = _make_folder(root / stage, name or default_name(overrides))
+        self.folder = Path(resume) if resume else _make_folder(root / stage, name or default_name(overrides))
         self._began = time.time()
         self._tables: dict[str, Any] = {}
-        self._meta = {
+        self._meta: dict[str, Any] = {
             "status": "running",
             "stage": stage,
             "start": datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -75,6 +79,8 @@ class Run:
             "inputs": {str(p): sha256(p) for p in inputs},
             "parents": [str(p) for p in parents],
         }
+        if resume:
+            self._check_inputs(json.loads((self.folder / "meta.json").read_text())["inputs"])
         (self.folder / "config.yaml").write_text(config)
         (self.folder / "overrides.yaml").write_text("".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n")
         self._write_meta()
@@ -90,6 +96,27 @@ class Run:
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
         self._write_meta()
+
+    def _check_inputs(self, before: Mapping[str, str]) -> None:
+        for path, digest in self._meta["inputs"].items():
+            if before.get(path) != digest:
+                raise UserError(f"resume: {path} is not what {self.folder} was started with")
+
+    def memo(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return the arrays that `make` returns, or that it returned when this run did this step before.
+
+        They are kept in checkpoints/<name>.npz, so that a resumed run goes on after its last whole step.
+        """
+        path = self.folder / "checkpoints" / f"{name.replace(' ', '_')}.npz"
+        if not path.is_file():
+            done = {k: np.asarray(v) for k, v in make().items()}
+            path.parent.mkdir(exist_ok=True)
+            part = path.with_suffix(".part")
+            with open(part, "wb") as file:
+                np.savez(file, **done)  # type: ignore[arg-type]
+            os.replace(part, path)
+        with np.load(path) as file:
+            return {k: file[k] for k in file.files}
 
     def figure(self, name: str) -> Path:
         """Return the path of a figure, figures/<name>.png."""

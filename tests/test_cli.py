@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -57,13 +58,40 @@ def identified(root) -> Path:
     return root / "identify" / "seed_run"
 
 
+@pytest.fixture(scope="module")
+def stopped(root) -> Path:
+    """Return the folder of an identification that was killed in the middle of its searches."""
+    words = ["stage=identify", "name=killed", f"root={root}", *TOY]
+    folder = root / "identify" / "killed"
+    with subprocess.Popen([sys.executable, "run.py", *words], cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        while not (folder / "checkpoints" / "search_1.npz").is_file():
+            assert process.poll() is None, "it ended before it could be killed"
+            time.sleep(0.02)
+        process.kill()
+    assert not (folder / "parameters.yaml").exists()
+    return folder
+
+
 def readme_commands() -> list[str]:
     blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.S)
     lines = [line for block in blocks for line in block.splitlines()]
     return [line.removeprefix("python run.py ") for line in lines if line.startswith("python run.py")]
 
 
-@pytest.mark.parametrize("command", readme_commands())
+def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, identified):
+    """Killed, then `resume=`: the same numbers in every file that holds results; resumed again it is refused."""
+    succeed(f"resume={stopped}")
+    for name in ("parameters.yaml", "summary.json"):
+        texts = [(f / name).read_text().replace(str(f), "") for f in (stopped, identified)]
+        assert texts[0] == texts[1]
+    with np.load(stopped / "posterior.npz") as a, np.load(identified / "posterior.npz") as b:
+        assert np.array_equal(a["samples"], b["samples"])
+    done = r2s(f"resume={stopped}")
+    assert done.returncode == 2
+    assert "is finished" in done.stderr
+
+
+@pytest.mark.parametrize("command", [c for c in readme_commands() if not c.startswith("resume=")])
 def test_readme_command(command, root, recording, trained, identified):
     """Every `python run.py` line of the README ends well and says where its files are."""
     command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))
@@ -71,7 +99,8 @@ def test_readme_command(command, root, recording, trained, identified):
     command = command.replace("budget.minutes=4", "budget.minutes=0.05")
     toy = [*TOY, "pipeline.train_minutes=null"] if "pipeline" in command else TOY
     if "search=ga" in command:
-        toy = ["data.seconds=2", "search.0.population=4", "search.0.generations=2", "identify.breakaway=null"]
+        toy = ["data.seconds=2", "data.ramp_poses=1", "search.0.population=4", "search.0.generations=2"]
+        toy += ["friction.family=sigmoid", "identify.terms.commanded=[offset]"]
     out = succeed(*shlex.split(command), f"root={root}", *toy)
     folders = [root / Path(f).relative_to(root) for f in re.findall(r"written: (\S+)", out)]
     assert folders
@@ -98,7 +127,7 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
             assert len(errors[side][key]) == 7
         assert "0.1" in errors[side]["ee_error_mm"]
     parameters = yaml.safe_load((identified / "parameters.yaml").read_text())["parameters"]
-    assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset"}
+    assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset", "delay"}
     assert parameters["phi1"]["unit"] == "Nm"
     assert len(parameters["phi1"]["identifiable"]) == 7
 
@@ -123,6 +152,14 @@ def test_exported_policy_is_the_trained_policy(trained):
     facts = session.get_modelmeta().custom_metadata_map
     assert facts["policy_hz"] == "50"
     assert len(facts["torque_scale_Nm"].split()) == 7
+
+
+def test_every_algorithm_trains(root):
+    """A sweep over the other three writes a run folder with a policy each."""
+    out = succeed("-m", "algo=ddpg,sac,td3", f"root={root}", *TOY)
+    folders = re.findall(r"written: (\S+)", out)
+    assert len(folders) == 3
+    assert all((Path(f) / "policy.onnx").is_file() for f in folders)
 
 
 def test_same_seed_same_training(root, trained):
@@ -153,6 +190,15 @@ MISTAKES = {
     "stage=identify data=recording data.path=BACK data.torque=commanded": r"time does not increase at row",
     "stage=identify data=recording data.path=SIX data.torque=commanded": r"6.*7|7.*6",
     "stage=identify data=recording data.path=LOG data.torque=commanded data.validation=LOG": r"training file itself",
+    "stage=identify data=recording data.path=LOG data.torque=commanded data.validation=COPY": r"rows of the training",
+    "stage=identify data=recording data.path=STILL data.torque=commanded": r"not enough motion",
+    "stage=identify data=recording data.path=DEGREES data.torque=commanded": r"joint \d is at .*allows .*degrees",
+    "stage=identify friction.family=strbeck": r"no family 'strbeck'.*did you mean 'stribeck'",
+    "stage=identify identify.terms.commanded=[ofset]": r"unknown term 'ofset'.*did you mean 'offset'",
+    "stage=identify data.excitation=nowhere.csv": r"nowhere.csv",
+    "stage=identify data=recording data.path=LOG data.torque=commanded data.ramps=nowhere.npz": r"no file nowhere",
+    "dr=identified": r"give calibration=RUN_FOLDER",
+    "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
     "calibration=nowhere": r"calibration: no parameters.yaml",
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
@@ -176,7 +222,15 @@ def test_mistake_gets_one_line(mistake, recording, tmp_path):
         for r in rows
     ]
     (tmp_path / "six.csv").write_text("\n".join(six))
+    (tmp_path / "copy.csv").write_text("\n".join(rows[:1500]))
+    values = np.loadtxt(recording, delimiter=",", skiprows=1)
+    for name, q in (("still", values[:, 1:8] * 1e-3), ("degrees", np.degrees(values[:, 1:8]))):
+        table = np.column_stack([values[:, :1], q, values[:, 8:]])
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
     places = {
+        "COPY": tmp_path / "copy.csv",
+        "STILL": tmp_path / "still.csv",
+        "DEGREES": tmp_path / "degrees.csv",
         "LOG": recording,
         "NAN": tmp_path / "nan.csv",
         "BACK": tmp_path / "back.csv",
@@ -213,5 +267,5 @@ def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
         f"root={tmp_path}",
     )
     validation = json.loads((tmp_path / "identify" / "real" / "summary.json").read_text())["validation"]
-    assert np.mean(validation["torque_rmse_Nm"]) < 0.9 * np.mean(validation["nominal_torque_rmse_Nm"])
+    assert np.mean(validation["torque_rmse_Nm"]) < 0.75 * np.mean(validation["nominal_torque_rmse_Nm"])
     assert np.all(np.array(validation["torque_rmse_Nm"]) <= 1.02 * np.array(validation["nominal_torque_rmse_Nm"]))

@@ -11,11 +11,14 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # from the bottom up; a new module goes into one of them
 FLOORS = [
-    ["errors", "recording", "readers", "robot", "friction", "parameters", "simulator", "excitation", "actuation"],
-    ["randomization", "residual", "identify", "search_*", "rewards", "env"],
-    ["networks", "tqc", "policy", "train", "evaluate"],
+    [
+        *("errors", "recording", "readers", "readers_robot", "robot", "regressor", "friction", "actuation"),
+        *("parameters", "simulator", "excitation", "motion_checks"),
+    ],
+    ["randomization", "breakaway", "residual", "least_squares", "identify", "search_*", "rewards", "env"],
+    ["networks", "ddpg", "td3", "sac", "tqc", "policy", "train", "evaluate"],
     ["engines", "engines.*", "arm", "arm.*"],
-    ["runs", "report", "viewer", "tell", "pipeline"],
+    ["runs", "report", "report_figures", "report_identification", "viewer", "tell", "pipeline"],
 ]
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))
 

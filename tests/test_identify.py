@@ -1,25 +1,30 @@
 """What was put into an arm is found again from its recording, by every search and for both kinds of torque."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 from conftest import REAL, conf
+from hydra.utils import instantiate
 
+from r2s.arm.ramp import ramp
 from r2s.arm.record import record
 from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.excitation import fourier
-from r2s.friction import friction_level, friction_torque
-from r2s.identify import identify, prediction_errors
-from r2s.parameters import inertia_scale, nominal_dynamics, parameter_space
+from r2s.friction import FAMILIES, family
+from r2s.identify import identify, left_out, prediction_errors, searched
+from r2s.parameters import LINK, inertia_scale, nominal_dynamics, of_family, parameter_space
+from r2s.randomization import draw_identified, physical
 from r2s.readers import read
 from r2s.recording import Recording
 from r2s.residual import ReplayResidual, TorqueResidual, cut_windows, replay
 from r2s.robot import load_robot
-from r2s.search_ga import ga_search
-from r2s.search_least_squares import least_squares_search
+from r2s.search_cmaes import CovarianceAdaptation
+from r2s.search_ga import Genetic
+from r2s.search_least_squares import LeastSquares
 
 ARM = """
 <mujoco model="threelink">
@@ -41,9 +46,13 @@ ARM = """
 </mujoco>
 """
 SCALE = [1.3, 0.8, 1.2]
+DELAY = 3e-3
 SETTINGS = conf("config")["identify"]
-HOW = {"window_s": SETTINGS["window_s"], "cutoff_hz": SETTINGS["cutoff_hz"], "nthread": 1}
+BOUNDS = SETTINGS["bounds"]
+WINDOW = {"window_s": SETTINGS["window_s"], "cutoff_hz": SETTINGS["cutoff_hz"], "nthread": 1}
 NOISE = {k: conf("data/simulated")[k] for k in ("position_noise", "velocity_noise")}
+TORQUE = LeastSquares(level="torque", max_evaluations=12, ftol=1e-3)
+STAGED = [TORQUE, LeastSquares(max_evaluations=20, ftol=1e-3)]
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +64,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def truth(arm):
-    return nominal_dynamics(
+    dynamics = nominal_dynamics(
         arm,
         phi1=[1.8, 1.4, 0.9],
         phi2=[12.0, 8.0, 15.0],
@@ -65,6 +74,7 @@ def truth(arm):
         breakaway_negative=[-0.5, -0.6, -0.35],
         inertia_scale=SCALE,
     )
+    return replace(dynamics, delay=DELAY)
 
 
 @pytest.fixture(scope="module")
@@ -77,65 +87,113 @@ def recorded(robot, dynamics, seconds, seed):
     return record(SimulatedArm(robot, dynamics, **NOISE, seed=seed), fourier(robot, duration=seconds, seed=seed))
 
 
+def run(robot, nominal, recording, searches, **change):
+    """Identify with the settings of conf/, few terms and no scan of the dead zone unless `change` says so."""
+    how = {"bounds": BOUNDS, "prior": SETTINGS["prior"][recording.torque], "breakaway_max": None}
+    how |= {"terms": ["offset", "inertia_scale", *(["delay"] if recording.torque == "commanded" else [])]}
+    return identify(robot, nominal, recording, searches, **(how | WINDOW | {"stride": SETTINGS["stride"]} | change))
+
+
 @pytest.fixture(scope="module")
 def motion(arm, truth):
-    return recorded(arm, truth, 8.0, seed=0)
+    return recorded(arm, truth, 6.0, seed=0)
 
 
 @pytest.fixture(scope="module")
-def found(arm, wrong, motion):
-    return identify(
-        arm,
-        wrong,
-        motion,
-        [least_squares_search()],
-        bounds=SETTINGS["bounds"],
-        prior=SETTINGS["prior"]["commanded"],
-        nthread=1,
-    )
+def ramps(arm, truth):
+    return ramp(SimulatedArm(arm, truth, **NOISE, seed=5), [arm.q_home, arm.q_home + 0.3])
+
+
+@pytest.fixture(scope="module")
+def found(arm, wrong, motion, ramps):
+    return run(arm, wrong, motion, STAGED, ramps=ramps)
+
+
+@pytest.fixture(scope="module")
+def directly(arm, wrong, motion):
+    """Least squares on replays alone, and the dead zone looked for in the motion."""
+    return run(arm, wrong, motion, [LeastSquares(ftol=1e-3)], breakaway_max=SETTINGS["breakaway"])
 
 
 def curve_error(found, truth, dq):
     """Return (n,): the largest error of friction over the speeds of dq (98 % quantile), over the friction's level."""
     fastest = np.quantile(np.abs(dq), 0.98, axis=0)
     grid = np.linspace(-1, 1, 201)[:, None] * fastest
-    error = np.abs(friction_torque(grid, found.phi) - friction_torque(grid, truth.phi)).max(0)
-    return error / friction_level(truth.phi, fastest)
+    return np.abs(found.friction(grid) - truth.friction(grid)).max(0) / truth.family.level(truth.phi, fastest)
 
 
-def test_least_squares_finds_what_was_injected(arm, found, truth, wrong, motion):
-    """From a wrong start: friction within 2 % of its level, offsets within 0.02 Nm, inertia scales within 10 %."""
-    dynamics = found.dynamics
+@pytest.mark.parametrize("how", ["found", "directly"])
+def test_least_squares_finds_what_was_injected(arm, truth, wrong, motion, how, request):
+    """From a wrong start: friction within 2 % of its level, offsets within 0.01 Nm, inertia scales within 2 %."""
+    dynamics = request.getfixturevalue(how).dynamics
     assert curve_error(wrong, truth, motion.dq).min() > 0.05
     assert curve_error(dynamics, truth, motion.dq).max() < 0.02
-    np.testing.assert_allclose(dynamics.offset, truth.offset, atol=0.02)
-    np.testing.assert_allclose(inertia_scale(dynamics.inertia, arm.inertia), SCALE, rtol=0.10)
+    np.testing.assert_allclose(dynamics.offset, truth.offset, atol=0.01)
+    np.testing.assert_allclose(inertia_scale(dynamics.inertia, arm.inertia), SCALE, rtol=0.02)
 
 
-def test_breakaway_edges_are_found(found, truth):
-    """At least five of the six edges of the dead zone are within 0.08 Nm."""
-    assert np.sum(np.abs(found.dynamics.breakaway - truth.breakaway) < 0.08) >= 5
+@pytest.mark.parametrize("how", ["found", "directly"])
+def test_the_delay_of_the_commands_is_found(how, request):
+    """3 ms between a command and its torque are found to within 0.2 ms, and are as sure as that."""
+    result = request.getfixturevalue(how)
+    assert abs(float(result.dynamics.delay) - DELAY) < 2e-4
+    low, high = result.space.block(result.found.low, "delay"), result.space.block(result.found.high, "delay")
+    assert high - low < 1e-3
 
 
-def test_the_history_tells_what_the_search_did(found):
+def test_ramps_give_the_edges_of_the_dead_zone(found, truth):
+    """Ramped, every edge is within 2 % or 0.01 Nm; in the file it is a value of its own, with its repeatability."""
+    edges = found.dynamics.breakaway
+    assert np.all(np.abs(edges - truth.breakaway) < np.maximum(0.02 * np.abs(truth.breakaway), 0.01))
+    space, saved = found.saved
+    assert space.blocks == (*found.space.blocks, "breakaway_negative", "breakaway_positive")
+    np.testing.assert_allclose(space.dynamics(saved.x).breakaway, edges, atol=1e-12)
+    drawn = space.dynamics(saved.samples).breakaway
+    np.testing.assert_allclose(drawn.mean(0), edges, atol=0.01)
+    assert np.all(drawn.std(0) >= 0.5 * found.break_spread)
+    assert np.all(drawn[..., 0] <= 0)
+    assert np.all(drawn[..., 1] >= 0)
+
+
+def test_breakaway_edges_are_found_without_ramps(directly, truth):
+    """Looked for where the recorded motion comes to rest, every edge is within 0.05 Nm."""
+    assert np.all(np.abs(directly.dynamics.breakaway - truth.breakaway) < 0.05)
+
+
+def test_a_start_on_the_level_of_torque_ends_where_replays_alone_do(arm, truth, wrong, motion, directly):
+    """Staged from further away, every value ends well within the interval about what replays alone found."""
+    further = replace(wrong, phi=wrong.phi * [2.0, 0.7, 1.0], inertia=0.7 * wrong.inertia, offset=np.full(3, -0.5))
+    assert curve_error(further, truth, motion.dq).mean() > curve_error(wrong, truth, motion.dq).mean()
+    staged = run(arm, further, motion, STAGED)
+    one, other = staged.found, directly.found
+    half = 0.5 * np.maximum(one.high - one.low, other.high - other.low)
+    assert np.all(np.abs(one.x - other.x) < half)
+    assert curve_error(staged.dynamics, truth, motion.dq).max() < 0.02
+    replays = [r.history["search"].eq("least_squares").sum() for r in (staged, directly)]
+    assert replays[0] < replays[1]
+
+
+def test_the_history_tells_what_the_search_did(directly):
     """Each row has search, evaluations, cost and time; the cost of least squares never rises within a run."""
-    history = found.history
+    history = directly.history
     assert set(history["search"]) == {"least_squares", "breakaway", "least_squares, reweighed"}
     assert history["seconds"].is_monotonic_increasing
     assert (history["done"] <= history["total"]).all()
-    scan = np.flatnonzero(history["search"] == "breakaway")
-    before, after = history.iloc[: scan[0]], history.iloc[scan[-1] + 1 :]
-    for part in (before, after):
-        assert part["cost"].is_monotonic_decreasing
+    starts = np.flatnonzero(history["done"] == 1).tolist()
+    assert len(starts) == 4
+    for a, b in zip(starts, [*starts[1:], len(history)], strict=True):
+        part = history.iloc[a:b]
+        assert part["search"].nunique() == 1
         assert part["evaluations"].is_monotonic_increasing
-    assert before["cost"].iloc[-1] < 0.1 * before["cost"].iloc[0]
-    assert after["cost"].iloc[-1] < before["cost"].iloc[-1]
+        if part["search"].iloc[0] != "breakaway":
+            assert part["cost"].is_monotonic_decreasing
+    assert history["cost"].iloc[starts[1] - 1] < 0.1 * history["cost"].iloc[0]
 
 
 def test_identified_dynamics_predict_motion_that_was_not_fitted(arm, truth, wrong, found):
     """On a second excitation every error of the identified arm is far below the nominal one's, at every horizon."""
-    other = recorded(arm, truth, 5.0, seed=1)
-    errors = prediction_errors(arm, wrong, found.dynamics, other, **HOW)
+    other = recorded(arm, truth, 4.5, seed=1)
+    errors = prediction_errors(arm, wrong, found.dynamics, other, **WINDOW)
     for name in ("torque_rmse_Nm", "position_rmse_mrad"):
         assert len(errors[name]) == 3
         assert np.all(np.array(errors[name]) < 0.5 * np.array(errors[f"nominal_{name}"]))
@@ -146,67 +204,84 @@ def test_identified_dynamics_predict_motion_that_was_not_fitted(arm, truth, wron
 
 def test_the_truth_predicts_to_within_sensor_noise(arm, truth, wrong, motion):
     """Replayed with the injected dynamics the windows stay below 2 mrad: command, row and step belong together."""
-    errors = prediction_errors(arm, wrong, truth, motion, **HOW)
+    errors = prediction_errors(arm, wrong, truth, motion, **WINDOW)
     assert max(errors["position_rmse_mrad"]) < 2.0
     assert errors["ee_error_mm"]["0.1"] < 0.5
 
 
 def test_a_replay_without_noise_is_the_recording(arm, truth):
-    """Without sensor noise, a window from the exact state does what the recorded arm did, to 1e-9 rad."""
+    """Without sensor noise, a window from the exact state does what the recorded arm did, delay and lag included."""
+    late = replace(truth, delay=2.4e-3, lag=1e-3)
     clean = record(
-        SimulatedArm(arm, truth, position_noise=0.0, velocity_noise=0.0), fourier(arm, duration=2.5, seed=3)
+        SimulatedArm(arm, late, position_noise=0.0, velocity_noise=0.0), fourier(arm, duration=2.5, seed=3)
     )
     windows = cut_windows(clean, 0.2)
     rows = (windows.t / 1e-3).round().astype(int)
     exact = replace(windows, q0=clean.q[rows], dq0=clean.dq[rows])
-    np.testing.assert_allclose(replay(arm, truth, exact, nthread=1), exact.q, rtol=0, atol=1e-9)
+    error = replay(arm, late, exact, nthread=1) - exact.q
+    assert np.abs(error[1:]).max() < 1e-9  # nobody knows what was commanded before the first row
 
 
-def test_replays_of_many_candidates_are_those_of_each(arm, truth, wrong, motion):
+def test_replays_of_many_candidates_are_those_of_each(arm, wrong, motion):
     """The residual of a batch of candidates, in chunks, is the residual of each alone, to the bit."""
-    space = parameter_space(arm, wrong, SETTINGS["bounds"])
-    x = space.from_unit(np.random.default_rng(0).random((5, len(space.start))))
     short = motion.select(motion.t < 1.5)
+    space = searched(arm, wrong, BOUNDS, ["offset", "link", "delay", "lag", "load", "drag_sin"], short)
+    x = space.from_unit(np.random.default_rng(0).random((5, len(space.start))))
     together = ReplayResidual(arm, space, short, batch=2, nthread=1)
+    before = together.candidates
     rows = together(x)
     assert rows.shape == (5, len(together.clusters))
+    assert together.candidates == before + 5
     alone = ReplayResidual(arm, space, short, batch=1, nthread=1)
     assert np.array_equal(rows, np.concatenate([alone(x[k : k + 1]) for k in range(5)]))
-    assert together.candidates == 5
 
 
-def measured(robot, dynamics, scale, seconds, noise=0.0, seed=0, moving=(1, 1, 1)):
+@pytest.mark.parametrize("fitted", [False, True])
+def test_at_the_truth_whitened_errors_have_a_variance_of_one(arm, truth, wrong, motion, fitted):
+    """With encoder noise alone, rows of every joint are in units of their own standard deviation."""
+    space = searched(arm, replace(wrong, breakaway=truth.breakaway), BOUNDS, ["offset", "inertia_scale"], motion)
+    space = replace(space, nominal=truth)
+    residual = ReplayResidual(arm, space, motion, window_s=0.2, stride=10, nthread=1)
+    x = np.concatenate([truth.phi[:, :3].T.ravel(), truth.offset, SCALE])
+    residual.adapt(x, fitted)
+    r = residual(x[None])[0].reshape(residual.count, -1, 3)
+    counted = residual.error(x[None])[0].reshape(r.shape) != 0
+    for j in range(3):
+        assert 0.8 < np.mean(r[..., j][counted[..., j]] ** 2) < 1.2
+
+
+def measured(robot, dynamics, scale, seconds, noise=0.0, seed=0, moving=(1, 1, 1), mass=1.0, shift=0.0):
     """Return a recording of link-side torque: inverse dynamics with gravity, plus friction, minus offset, plus noise.
 
-    The tensors are scaled in the compiled model, not through r2s. Joints where `moving` is 0 stand at angle 0.
+    Tensors and masses are scaled, centres shifted (m) in the compiled model, not through r2s. Joints where `moving`
+    is 0 stand at angle 0.
     """
     e = fourier(robot, duration=seconds, seed=seed)
     e = replace(e, q=e.q * moving, dq=e.dq * moving, ddq=e.ddq * moving)
     model = robot.model(gravity=True)
     model.body_inertia[model.jnt_bodyid] *= np.array(scale)[:, None]
+    model.body_mass[model.jnt_bodyid] *= mass
+    model.body_ipos[model.jnt_bodyid] += shift
     data = mujoco.MjData(model)
     tau = np.empty_like(e.q)
     for k in range(len(e.t)):
         data.qpos[:], data.qvel[:], data.qacc[:] = e.q[k], e.dq[k], e.ddq[k]
         mujoco.mj_inverse(model, data)
         tau[k] = data.qfrc_inverse
-    tau += friction_torque(e.dq, dynamics.phi) - dynamics.offset
+    tau += dynamics.friction(e.dq) - dynamics.offset
     tau += noise * np.random.default_rng(seed + 100).normal(size=tau.shape)
     return Recording(t=e.t, q=e.q, dq=e.dq, tau=tau, torque="measured")
 
 
-def fit(arm, wrong, recording, cutoff_hz=10.0, folds=0):
-    return identify(
-        arm,
-        wrong,
-        recording,
-        [least_squares_search(ftol=1e-12)],
-        bounds=SETTINGS["bounds"],
-        prior={},
-        cutoff_hz=cutoff_hz,
-        folds=folds,
-        nthread=1,
-    )
+@pytest.fixture(scope="module")
+def clean(arm, truth):
+    """Four seconds of link-side torque without noise."""
+    return measured(arm, truth, SCALE, 4.0)
+
+
+def fit(arm, wrong, recording, cutoff_hz=10.0, **change):
+    exact = [LeastSquares(ftol=1e-12)]
+    return run(arm, wrong, recording, exact, **({"prior": {}, "cutoff_hz": cutoff_hz} | change))
 
 
 def test_torque_with_gravity_gives_friction_and_offset(arm, truth, wrong):
@@ -219,61 +294,268 @@ def test_torque_with_gravity_gives_friction_and_offset(arm, truth, wrong):
 
 
 def test_predicted_torque_is_inverse_dynamics(arm, truth, wrong):
-    """The linear prediction equals MuJoCo's inverse dynamics of the true tensors, with and without gravity."""
-    recording = measured(arm, truth, SCALE, 3.0)
-    space = parameter_space(arm, wrong, SETTINGS["bounds"])
+    """The linear prediction equals MuJoCo's inverse dynamics of the true links, with and without gravity.
+
+    Without gravity the arm compensates that of its nominal links: only what is wrong about them is felt.
+    """
+    recording = measured(arm, truth, SCALE, 2.0)
+    mass, shift = np.array([1.1, 0.8, 1.3]), np.array([0.01, -0.02, 0.03])
+    other = replace(truth, mass=arm.mass * mass, com=arm.com + shift)
+    space = parameter_space(arm, wrong, {k: BOUNDS[k] for k in ("phi1", "offset", *LINK)})
     for torque in ("measured", "commanded"):
         residual = TorqueResidual(arm, space, replace(recording, torque=torque), cutoff_hz=50.0)
         m = residual.motion
-        model = arm.model(gravity=torque == "measured")
+        model, nominal = arm.model(gravity=True), arm.model(gravity=True)
         model.body_inertia[model.jnt_bodyid] *= np.array(SCALE)[:, None]
-        data = mujoco.MjData(model)
+        model.body_mass[model.jnt_bodyid] *= mass
+        model.body_ipos[model.jnt_bodyid] += shift
+        data, compensated = mujoco.MjData(model), mujoco.MjData(nominal)
         expected = []
         for q, dq, ddq in zip(m.q, m.dq, m.ddq, strict=True):
             data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddq
             mujoco.mj_inverse(model, data)
-            expected.append(data.qfrc_inverse + friction_torque(dq, truth.phi) - truth.offset)
-        np.testing.assert_allclose(residual.predict(truth), expected, atol=1e-9)
+            compensated.qpos[:] = q
+            mujoco.mj_inverse(nominal, compensated)
+            expected.append(data.qfrc_inverse - (torque == "commanded") * compensated.qfrc_inverse)
+        expected += m.filtered(truth.friction(m.fast)) - truth.offset
+        np.testing.assert_allclose(residual.predict(other), expected, atol=1e-9)
 
 
-def test_intervals_contain_the_truth(arm, truth, wrong):
-    """With 0.1 Nm of white noise, the 95 % intervals of five recordings hold at least 80 % of the true values."""
-    inside = []
-    for seed in range(5):
-        result = fit(arm, wrong, measured(arm, truth, SCALE, 8.0, noise=0.1, seed=seed), cutoff_hz=50.0)
-        expected = np.concatenate([*truth.phi.T, SCALE, truth.offset])
-        low, high = result.interval
+@pytest.mark.parametrize("torque", ["measured", "commanded"])
+@pytest.mark.parametrize("name", [f.name for f in FAMILIES])
+@pytest.mark.parametrize("inertia", ["link", "inertia_scale"])
+def test_the_jacobian_of_the_torque_is_that_of_brute_force(arm, wrong, clean, torque, name, inertia):
+    """`change` is what one call per stepped value gives, for every block that there is."""
+    short = replace(clean.select(clean.t < 1.0), torque=torque)
+    terms = ["viscous", "offset", inertia, "delay", "lag", "load", "drag_sin", "drag_cos", "gain"]
+    space = searched(arm, of_family(wrong, name), BOUNDS, terms, short)
+    residual = TorqueResidual(arm, space, short)
+    rng = np.random.default_rng(0)
+    u = rng.uniform(0.2, 0.8, len(space.start))
+    x, stepped = space.from_unit(u), space.from_unit(u + rng.uniform(-1e-2, 1e-2, len(u)))
+    each = np.where(np.eye(len(x), dtype=bool), stepped, x)
+    brute = (residual(each) - residual(x[None])).T
+    scale = np.abs(residual(x[None])).max()
+    np.testing.assert_allclose(residual.change(x, stepped), brute, rtol=0, atol=1e-8 * max(scale, 1.0))
+
+
+def vector(space, truth):
+    """Return the injected values of a space of sigmoid friction, offset, inertia scale and delay."""
+    blocks = {"phi1": truth.phi[:, 0], "phi2": truth.phi[:, 1], "phi3": truth.phi[:, 2], "offset": truth.offset}
+    blocks |= {"inertia_scale": np.array(SCALE), "delay": np.array([truth.delay])}
+    return np.concatenate([blocks[b] for b in space.blocks])
+
+
+@pytest.mark.parametrize("torque", ["measured", "commanded"])
+def test_intervals_contain_the_truth(arm, truth, wrong, torque):
+    """The 95 % intervals of several recordings hold at least 85 % of the true values, and are not much too wide.
+
+    Without a dead zone: where a joint sticks in some windows, no interval of the others knows of it.
+    """
+    free, inside, miss = replace(truth, breakaway=np.zeros((3, 2))), [], []
+    for seed in range(5 if torque == "measured" else 4):
+        if torque == "measured":
+            result = fit(arm, wrong, measured(arm, free, SCALE, 8.0, noise=0.1, seed=seed), cutoff_hz=50.0)
+        else:
+            result = run(arm, wrong, recorded(arm, free, 4.0, seed), STAGED, window_s=0.2)
+        expected, low, high = vector(result.space, free), result.found.low, result.found.high
         assert np.all(low <= result.x + 1e-12)
         assert np.all(result.x <= high + 1e-12)
         inside.append((low <= expected) & (expected <= high))
-    assert np.mean(inside) >= 0.8
+        miss.append(np.abs(result.x - expected) / (0.5 * (high - low)))
+    assert np.mean(inside) >= 0.85
+    assert np.sqrt(np.mean(np.square(miss))) > 0.15  # 0.5 were exact
 
 
-def test_what_the_data_cannot_tell_is_said(arm, truth, wrong):
-    """Of a joint that stands still friction is not identifiable; of joints that move it is."""
+def test_what_the_data_cannot_tell_stays_nominal_and_is_said(arm, truth, wrong):
+    """Of a joint that stands still friction is not identifiable, and is what it was; of joints that move it is."""
     result = fit(arm, wrong, measured(arm, truth, SCALE, 8.0, noise=0.1, moving=(1, 1, 0)))
     names = np.array(result.space.names)
-    assert set(names[~result.identifiable]) >= {"phi2[3]", "phi3[3]"}
-    assert set(names[result.identifiable]) >= {"phi1[1]", "offset[1]", "phi1[2]", "offset[2]"}
+    known = result.found.identifiable
+    assert set(result.unseen) >= {"phi1[3]", "phi2[3]", "phi3[3]"}
+    assert set(names[~known]) >= set(result.unseen)
+    assert set(names[known]) >= {"phi1[1]", "offset[1]", "phi1[2]", "offset[2]"}
+    unseen = np.isin(names, result.unseen)
+    np.testing.assert_allclose(result.x[unseen], result.space.start[unseen], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(result.dynamics.phi[2], wrong.phi[2], rtol=1e-12, atol=1e-15)
 
 
-def test_the_genetic_search_only_improves_and_keeps_its_seed(arm, truth, wrong):
-    """The GA's best cost never rises, falls far below the start's, and a seed gives the same generations twice."""
-    recording = measured(arm, truth, SCALE, 4.0)
-    runs = [
-        identify(
-            arm,
-            wrong,
-            recording,
-            [ga_search(population=40, generations=15, seed=seed)],
-            bounds=SETTINGS["bounds"],
-            prior=SETTINGS["prior"]["measured"],
-            nthread=1,
-        )
-        for seed in (0, 0, 1)
-    ]
+def test_combinations_that_only_the_prior_decides_are_named(arm, truth, wrong):
+    """While a joint moves, Coulomb asymmetry is an offset: of noisy data the two are named together."""
+    level, prior = np.array([0.8, 0.7, 0.6]), SETTINGS["prior"]["measured"]
+    real = replace(truth, family=family("coulomb"), phi=np.stack([level, [0.1, -0.1, 0.05], np.zeros(3)], -1))
+    recording = measured(arm, real, [1, 1, 1], 4.0, noise=1.0)
+    bounds = {k: BOUNDS[k] for k in ("coulomb", "asymmetry", "offset")}
+    result = run(arm, wrong, recording, [TORQUE], family="coulomb", bounds=bounds, terms=["offset"])
+    assert len(result.null_directions) == 3
+    assert all(0.5 < share <= 1.0 for share, _ in result.null_directions)
+    directions = {name: parts for _, parts in result.null_directions for name in parts}
+    for j in range(3):
+        parts = directions[f"offset[{j + 1}]"]
+        assert set(parts) == {f"offset[{j + 1}]", f"asymmetry[{j + 1}]"}
+        offset = parts[f"offset[{j + 1}]"] * prior["offset"]  # each part is in terms of its prior's sigma
+        asymmetry = parts[f"asymmetry[{j + 1}]"] * prior["asymmetry"]
+        assert offset == pytest.approx(level[j] * asymmetry, rel=0.25)
+
+
+PHI = {
+    "sigmoid": [[1.8, 12.0, 0.02], [1.4, 8.0, -0.02], [0.9, 15.0, 0.01]],
+    "coulomb": [[0.8, 0.1, 0.3], [0.6, -0.1, 0.4], [0.4, 0.0, 0.2]],
+    "stribeck": [[0.6, 0.05, 0.3, 0.9, 0.12], [0.5, -0.05, 0.4, 1.1, 0.1], [0.4, 0.0, 0.2, 0.8, 0.15]],
+}
+
+
+@pytest.mark.parametrize("name", list(PHI))
+def test_the_family_that_made_the_data_is_chosen(arm, truth, wrong, name):
+    """family=auto picks the law that the arm has, and says by how much the others predict worse."""
+    real = replace(truth, family=family(name), phi=np.array(PHI[name]))
+    recording = recorded(arm, real, 6.0, seed=0)
+    result = run(arm, wrong, recording, [TORQUE], family="auto")
+    assert result.dynamics.family.name == name
+    assert set(result.families) == {f.name for f in FAMILIES}
+    assert min(result.families.values()) == 1.0
+    assert result.families[name] < 1.1
+
+
+def inertial(d):
+    """Return mass (..., n) and the smallest eigenvalue of the pseudo-inertia (..., n) over its largest."""
+    second = 0.5 * np.trace(d.inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - d.inertia
+    moments = np.linalg.eigvalsh(second)
+    return d.mass, moments[..., 0] / moments[..., -1]
+
+
+@pytest.mark.parametrize("data", ["a random walk", "an arm of negative mass"])
+def test_whole_links_are_physical_whatever_the_data(arm, wrong, clean, data):
+    """Torque of no arm at all, no prior: mass and moments positive, triangle inequality kept, in every draw."""
+    if data == "a random walk":
+        walk = np.cumsum(np.random.default_rng(0).normal(size=clean.tau.shape), axis=0)
+        recording = replace(clean, tau=10.0 * walk / walk.std(0))
+    else:
+        recording = replace(clean, tau=-clean.tau)
+    result = run(arm, wrong, recording, [TORQUE], prior={}, terms=["offset", "link"])
+    for d in (result.dynamics, result.space.dynamics(result.found.samples)):
+        mass, least = inertial(d)
+        assert mass.min() > 0
+        assert least.min() > 0
+        assert physical(d.inertia).all()
+    assert (np.ptp(result.space.dynamics(result.found.samples).mass, axis=0) > arm.mass).all()  # far from nominal
+
+
+@pytest.fixture(scope="module")
+def linked(arm, truth, wrong):
+    """Whole links, of an arm with other masses and centres, from link-side torque with noise."""
+    recording = measured(arm, truth, SCALE, 12.0, noise=0.1, mass=MASS, shift=SHIFT)
+    return run(arm, wrong, recording, STAGED, terms=["offset", "link"])
+
+
+MASS = np.array([1.2, 0.8, 1.4])
+SHIFT = np.array([[0.02, 0.01, 0.0], [-0.02, 0.03, 0.02], [0.02, -0.02, 0.03]])
+
+
+def test_whole_links_predict_an_arm_of_other_masses_and_centres(arm, truth, wrong, linked):
+    """Torque with gravity of a motion that was not fitted is predicted to within 2 % of its size."""
+    other = measured(arm, truth, SCALE, 4.0, seed=1, mass=MASS, shift=SHIFT)
+    errors = prediction_errors(arm, wrong, linked.dynamics, other, **WINDOW)
+    error, nominal = (np.array(errors[k]) for k in ("torque_rmse_Nm", "nominal_torque_rmse_Nm"))
+    size = np.sqrt((other.tau**2).mean(0))
+    assert (nominal / size).max() > 0.2
+    assert (error / size).max() < 0.02
+
+
+def test_draws_of_what_was_identified_are_physical_and_keep_its_correlation(linked):
+    """dr=identified: every drawn arm is physical, and parameters vary together as in the joint distribution."""
+    space, saved = linked.saved
+    drawn = draw_identified(np.random.default_rng(1), space, saved.samples, 3000)
+    assert drawn.offset.shape == (3000, 3)
+    mass, least = inertial(drawn)
+    assert mass.min() > 0
+    assert least.min() > 0
+    assert physical(drawn.inertia).all()
+
+    def correlation(d):
+        columns = [d.phi.reshape(-1, 9), d.offset, d.mass, (d.mass[..., None] * d.com).reshape(-1, 9)]
+        return np.corrcoef(np.concatenate(columns, 1).T)
+
+    expected = correlation(space.dynamics(saved.samples))
+    assert np.abs(expected - np.eye(len(expected))).max() > 0.5
+    np.testing.assert_allclose(correlation(drawn), expected, atol=0.12)
+
+
+class InterruptionError(Exception):
+    """What a person's Ctrl-C is to a run."""
+
+
+class Store:
+    """A memo that keeps arrays, as a run folder does; raises before the `broken`-th new step is done."""
+
+    def __init__(self):
+        self.kept, self.broken = {}, None
+
+    def __call__(self, name, make):
+        """Return what `make` makes, or made before."""
+        if name not in self.kept:
+            if self.broken == 0:
+                raise InterruptionError
+            made = {k: np.asarray(v) for k, v in make().items()}
+            self.broken = None if self.broken is None else self.broken - 1
+            self.kept[name] = made
+        return {k: v.copy() for k, v in self.kept[name].items()}
+
+
+def same(one, other):
+    """Assert that two results are the same to the bit, and tell the same story but for its times."""
+    for name in ("x", "low", "high", "identifiable", "samples"):
+        assert np.array_equal(getattr(one.found, name), getattr(other.found, name)), name
+    assert one.families == other.families
+    assert one.null_directions == other.null_directions
+    assert one.unseen == other.unseen
+    assert np.array_equal(one.dynamics.breakaway, other.dynamics.breakaway)
+    story = [r.history.drop(columns="seconds") for r in (one, other)]
+    assert story[0].equals(story[1])
+
+
+@pytest.mark.parametrize("torque", ["measured", "commanded"])
+def test_an_interrupted_run_goes_on_to_the_same_end(arm, wrong, clean, motion, torque):
+    """Stopped before every step in turn, and within one, a run with the same memo ends as if it never had been."""
+    how = {"family": "auto", "folds": 2, "keep_nominal": True}
+    recording, searches = clean, [Genetic(population=12, generations=3), LeastSquares(max_evaluations=3)]
+    if torque == "commanded":
+        recording, searches = motion.select(motion.t < 2.5), [TORQUE, LeastSquares(max_evaluations=2)]
+        how = {"breakaway_max": 1.5, "stride": 20}
+    whole, store = Store(), Store()
+    expected = run(arm, wrong, recording, searches, memo=whole, **how)
+    assert len(whole.kept) >= 6
+
+    for k in range(len(whole.kept)):
+        store.broken = 1 if k else 0
+        with pytest.raises(InterruptionError):
+            run(arm, wrong, recording, searches, memo=store, **how)
+        assert list(store.kept) == list(whole.kept)[:k]
+    store.broken = None
+    same(run(arm, wrong, recording, searches, memo=store, **how), expected)
+
+    half, rows = Store(), []
+
+    def stop(row):
+        rows.append(row)
+        if len(rows) == len(expected.history) - 3:
+            raise InterruptionError
+
+    with pytest.raises(InterruptionError):
+        run(arm, wrong, recording, searches, memo=half, report=stop, **how)
+    assert 0 < len(half.kept) < len(whole.kept)
+    same(run(arm, wrong, recording, searches, memo=half, **how), expected)
+
+
+@pytest.mark.parametrize(
+    ("search", "small"),
+    [(Genetic, {"population": 40, "generations": 15}), (CovarianceAdaptation, {"population": 16, "generations": 25})],
+)
+def test_a_population_only_improves_and_keeps_its_seed(arm, wrong, clean, search, small):
+    """The best cost never rises, falls far below the start's, and a seed gives the same generations twice."""
+    runs = [run(arm, wrong, clean, [search(seed=seed, **small)]) for seed in (0, 0, 1)]
     cost = runs[0].history["cost"]
-    assert len(cost) >= 15
+    assert len(cost) == small["generations"]
     assert cost.is_monotonic_decreasing
     assert cost.iloc[-1] < 0.5 * cost.iloc[0]
     assert np.array_equal(runs[0].x, runs[1].x)
@@ -281,104 +563,119 @@ def test_the_genetic_search_only_improves_and_keeps_its_seed(arm, truth, wrong):
     assert not np.array_equal(runs[0].x, runs[2].x)
 
 
+@pytest.mark.parametrize("search", [Genetic, CovarianceAdaptation])
+def test_a_population_stops_at_its_generations_and_never_ends_worse(search):
+    """`generations` is G_max: not one more is evaluated or told of; where nothing is better the start comes back."""
+    problem = SimpleNamespace(residual=lambda u: u - 0.3)
+    rows, start = [], np.full(3, 0.9)
+    found = search(population=10, generations=4)(problem, start, rows.append)
+    assert [row["generation"] for row in rows] == [1, 2, 3, 4]
+    assert ((found - 0.3) ** 2).sum() == pytest.approx(rows[-1]["cost"])
+    assert np.array_equal(
+        search(population=10, generations=2)(problem, np.full(3, 0.3), rows.append), np.full(3, 0.3)
+    )
+
+
 def test_a_joint_whose_refit_does_not_pay_keeps_its_friction(arm, truth, wrong):
-    """With `folds`, a joint that is as the nominal model says stays so and is not called identified; others are."""
+    """With keep_nominal, a joint that is as the nominal model says stays so and is unseen; others are identified."""
     mixed = replace(
         truth, phi=np.where(np.arange(3)[:, None] == 1, wrong.phi, truth.phi), offset=truth.offset * [1, 0, 1]
     )
-    result = fit(arm, wrong, measured(arm, mixed, [1, 1, 1], 8.0, noise=0.3), folds=4)
+    result = fit(arm, wrong, measured(arm, mixed, [1, 1, 1], 8.0, noise=0.3), keep_nominal=True)
     np.testing.assert_allclose(result.dynamics.phi[1], wrong.phi[1], rtol=1e-2, atol=1e-3)
     assert abs(result.dynamics.offset[1]) < 1e-2
     assert abs(result.dynamics.offset[0] - truth.offset[0]) < 0.05
-    names = np.array(result.space.names)
-    assert not result.identifiable[[n in ("phi1[2]", "phi2[2]", "phi3[2]", "offset[2]") for n in names]].any()
-    assert result.identifiable[[n in ("phi1[1]", "offset[1]", "phi1[3]", "offset[3]") for n in names]].all()
+    names, known = np.array(result.space.names), result.found.identifiable
+    assert not known[[n in ("phi1[2]", "phi2[2]", "phi3[2]", "offset[2]") for n in names]].any()
+    assert known[[n in ("phi1[1]", "offset[1]", "phi1[3]", "offset[3]") for n in names]].all()
 
 
-def test_the_genetic_search_stops_at_its_generations():
-    """`generations` is G_max: not one more is evaluated or told of."""
-    rows = []
-    ga_search(population=10, generations=4)(lambda u: u - 0.3, np.full(3, 0.9), rows.append)
-    assert [row["generation"] for row in rows] == [1, 2, 3, 4]
-
-
-def test_searches_run_one_after_the_other(arm, truth, wrong):
+def test_searches_run_one_after_the_other(arm, wrong, clean):
     """Least squares after the GA starts where the GA ended and ends no worse than it."""
-    recording = measured(arm, truth, SCALE, 4.0)
-    result = identify(
-        arm,
-        wrong,
-        recording,
-        [ga_search(population=30, generations=5, seed=0), least_squares_search()],
-        bounds=SETTINGS["bounds"],
-        prior={},
-        nthread=1,
-    )
+    searches = [Genetic(population=30, generations=5, seed=0), LeastSquares()]
+    result = run(arm, wrong, clean, searches, prior={})
     cost = result.history.groupby("search", sort=False)["cost"]
     assert list(cost.groups) == ["ga", "least_squares", "least_squares, reweighed"]
-    assert cost.first()["least_squares"] == pytest.approx(cost.last()["ga"], rel=1e-2)
-    assert cost.last()["least_squares"] < cost.last()["ga"]
+    assert cost.last()["least_squares"] < cost.first()["least_squares"]
 
 
-def test_a_prior_decides_where_the_data_cannot(arm, truth, wrong):
+def test_a_prior_decides_where_the_data_cannot(arm, wrong, clean):
     """A belief held very firmly keeps the nominal value; without one the data move it."""
-    recording = measured(arm, truth, SCALE, 4.0)
     scales = []
     for prior in ({"inertia_scale": 1e-6}, {}):
-        result = identify(
-            arm, wrong, recording, [least_squares_search()], bounds=SETTINGS["bounds"], prior=prior, nthread=1
-        )
+        result = run(arm, wrong, clean, [LeastSquares()], prior=prior)
         scales.append(result.space.block(result.x, "inertia_scale"))
     np.testing.assert_allclose(scales[0], 1.0, atol=1e-3)
     assert np.abs(scales[1] - 1.0).min() > 0.1
+
+
+def test_what_is_left_out_is_not_fitted(clean):
+    """Folds cover every moment once, and what is fitted keeps 0.1 s away; of repeated motion they are phases."""
+    for recording, clock in ((clean, clean.t), (replace(clean, period=1.5), clean.t % 1.5)):
+        lookup = dict(zip(clean.t.tolist(), clock.tolist(), strict=True))
+        folds = left_out(recording, 4)
+        assert sum(len(out.t) for _, out in folds) >= len(clean.t)
+        for rest, out in folds:
+            near = np.array([lookup[t] for t in rest.t.tolist()])
+            low, high = (f(lookup[t] for t in out.t.tolist()) for f in (min, max))
+            assert np.all((near <= low - 0.099) | (near >= high + 0.099))
+            assert 0.15 < len(out.t) / len(clean.t) < 0.35
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"joints": 2}, r"^the recording has 2 joints, threelink has 3$"),
-        ({"prior": {"inertia_scal": 1.0}}, r"^prior: \['inertia_scal'\] is not searched"),
-        ({"bounds": {"phi9": [0, 1]}}, r"^bounds: unknown parameter 'phi9'; allowed: .*did you mean 'phi"),
-        ({"rows": 150}, r"^no trajectory is as long as a window of 0\.2 s; the longest is 0\.1"),
+        ({"scale": 180 / np.pi}, r"^the recording: joint \d is at -?\d+\.\d+ rad, threelink allows .* degrees\?$"),
+        (
+            {"rows": 150},
+            r"^the recording has not enough motion .*: 0\.15 s .* at least 1 s and 0\.02 rad are needed$",
+        ),
+        ({"scale": 1e-3}, r"^the recording has not enough motion .* moves most moves 0\.00\d+ rad; at least 1 s"),
+        ({"window_s": 3.0}, r"^no trajectory is as long as a window of 3 s; the longest is 1\.5"),
+        ({"prior": {"inertia_scal": 1.0}}, r"^prior: .*'inertia_scal'.*; did you mean 'inertia_scale'\?$"),
+        ({"prior": {"offset": 0.0}}, r"^prior\.offset: 0\.0 .*positive"),
+        ({"bounds": BOUNDS | {"phi9": [0, 1]}}, r"^bounds: unknown parameter 'phi9'; allowed: .*did you mean 'phi"),
+        ({"bounds": {"phi1": [0.1, 1.0]}}, r"^identify\.bounds: none for offset, inertia_scale, delay$"),
+        ({"terms": ["ofset"]}, r"^identify\.terms: unknown term 'ofset'; allowed: .*; did you mean 'offset'\?$"),
+        ({"terms": ["inertia_scale", "link"]}, r"^bounds: inertia_scale and link_\.\.\. describe the same tensors"),
+        ({"family": "stribek"}, r"^friction\.family: no family 'stribek'; allowed: .*; did you mean 'stribeck'\?$"),
+        ({"family": "auto", "folds": 1}, r"^identify\.folds: 1 .* at least 2"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(arm, wrong, motion, change, message):
-    """Another number of joints, an unknown block and a recording that is too short are named."""
-    joints, rows = change.pop("joints", 3), change.pop("rows", 400)
+    """Another arm, degrees, too little motion, and unknown names are told apart, each with the nearest match."""
+    joints, rows, scale = (change.get(k, v) for k, v in (("joints", 3), ("rows", 1500), ("scale", 1.0)))
+    settings = {k: v for k, v in change.items() if k not in ("joints", "rows", "scale")}
     short = Recording(
         t=motion.t[:rows],
-        q=motion.q[:rows, :joints],
-        dq=motion.dq[:rows, :joints],
+        q=scale * motion.q[:rows, :joints],
+        dq=scale * motion.dq[:rows, :joints],
         tau=motion.tau[:rows, :joints],
         torque="commanded",
     )
-    settings = {"bounds": SETTINGS["bounds"], "prior": {}} | change
     with pytest.raises(UserError, match=message) as caught:
-        identify(arm, wrong, short, [least_squares_search()], nthread=1, **settings)
+        run(arm, wrong, short, [LeastSquares()], **settings)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason=f"the real recording is not here: {REAL}")
 def test_the_real_recording_is_predicted_better_than_by_published_values(panda):
-    """On held-out phases of the real Panda's motion the torque error falls below the published model's."""
+    """On held-out phases of the real Panda's motion the torque error is a third below the published model's.
+
+    No joint is predicted worse.
+    """
     columns = {"t": "t", "q": "q", "dq": "dq", "tau": None, "trajectory": None}
     how = {"torque": "measured", "columns": columns, "period": 13.3333, "max_gap_s": 0.05, "n_joints": 7}
     train, validation = read(REAL, **how).split(SETTINGS["validation_fraction"])
     nominal = nominal_dynamics(panda, **conf("friction/gaz2019"))
-    result = identify(
-        panda,
-        nominal,
-        train,
-        [least_squares_search()],
-        bounds=SETTINGS["bounds"],
-        prior=SETTINGS["prior"]["measured"],
-        cutoff_hz=SETTINGS["cutoff_hz"],
-        folds=SETTINGS["folds"],
-        nthread=1,
-    )
-    errors = prediction_errors(panda, nominal, result.dynamics, validation, **HOW)
+    searches = [instantiate(s) for s in conf("search/staged")]
+    terms = SETTINGS["terms"]["measured"]
+    result = run(panda, nominal, train, searches, terms=terms, family="auto", folds=SETTINGS["folds"])
+    errors = prediction_errors(panda, nominal, result.dynamics, validation, **WINDOW)
     ratio = np.array(errors["torque_rmse_Nm"]) / np.array(errors["nominal_torque_rmse_Nm"])
-    assert ratio.mean() < 1
+    assert ratio.mean() < 0.75
+    assert ratio.max() < 1.02
 
 
 @pytest.mark.slow
@@ -387,15 +684,7 @@ def test_the_papers_new_column_is_found_from_its_old_one(panda):
     new = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     old = nominal_dynamics(panda, **conf("friction/gaz2019"), inertia_scale=conf("inertia/nominal")["scale"])
     recording = recorded(panda, new, 20.0, seed=0)
-    result = identify(
-        panda,
-        old,
-        recording,
-        [least_squares_search()],
-        bounds=SETTINGS["bounds"],
-        prior=SETTINGS["prior"]["commanded"],
-        nthread=1,
-    )
+    result = run(panda, old, recording, [instantiate(s) for s in conf("search/staged")], breakaway_max=1.5)
     assert curve_error(result.dynamics, new, recording.dq).max() < 0.02
     np.testing.assert_allclose(result.dynamics.offset, new.offset, atol=0.02)
     assert np.mean(np.abs(result.dynamics.breakaway - new.breakaway) < 0.08) > 0.5

@@ -1,0 +1,57 @@
+"""What the identification benchmarks share: the Panda, its published and its true values, settings from conf/."""
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+from hydra.utils import instantiate  # noqa: E402
+
+from r2s.arm.ramp import ramp  # noqa: E402
+from r2s.arm.record import record  # noqa: E402
+from r2s.excitation import fourier  # noqa: E402
+from r2s.parameters import nominal_dynamics  # noqa: E402
+from r2s.robot import load_robot  # noqa: E402
+from r2s.runs import _cpu  # noqa: E402
+
+
+def conf(path: str) -> dict:
+    """Read one file of conf/."""
+    return yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+
+
+MACHINE = f"{_cpu()}, {os.cpu_count()} cores"
+ROBOT = load_robot(**conf("robot/panda"))
+OLD = nominal_dynamics(ROBOT, **conf("friction/gaz2019"))
+NEW = nominal_dynamics(ROBOT, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+SETTINGS = conf("config")["identify"]
+
+
+def searches(name: str, **change) -> list:
+    """Return the searches of conf/search/<name>.yaml; seeds are 0."""
+    text = (ROOT / "conf" / "search" / f"{name}.yaml").read_text().replace("${seed}", "0")
+    return [instantiate(s | {k: v for k, v in change.items() if k in s}) for s in yaml.safe_load(text)]
+
+
+def poses(count: int) -> list[np.ndarray]:
+    """Return the postures of the breakaway protocol, as run.py chooses them."""
+    turn = np.where(np.arange(ROBOT.n) % 2, -0.3, 0.3)
+    return [ROBOT.q_home + k * turn for k in range(count)]
+
+
+def how(torque: str = "commanded", **change) -> dict:
+    """Return the keyword arguments of `identify` as stage=identify gives them."""
+    s = SETTINGS
+    out = {"bounds": s["bounds"], "prior": s["prior"][torque], "terms": s["terms"][torque]}
+    out |= {"window_s": s["window_s"], "stride": s["stride"], "cutoff_hz": s["cutoff_hz"], "folds": s["folds"]}
+    return out | {"breakaway_max": s["breakaway"]} | change
+
+
+__all__ = ["MACHINE", "NEW", "OLD", "ROBOT", "ROOT", "SETTINGS", "conf", "fourier", "how", "poses", "ramp", "record"]
+__all__ += ["replace", "searches"]
