@@ -11,6 +11,7 @@ import time
 import numpy as np
 from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, poses, ramp, record, replace, searches
 
+from r2s.arm.interface import ArmStopped
 from r2s.arm.simulated import SimulatedArm
 from r2s.identify import identify, prediction_errors
 from r2s.parameters import inertia_scale
@@ -32,12 +33,18 @@ ASKED = {
 }
 
 
+def recorded(seed: int, excitation: int):
+    """Return a recording; where the arm stops itself, of another excitation."""
+    try:
+        return record(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), fourier(ROBOT, duration=20.0, seed=excitation))
+    except ArmStopped as stop:
+        print(f"excitation {excitation}: {stop}; taking {excitation + 1000}", flush=True)
+        return recorded(seed, excitation + 1000)
+
+
 def one(seed: int) -> list[float]:
     """Return a row of the table."""
-    motions = [
-        record(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), fourier(ROBOT, duration=20.0, seed=s))
-        for s in (2 * seed, 2 * seed + 1)
-    ]
+    motions = [recorded(seed, s) for s in (2 * seed, 2 * seed + 1)]
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses(2))
     began = time.perf_counter()
     found = identify(ROBOT, OLD, motions[0], searches("staged"), family="sigmoid", ramps=ramps, **how(terms=TERMS))

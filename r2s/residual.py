@@ -208,16 +208,17 @@ class ReplayResidual:
         steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
         z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
         self._trust = np.ones(self.count)
-        if fitted:
-            usual = np.ones(self.count, dtype=bool)
+        moves = self._seen.any((1, 2))  # the others have no error at all, and say nothing of its usual size
+        if fitted and moves.any():
+            usual = moves
             for _ in range(2):  # a window in which something else happened tells nothing of the noise of the others
                 self._spread, self._noise = _random_effects(
                     z[usual], at_x[0, usual], self._seen[usual], self._spread, self._noise, self._least
                 )
                 self._whiten(z)
                 size = self._window_size(at_x[0])
-                usual = size <= np.quantile(size, USUAL)
-            self._trust = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-9))
+                usual = moves & (size <= np.quantile(size[moves], USUAL))
+            self._trust = np.minimum(1.0, HUBER * np.median(size[moves]) / np.maximum(size, 1e-9))
         self._whiten(z)
 
     def _window_size(self, error: np.ndarray) -> np.ndarray:

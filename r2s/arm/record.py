@@ -84,7 +84,7 @@ class Tracker:
         self._theta = np.zeros((3, robot.n))
         # what a joint feels with the others free; Nm/s per (rad/s + BANDWIDTH rad) of error
         alone = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
-        self._learn = LEARNING * SIM_DT * BANDWIDTH**2 * np.median(alone, axis=0)
+        self._learn = LEARNING * SIM_DT * BANDWIDTH**2 * alone  # of each posture: a light one has to learn slowly
         self._limit, self._step = TORQUE_SHARE * robot.tau_max, RATE_SHARE * robot.dtau_max * SIM_DT
         self._smooth = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)
         self._filtered = np.zeros(robot.n)
@@ -93,7 +93,7 @@ class Tracker:
         """Return the command (n,) Nm of cycle k, from the state read in it and the command before."""
         e = self._e
         lag, slow = e.q[k] - q, e.dq[k] - dq
-        self._theta += self._learn * (slow + 0.5 * BANDWIDTH * lag) * self._regressor[k]
+        self._theta += self._learn[k // MASS_EVERY] * (slow + 0.5 * BANDWIDTH * lag) * self._regressor[k]
         pull = self._mass[k // MASS_EVERY] @ (BANDWIDTH**2 * lag + 2 * BANDWIDTH * slow)
         tau = self._feedforward[k] + pull + (self._theta * self._regressor[k]).sum(0)
         self._filtered += self._smooth * (tau - self._filtered)
