@@ -224,7 +224,10 @@ def test_mistake_gets_one_line(mistake, recording, tmp_path):
     (tmp_path / "six.csv").write_text("\n".join(six))
     (tmp_path / "copy.csv").write_text("\n".join(rows[:1500]))
     values = np.loadtxt(recording, delimiter=",", skiprows=1)
-    for name, q in (("still", values[:, 1:8] * 1e-3), ("degrees", np.degrees(values[:, 1:8]))):
+    for name, q in (
+        ("still", values[0, 1:8] + 1e-3 * (values[:, 1:8] - values[0, 1:8])),
+        ("degrees", np.degrees(values[:, 1:8])),
+    ):
         table = np.column_stack([values[:, :1], q, values[:, 8:]])
         np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
     places = {
