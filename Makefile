@@ -10,7 +10,7 @@ run: $(READY)
 	$(BIN)/python run.py stage=pipeline
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
