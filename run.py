@@ -139,17 +139,15 @@ def make_source(cfg, robot, seed):
     return SimulatedArm(robot, dynamics, **noise, seed=seed)
 
 
-def record_motion(cfg, robot, seed, label):
-    """Return a recording of an excitation, the motion of data.excitation or an optimised one."""
+def record_motion(cfg, robot, motion, seed, label):
+    """Return the recording of a motion; without one, of the best that was found for data.seconds."""
     from r2s.arm.record import record
-    from r2s.excitation import fourier, load
+    from r2s.excitation import fourier
     from r2s.runs import Progress
 
     progress = Progress(label)
-    if cfg.data.excitation and seed == cfg.data.excitation_seed:
-        motion = load(cfg.data.excitation, robot)
-    else:
-        motion = fourier(robot, duration=cfg.data.seconds, seed=seed)
+    if motion is None:
+        motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=cfg.data.torque == "measured")
     arm = make_source(cfg, robot, seed)
     out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
@@ -158,20 +156,15 @@ def record_motion(cfg, robot, seed, label):
 
 def record_ramps(cfg, robot):
     """Return the ramps of the breakaway protocol about the home posture, or None where none are asked for."""
-    import numpy as np
-
-    from r2s.arm.ramp import ramp
+    from r2s.arm.ramp import poses_about, ramp
     from r2s.runs import Progress
 
     if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
         return None
     progress = Progress("ramp the joints until they move")
-    turn = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
-    poses = [robot.q_home + k * turn for k in range(cfg.data.ramp_poses)]
-    poses = np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
     out = ramp(
         make_source(cfg, robot, cfg.data.excitation_seed + 2),
-        poses,
+        poses_about(robot, cfg.data.ramp_poses),
         progress=lambda k, n: progress(k / n, f"{k} ramps"),
     )
     progress.close(f"{out.recording.duration:.1f} s of ramps")
@@ -221,17 +214,18 @@ def identify(cfg, overrides):
     from r2s.breakaway import Ramps
     from r2s.errors import UserError
     from r2s.excitation import load
-    from r2s.identify import check_choices, prediction_errors
     from r2s.identify import identify as run_identify
     from r2s.parameters import save_parameters
+    from r2s.problem import check_choices
     from r2s.readers import files_of, read
     from r2s.runs import Progress
+    from r2s.validation import prediction_errors
 
     robot, settings = make_robot(cfg), plain(cfg.identify)
     nominal = make_dynamics(cfg, robot)
     for terms in settings["terms"].values():
         check_choices(cfg.friction.family, terms)
-    inputs, ramps = [], None
+    inputs, ramps, motion = [], None, None
     if cfg.data.kind == "recording":
         train, validation = read_motion(cfg, robot)
         inputs = [f for p in (cfg.data.path, cfg.data.validation) if p for f in files_of(p)]
@@ -239,22 +233,22 @@ def identify(cfg, overrides):
             ramps = Ramps.load(cfg.data.ramps)
             inputs.append(cfg.data.ramps)
     elif cfg.data.excitation:
-        load(cfg.data.excitation, robot)  # a wrong file is said before a folder is made
+        motion = load(cfg.data.excitation, robot)  # a wrong file is said before a folder is made
         inputs = [cfg.data.excitation]
     with open_run(cfg, overrides, inputs) as run:
         if cfg.data.kind != "recording":
 
-            def recorded(name, seed, label):
+            def recorded(name, motion, seed):
                 path = run.folder / f"{name}.npz"
                 if not path.is_file():
-                    motion, out = record_motion(cfg, robot, seed, label)
+                    motion, out = record_motion(cfg, robot, motion, seed, f"record {name} motion")
                     motion.save(run.folder / f"excitation_{name}.csv")
                     out.save(path)
                 return read(path, torque=cfg.data.torque)
 
             try:
-                train = recorded("train", cfg.data.excitation_seed, "record training motion")
-                validation = recorded("validation", cfg.data.excitation_seed + 1, "record validation motion")
+                train = recorded("train", motion, cfg.data.excitation_seed)
+                validation = recorded("validation", None, cfg.data.excitation_seed + 1)
                 path = run.folder / "ramps.npz"
                 ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
                 if ramps is not None and not path.is_file():

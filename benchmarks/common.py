@@ -5,7 +5,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 ROOT = Path(__file__).parent.parent
@@ -13,7 +12,7 @@ sys.path.insert(0, str(ROOT))
 
 from hydra.utils import instantiate  # noqa: E402
 
-from r2s.arm.ramp import ramp  # noqa: E402
+from r2s.arm.ramp import poses_about, ramp  # noqa: E402
 from r2s.arm.record import record  # noqa: E402
 from r2s.excitation import fourier  # noqa: E402
 from r2s.parameters import nominal_dynamics  # noqa: E402
@@ -39,12 +38,6 @@ def searches(name: str, **change) -> list:
     return [instantiate(s | {k: v for k, v in change.items() if k in s}) for s in yaml.safe_load(text)]
 
 
-def poses(count: int) -> list[np.ndarray]:
-    """Return the postures of the breakaway protocol, as run.py chooses them."""
-    turn = np.where(np.arange(ROBOT.n) % 2, -0.3, 0.3)
-    return [ROBOT.q_home + k * turn for k in range(count)]
-
-
 def how(torque: str = "commanded", **change) -> dict:
     """Return the keyword arguments of `identify` as stage=identify gives them."""
     s = SETTINGS
@@ -53,5 +46,5 @@ def how(torque: str = "commanded", **change) -> dict:
     return out | {"breakaway_max": s["breakaway"]} | change
 
 
-__all__ = ["MACHINE", "NEW", "OLD", "ROBOT", "ROOT", "SETTINGS", "conf", "fourier", "how", "poses", "ramp", "record"]
-__all__ += ["replace", "searches"]
+__all__ = ["MACHINE", "NEW", "OLD", "ROBOT", "ROOT", "SETTINGS", "conf", "fourier", "how", "poses_about", "ramp"]
+__all__ += ["record", "replace", "searches"]

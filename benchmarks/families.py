@@ -13,7 +13,7 @@ from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
 
 from r2s.arm.simulated import SimulatedArm
 from r2s.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK
-from r2s.identify import compare_families
+from r2s.validation import compare_families
 
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
 

@@ -9,12 +9,13 @@ import sys
 import time
 
 import numpy as np
-from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, poses, ramp, record, replace, searches
+from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, poses_about, ramp, record, replace, searches
 
 from r2s.arm.interface import ArmStopped
 from r2s.arm.simulated import SimulatedArm
-from r2s.identify import identify, prediction_errors
+from r2s.identify import identify
 from r2s.parameters import inertia_scale
+from r2s.validation import prediction_errors
 
 TRUTH = replace(NEW, delay=3e-3)
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
@@ -45,7 +46,7 @@ def recorded(seed: int, excitation: int):
 def one(seed: int) -> list[float]:
     """Return a row of the table."""
     motions = [recorded(seed, s) for s in (2 * seed, 2 * seed + 1)]
-    ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses(2))
+    ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
     found = identify(ROBOT, OLD, motions[0], searches("staged"), family="sigmoid", ramps=ramps, **how(terms=TERMS))
     seconds = time.perf_counter() - began

@@ -13,7 +13,8 @@ from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, record, replace, sea
 from known_truth import NOISE, TERMS, TRUTH
 
 from r2s.arm.simulated import SimulatedArm
-from r2s.identify import SLOWEST, Problem, searched
+from r2s.identify import CLEAR
+from r2s.problem import Problem, searched
 from r2s.residual import ReplayResidual, TorqueResidual
 
 matplotlib.use("Agg")
@@ -52,7 +53,7 @@ def main() -> None:
     s = how(terms=TERMS)
     nominal = replace(OLD, breakaway=TRUTH.breakaway)  # edges come from ramps, for all searches alike
     space = searched(ROBOT, nominal, s["bounds"], TERMS, motions[0])
-    timing = {"window_s": s["window_s"], "stride": s["stride"], "slowest": SLOWEST}
+    timing = {"window_s": s["window_s"], "stride": s["stride"], "slowest": CLEAR * OLD.dq_min}
     judge = ReplayResidual(ROBOT, space, motions[1], window_s=0.2, stride=5, batch=SHOWN)
     figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
     lines = []

@@ -9,16 +9,17 @@ import sys
 import time
 
 import numpy as np
-from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, poses, ramp, record, searches
+from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, poses_about, ramp, record, searches
 
 from r2s.arm.twin import Twin
-from r2s.identify import identify, prediction_errors
+from r2s.identify import identify
+from r2s.validation import prediction_errors
 
 
 def one(seed: int) -> dict:
     """Return what came out for one twin."""
     train, validation = (record(Twin(ROBOT, seed), fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1))
-    ramps = ramp(Twin(ROBOT, seed), poses(2))
+    ramps = ramp(Twin(ROBOT, seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
     found = identify(ROBOT, OLD, train, searches("staged"), family="auto", ramps=ramps, **how())
     seconds = time.perf_counter() - began

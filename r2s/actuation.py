@@ -6,6 +6,7 @@ its loop adds them, clips the sum and limits its rate once more (r2s/arm/deploy.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,6 +87,14 @@ class Actuation:
         self.filtered[at] = 0.0
         self.last[at] = 0.0
 
+    def state(self) -> dict[str, np.ndarray]:
+        """Return copies of the filter's state and the last command, for `set_state`."""
+        return {"filtered": self.filtered.copy(), "last": self.last.copy()}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go back to what `state` returned."""
+        self.filtered[:], self.last[:] = state["filtered"], state["last"]
+
     def __call__(self, target: np.ndarray, nstep: int) -> np.ndarray:
         """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
         out = np.empty((len(target), nstep, target.shape[1]))
@@ -136,6 +145,15 @@ class Motors:
         at = slice(None) if ids is None else ids
         self._motor[at] = tau
         self._line[at] = np.asarray(tau)[..., None, :] if np.ndim(tau) else tau
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return copies of delays, lags and what is under way, for `set_state`."""
+        return {name: getattr(self, name).copy() for name in ("_line", "_motor", "_delay", "_gain")}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go back to what `state` returned."""
+        for name, array in state.items():
+            getattr(self, name)[:] = array
 
     def __call__(self, tau: np.ndarray) -> np.ndarray:
         """Return (m, nstep, n) Nm at the joints for commands (m, nstep, n) Nm, one per ms."""

@@ -5,8 +5,9 @@ ms -> delay and lag -> physics with soft limits at 1 kHz for one control period 
 terms, truncation. Episodes never terminate, they are cut off (`truncated`): values bootstrap through their end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -229,12 +230,28 @@ class ReachEnv(EnvBase):
             batch_size=self.batch_size,
         )
 
+    def state(self) -> dict[str, Any]:
+        """Return all that the next steps depend on, as arrays, numbers and names, for `set_state`."""
+        own = {name: getattr(self, name).copy() for name in ("goal", "_dq", "_count", "_distance0")}
+        parts = {name: getattr(self, name).state() for name in ("sim", "actuation", "motors")}
+        return own | parts | {"rng": self.rng.bit_generator.state, "_stagger": self._stagger}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go back to what `state` returned; the same actions then lead to the same steps, bit for bit."""
+        for name in ("goal", "_dq", "_count", "_distance0"):
+            getattr(self, name)[:] = state[name]
+        for name in ("sim", "actuation", "motors"):
+            getattr(self, name).set_state(state[name])
+        self.rng.bit_generator.state = state["rng"]
+        self._stagger = state["_stagger"]
+
     def _observe(self) -> np.ndarray:
         s = self.sim
         return observe(s.q, s.dq, s.ee, self.goal, s.jacobian, self.actuation.last / self._torque)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].numpy().astype(np.float64)
+        self._finite("action", action)
         command = self.actuation(np.clip(action, -1.0, 1.0) * self._torque, self.task.substeps)
         self.sim.rollout(self.motors(command))
         self.sim.kinematics()
@@ -245,9 +262,8 @@ class ReachEnv(EnvBase):
         distance = np.linalg.norm(self.goal - self.sim.ee, axis=-1)
         terms = rewards.terms(distance, self._distance0, dq, ddq)
         observation = self._observe()
-        if not np.isfinite(observation).all():
-            broken = int(np.flatnonzero(~np.isfinite(observation).all(-1))[0])
-            raise FloatingPointError(f"arm {broken} left the numbers at its step {self._count[broken]}")
+        self._finite("observation", observation)
+        self._finite("reward", terms)
         cut = torch.from_numpy((self._count >= self.task.steps)[:, None])
         return TensorDict(
             {
@@ -261,6 +277,14 @@ class ReachEnv(EnvBase):
             },
             batch_size=self.batch_size,
         )
+
+    def _finite(self, what: str, rows: np.ndarray) -> None:
+        """Raise FloatingPointError where a row of (nsim, ...) has a value that is not finite."""
+        bad = ~np.isfinite(rows).all(-1)
+        if bad.any():
+            arm = int(bad.argmax())
+            value = rows[arm][~np.isfinite(rows[arm])][0]
+            raise FloatingPointError(f"{what} of arm {arm} is {value} at step {self._count[arm]} of its episode")
 
     def _set_seed(self, seed: int | None) -> None:
         self.rng = np.random.default_rng(seed)

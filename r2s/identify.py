@@ -2,181 +2,37 @@
 
 `identify` goes: friction family (compared on motion left out, with family=auto) -> the searches one after the other
 -> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found (block
-bootstrap). The paper's algorithm is search=ga on the residual of eq. (8). A search is a function on the unit cube; it
-knows nothing of arms.
+bootstrap). The paper's algorithm is search=ga on the residual of eq. (8).
 """
 
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from r2s.breakaway import Breakaway, Ramps, breakaway
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError
 from r2s.friction import BRISTLE, FAMILIES
-from r2s.least_squares import minimise
-from r2s.parameters import LINK, UNITS, Estimate, ParameterSpace, of_family, parameter_space
+from r2s.identified import Identified, conclude, posterior
+from r2s.parameters import check_parameters, of_family, parameter_space
+from r2s.problem import Problem, Report, Search, check_choices, check_prior, searched
 from r2s.recording import Recording
-from r2s.residual import ReplayResidual, TorqueResidual, cut_windows, replay
+from r2s.residual import MOVED, ReplayResidual, TorqueResidual
 from r2s.robot import Robot
-from r2s.simulator import Dynamics, Simulator
+from r2s.simulator import Dynamics
+from r2s.validation import compare_families, joints_kept
 
-HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
-DRAWS = 512  # of the joint distribution
-SHARPER = 4.0  # a parameter is identifiable when the half width of its interval is this much below its prior's sigma
 REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
-SLOWEST = 0.02  # rad/s: below it a joint may be in the dead zone; friction with a memory has none
-FAMILY_HZ = 50.0  # rows per second that families are compared on
-STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
-TERMS = ("viscous", "offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
-MOVED = 0.02  # rad that a joint must move for its friction to be looked for
-Report = Callable[[dict], None]
+MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
+TRUST = 0.01  # and by how much less the error must be to go that far
+NONE = 1e-4  # standard deviation of the belief in a value that is not searched any more
+CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
-
-
-class Problem:
-    """What a search sees: residuals on the unit cube, with what was believed before as rows of its own.
-
-    Args:
-        data: the residual that decides. quick: one on the level of torque, for a fast start; may be the same.
-        prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
-            the scale is logarithmic). Blocks that are not named are uniform in their bounds.
-        kept: (n,) bool, joints whose friction and offset stay nominal.
-    """
-
-    def __init__(
-        self,
-        data: ReplayResidual | TorqueResidual,
-        quick: TorqueResidual,
-        prior: Mapping[str, float],
-        kept: np.ndarray | None = None,
-    ):
-        self.data, self.quick_data, self.space = data, quick, data.space
-        space = data.space
-        self.start = space.to_unit(space.start)
-        uniform = space.spread / np.sqrt(12)
-        self.sigma = np.minimum(space.spread_out(prior, np.inf), uniform)
-        if kept is not None:
-            self.sigma[space.of_joints(kept)] = 1e-4
-        self.weight = space.spread / self.sigma
-        self.clusters = data.clusters
-
-    def residual(self, u: np.ndarray) -> np.ndarray:
-        """Return (C, R + P) for u (C, P) on the unit cube: data, then prior, in standard deviations."""
-        return self._with_prior(self.data, u)
-
-    def quick(self, u: np.ndarray) -> np.ndarray:
-        """Return `residual` on the level of torque."""
-        return self._with_prior(self.quick_data, u)
-
-    def quick_jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return (R + P, P), the Jacobian of `quick` at u (P,)."""
-        h = np.where(u > 0.5, -STEP, STEP)
-        change = self.quick_data.change(self.space.from_unit(u), self.space.from_unit(u + h))
-        return np.concatenate([change / h, np.diag(self.weight)])
-
-    def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:
-        return np.concatenate([data(self.space.from_unit(u)), (u - self.start) * self.weight], axis=1)
-
-    def adapt(self, u: np.ndarray, fitted: bool) -> None:
-        """Let the residuals find their weights about u (P,)."""
-        for data in {id(d): d for d in (self.data, self.quick_data)}.values():
-            data.adapt(self.space.from_unit(u), fitted)
-
-    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual (R + P,) and its Jacobian (R + P, P) at u (P,)."""
-        if self.data is self.quick_data:
-            return self.quick(u[None])[0], self.quick_jacobian(u)
-        h = np.where(u > 0.5, -STEP, STEP)  # always into the cube
-        r = self.residual(np.concatenate([u[None], u + np.diag(h)]))
-        return r[0], ((r[1:] - r[0]) / h[:, None]).T
-
-
-class Posterior(NamedTuple):
-    """u (P,) the result on the unit cube, draws about it as steps (S, P), and the data's information (P, P)."""
-
-    u: np.ndarray
-    steps: np.ndarray
-    information: np.ndarray
-
-
-class Search(Protocol):
-    """A search minimises the sum of squares of a Problem's residual from `start` (P,) and returns where it ended.
-
-    `report` gets a dict after every step or generation: search, evaluations, cost, done, total. `local` says whether
-    it goes on from its start, so that it can polish.
-    """
-
-    local: bool
-
-    def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return u (P,) on the unit cube."""
-        ...
-
-
-@dataclass(frozen=True)
-class Identified:
-    """The result.
-
-    Attributes:
-        space, found: what was searched, and what was found (r2s/parameters.py).
-        history: a row per step or generation of each search.
-        families: {"sigmoid": error on motion left out, ...} where the family was chosen, relative to the best.
-        null_directions: combinations of parameters that only the prior decides: (share of the prior's sigma left,
-            {name: part}), widest first.
-        unseen: names that keep their nominal value, because the data hardly say anything of them.
-        break_spread: (n, 2) Nm, repeatability of the breakaway, where it was measured.
-    """
-
-    space: ParameterSpace
-    found: Estimate
-    history: pd.DataFrame
-    families: dict[str, float]
-    null_directions: list[tuple[float, dict[str, float]]]
-    unseen: list[str]
-    break_spread: np.ndarray | None = None
-
-    @property
-    def x(self) -> np.ndarray:
-        """(P,) the values found, SI units."""
-        return self.found.x
-
-    @property
-    def dynamics(self) -> Dynamics:
-        """The identified arm."""
-        return self.space.dynamics(self.found.x)
-
-    @property
-    def saved(self) -> tuple[ParameterSpace, Estimate]:
-        """What goes into parameters.yaml: the result, with measured edges of the dead zone as blocks of their own."""
-        if self.break_spread is None:
-            return self.space, self.found
-        d, f = self.dynamics, self.found
-        edges = self.space.dynamics(f.samples).breakaway
-        spread = np.nan_to_num(self.break_spread, nan=0.0)
-        rng = np.random.default_rng(0)
-        edges = edges + spread * rng.standard_normal(edges.shape)
-        edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
-        samples = np.concatenate([f.samples, edges[..., 0], edges[..., 1]], -1)
-        x = np.concatenate([f.x, d.breakaway[:, 0], d.breakaway[:, 1]])
-        half = 1.96 * np.concatenate([spread[:, 0], spread[:, 1]])
-        n, p = self.space.n, len(f.x)
-        low, high = np.concatenate([f.low, x[p:] - half]), np.concatenate([f.high, x[p:] + half])
-        known = np.concatenate([f.identifiable, np.ones(2 * n, dtype=bool)])
-        limit = np.full(n, 10.0)
-        space = replace(
-            self.space,
-            blocks=(*self.space.blocks, "breakaway_negative", "breakaway_positive"),
-            lower=np.concatenate([self.space.lower, -limit, 0 * limit]),
-            upper=np.concatenate([self.space.upper, 0 * limit, limit]),
-            break_command=None,
-        )
-        return space, Estimate(x, low, high, known, samples)
 
 
 def identify(
@@ -214,7 +70,7 @@ def identify(
             drag_cos, gain.
         family: of the friction; auto fits each and keeps the one that predicts motion left out best.
         ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
-        window_s, stride: replay windows, s, and every which ms is compared (commanded torque).
+        window_s, stride: replay windows, s, and ms that compared angles are means of (commanded torque).
         cutoff_hz: zero-phase filter of the torque.
         breakaway_max: scan the edges up to this, Nm, where there are no ramps (commanded torque; a link-side sensor
             does not feel the motor's breakaway). None keeps the nominal edges.
@@ -233,7 +89,8 @@ def identify(
     names = [f.name for f in FAMILIES]
     if folds < 2 and (family == "auto" or keep_nominal):
         raise UserError(f"identify.folds: {folds} is too few to leave motion out; at least 2 are needed")
-    _check_names(bounds, prior)
+    check_parameters("bounds", bounds)
+    check_prior(prior)
     began, history = time.perf_counter(), []
 
     def told(row: dict) -> None:
@@ -257,20 +114,18 @@ def identify(
         families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
         family = names[int(chosen["best"])]
     nominal = of_family(nominal, family)
-    edges = None
-    if ramps is not None:
-        edges = breakaway(ramps)
     space = searched(robot, nominal, bounds, terms, recording)
     quick = TorqueResidual(robot, space, recording, **how)
     data: ReplayResidual | TorqueResidual = quick
     if recording.torque == "commanded":
         batch = min(len(space.start) + 1, 64)
-        slowest = 0.0 if nominal.family == BRISTLE else SLOWEST
+        slowest = 0.0 if nominal.family == BRISTLE else CLEAR * nominal.dq_min  # bristles have no dead zone
         data = ReplayResidual(
             *(robot, space, recording),
             window_s=window_s,
             stride=stride,
             slowest=slowest,
+            edges=None if ramps is None else _reached(breakaway(ramps), np.array([-np.inf, np.inf])),
             batch=batch,
             nthread=nthread,
         )
@@ -281,12 +136,8 @@ def identify(
     u = problem.start
     for k, search in enumerate(searches):
         u = np.asarray(step(f"search {k + 1}", lambda s=search, u=u: {"u": s(problem, u, told)})["u"])  # type: ignore[misc]
-        problem.adapt(u, fitted=True)
-    if edges is not None:
-        # only now: a dead zone makes the error jump where a joint is held or let go, and a search from afar stick
-        space = replace(space, break_command=_reached(edges, nominal))
-        data.space = quick.space = problem.space = space
-        problem.adapt(u, fitted=True)
+        # what a first search leaves is not noise: weights come from what the last one could not explain
+        problem.adapt(u, fitted=k == len(searches) - 1)
     last = searches[-1]
     if last.local:  # a local search goes on from where it was, weighed by what is left unexplained
 
@@ -294,39 +145,48 @@ def identify(
             told(row | {"search": f"{row['search']}, reweighed"})
 
         for k in range(REWEIGH):
-            u = np.asarray(step(f"reweighed {k + 1}", lambda u=u: {"u": last(problem, u, again)})["u"])  # type: ignore[misc]
+            local = partial(without_lag, last) if k == REWEIGH - 1 and "lag" in space.blocks else last
+            u = np.asarray(step(f"reweighed {k + 1}", lambda s=local, u=u: {"u": s(problem, u, again)})["u"])  # type: ignore[misc]
             problem.adapt(u, fitted=True)
-    dynamics = space.dynamics(space.from_unit(u))
+        if "lag" in space.blocks and u[lag := space.where("lag")] == problem.start[lag]:
+            problem.believe(lag, NONE)
+    dynamics, edges = space.dynamics(space.from_unit(u)), None
+    scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=told)
     if ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
-        space = replace(space, break_command=_reached(edges, nominal))
+        command = _reached(edges, nominal.breakaway)
+        if nominal.family != BRISTLE:
+            dynamics = replace(dynamics, breakaway=command + dynamics.offset[:, None])
+            found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, None)})
+            command = np.asarray(found["edges"]) - dynamics.offset[:, None]
+        space = replace(space, break_command=command)
     elif breakaway_max and recording.torque == "commanded":
-        found = step(
-            "breakaway",
-            lambda: {
-                "edges": scan_breakaway(robot, dynamics, recording, breakaway_max, window_s, stride, nthread, told)
-            },
-        )
+        found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, breakaway_max)})
         space = replace(space, nominal=replace(nominal, breakaway=np.asarray(found["edges"])))
-    data.space = quick.space = problem.space = space
     sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
-    return conclude(problem, sure, pd.DataFrame(history), families, None if edges is None else edges.spread)
+    return conclude(problem, space, sure, pd.DataFrame(history), families, None if edges is None else edges.spread)
 
 
-def _reached(edges: Breakaway, nominal: Dynamics) -> np.ndarray:
-    """Return (n, 2) Nm, the commands at which joints let go; nominal where no ramp got that far."""
-    return np.where(np.isnan(edges.command), nominal.breakaway, edges.command)
+def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
+    """Return u (P,) of a local search without a lag, or with one where the data clearly need it.
+
+    A short lag does to slow torques what a delay does, and together they wander. Clearly: the cost falls by more than
+    the logarithm of the rows (Schwarz, Annals of Statistics 6(2), 1978).
+    """
+    lag = problem.space.where("lag")
+    before, free = problem.sigma[lag], problem.cost(start)
+    problem.believe(lag, NONE)
+    u = start.copy()
+    u[lag] = problem.start[lag]
+    u = search(problem, u, report)
+    needed = problem.cost(u) - free > np.log(len(problem.clusters))
+    problem.believe(lag, before)
+    return search(problem, start, report) if needed else u
 
 
-def check_choices(family: str, terms: Sequence[str]) -> None:
-    """Raise UserError if there is no such friction family, or no such term to search."""
-    for what, seen, known in (
-        ("friction.family: no family", [family], [*(f.name for f in FAMILIES), "auto"]),
-        ("identify.terms: unknown term", terms, TERMS),
-    ):
-        for name in seen:
-            if name not in known:
-                raise UserError(f"{what} '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
+def _reached(edges: Breakaway, otherwise: np.ndarray) -> np.ndarray:
+    """Return (n, 2) Nm, the commands at which joints let go; `otherwise` where no ramp got that far."""
+    return np.where(np.isnan(edges.command), otherwise, edges.command)
 
 
 def check_recording(robot: Robot, recording: Recording) -> None:
@@ -350,147 +210,12 @@ def check_recording(robot: Robot, recording: Recording) -> None:
         )
 
 
-def _check_names(bounds: Mapping[str, Sequence[float]], prior: Mapping[str, float]) -> None:
-    """Raise UserError if either names what does not exist (both may name what is not searched), or no deviation."""
-    for where, given in (("bounds", bounds), ("prior", prior)):
-        for name in given:
-            if name not in UNITS:
-                raise UserError(
-                    f"{where}: unknown parameter '{name}'; allowed: {choices(UNITS)}{nearest(name, UNITS)}"
-                )
-    for name, sigma in prior.items():
-        if not sigma > 0:
-            raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
-
-
-def searched(
-    robot: Robot,
-    nominal: Dynamics,
-    bounds: Mapping[str, Sequence[float]],
-    terms: Sequence[str],
-    recording: Recording,
-    break_command: np.ndarray | None = None,
-) -> ParameterSpace:
-    """Return the space of the family's parameters and `terms`; `link` stands for its ten blocks.
-
-    Delay and lag lie between a command and the motion, a gain error in the torque sensor: each is searched where
-    it is.
-
-    Raises:
-        UserError: a term without bounds.
-    """
-    names = [name for name in nominal.family.names if name in bounds]
-    if nominal.family.name == "sigmoid" and "viscous" not in terms:
-        names = [name for name in names if name != "viscous"]
-    for term in terms:
-        elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
-        if term == "viscous" or term in elsewhere:
-            continue
-        names += LINK if term == "link" else [term]
-    if missing := [name for name in names if name not in bounds]:
-        raise UserError(f"identify.bounds: none for {choices(missing)}")
-    return parameter_space(robot, nominal, {name: bounds[name] for name in names}, break_command)
-
-
-def fit_torque(problem: Problem, rounds: int = 2) -> np.ndarray:
-    """Return u (P,) by least squares on the level of torque, weighed again after every round."""
-    u = problem.start
-    for k in range(rounds):
-        u = minimise(problem.quick, problem.quick_jacobian, u, 12, 1e-3)
-        if k < rounds - 1:
-            problem.quick_data.adapt(problem.space.from_unit(u), fitted=True)
-    return u
-
-
-def left_out(recording: Recording, folds: int) -> list[tuple[Recording, Recording]]:
-    """Return (rest, block) for blocks of time, or of phase where the motion repeats itself; 0.1 s apart."""
-    clock = recording.t % recording.period if recording.period else recording.t
-    edges = np.quantile(clock, np.linspace(0, 1, folds + 1))
-    pairs = []
-    for low, high in pairwise(edges):
-        out = (clock >= low) & (clock <= high)
-        near = (clock > low - 0.1) & (clock < high + 0.1)
-        pairs.append((recording.select(~near), recording.select(out)))
-    return pairs
-
-
-def compare_families(
-    robot: Robot,
-    nominal: Dynamics,
-    recording: Recording,
-    bounds: Mapping[str, Sequence[float]],
-    prior: Mapping[str, float],
-    terms: Sequence[str],
-    folds: int,
-    how: Mapping[str, Any],
-    report: Report,
-) -> dict[str, Any]:
-    """Return {"error": (F,) relative to the best, "best": index}: torque predicted on motion left out.
-
-    A family with more parameters has to predict clearly better: by more than one standard error of the difference
-    over blocks of half a second (Breiman et al. 1984, the one-standard-error rule).
-    """
-    squares: list[np.ndarray] = []
-    scale: np.ndarray | None = None
-    how = dict(how) | {"rate_hz": FAMILY_HZ}
-    for k, f in enumerate(FAMILIES):
-        own = of_family(nominal, f.name)
-        blocks = []
-        for rest, out in left_out(recording, folds):
-            space = searched(robot, own, bounds, terms, recording)
-            fit = TorqueResidual(robot, space, rest, **how)
-            u = fit_torque(Problem(fit, fit, prior))
-            test = TorqueResidual(robot, space, out, **how)
-            error = test.error(space.from_unit(u)[None])[0] ** 2
-            window = test.clusters[:: robot.n]
-            blocks.append(np.stack([error[window == w].mean(0) for w in np.unique(window)]))
-        mean = np.concatenate(blocks)
-        scale = mean.mean(0) if scale is None else scale
-        squares.append((mean / scale).sum(1))
-        report(
-            {
-                "search": f"family {f.name}",
-                "evaluations": 0,
-                "cost": squares[-1].mean(),
-                "done": k + 1,
-                "total": len(FAMILIES),
-            }
-        )
-    means = np.array([s.mean() for s in squares])
-    best = int(means.argmin())
-    for k in np.argsort([len(f.names) for f in FAMILIES], kind="stable"):
-        more = squares[k] - squares[best]
-        if means[k] <= means[best] + more.std() / np.sqrt(len(more)):
-            best = int(k)
-            break
-    return {"error": np.sqrt(means / means.min()), "best": best}
-
-
-def joints_kept(
-    robot: Robot,
-    space: ParameterSpace,
-    recording: Recording,
-    prior: Mapping[str, float],
-    folds: int,
-    how: Mapping[str, Any],
-) -> np.ndarray:
-    """Return (n,) bool: joints whose refit does not predict left-out motion at least 5 % better (RMSE).
-
-    Published parameters are a strong start on real arms; a refit has to earn its place.
-    """
-    squared = np.zeros((2, robot.n))
-    for rest, out in left_out(recording, folds):
-        fit, test = (TorqueResidual(robot, space, part, **how) for part in (rest, out))
-        x = space.from_unit(fit_torque(Problem(fit, fit, prior)))
-        squared += (test.error(np.stack([x, space.start])) ** 2).sum(1)
-    return squared[0] >= 0.9 * squared[1]
-
-
 def scan_breakaway(
     robot: Robot,
     dynamics: Dynamics,
     recording: Recording,
-    largest: float,
+    largest: float | None,
+    *,
     window_s: float,
     stride: int,
     nthread: int,
@@ -500,141 +225,31 @@ def scan_breakaway(
 
     The error jumps where a joint is held or let go one step sooner, so there is no gradient: each edge is scanned
     over [0, largest], all edges at once and each judged by its own joint, then again about the best, ever finer.
-    The coarse scan is done twice, because an edge looks different while the others are wrong.
+    The coarse scan is done twice, because an edge looks different while the others are wrong. Without `largest` the
+    edges of `dynamics` were measured: only the fine scans are done, and where no hold tells them they stay.
     """
-    space = parameter_space(
-        robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
-    )
+    top = largest or 2.0 * np.abs(dynamics.breakaway).max() + MEASURED
+    space = parameter_space(robot, dynamics, {"breakaway_negative": [-top, 0.0], "breakaway_positive": [0.0, top]})
     data = ReplayResidual(
         robot, space, recording, window_s=window_s, stride=stride, slowest=0.0, limit=50, nthread=nthread
     )
-    x, step, coarse, passes = space.start, largest / 12, 2, 6
+    x, step, coarse, passes = space.start, top / 12, 2, 6
+    if largest is None:
+        step, coarse, passes = MEASURED, 0, 3
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
     for k in range(passes):
-        offsets = np.linspace(0, largest, 13) if k < coarse else step * np.arange(-2, 3)
+        offsets = np.linspace(0, top, 13) if k < coarse else step * np.arange(-2, 3)
         base = np.zeros_like(x) if k < coarse else x
         trials = np.clip(base[:, None] + sign[:, None] * offsets, space.lower[:, None], space.upper[:, None])
         candidates = np.repeat(x[None], trials.size, axis=0).reshape(*trials.shape, -1)
         candidates[np.arange(len(x)), :, np.arange(len(x))] = trials
         cost = data.joint_error(candidates.reshape(-1, len(x))).reshape(*trials.shape, robot.n)
         own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
+        if largest is None:
+            own *= 1.0 + TRUST * ((trials - space.start[:, None]) / MEASURED) ** 2
         x = trials[np.arange(len(x)), own.argmin(1)]
         step /= 1 if k < coarse else 2.5
         row = {"pass": k + 1, "evaluations": data.candidates, "done": k + 1, "total": passes}
         report(row | {"search": "breakaway"})
     return x.reshape(2, robot.n).T
-
-
-def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
-    """Return draws of the joint distribution about the result u (P,), by a linearised block bootstrap.
-
-    Errors within a window are correlated, so windows are drawn with replacement (Kuensch 1989), and the belief is
-    drawn from its prior each time; each draw is one Gauss-Newton step from u. Where the data say nothing a draw is
-    one of the prior's. A bootstrap of few windows is too narrow where single windows decide, so the spread is not
-    let below what the residual's own variance gives.
-    """
-    rng = np.random.default_rng(seed)
-    residual, jacobian = problem.jacobian(u)
-    rows, p = len(problem.clusters), len(u)
-    j, r = jacobian[:rows], residual[:rows]
-    count = int(problem.clusters.max()) + 1
-    order = np.argsort(problem.clusters, kind="stable")
-    edges = np.searchsorted(problem.clusters[order], np.arange(count + 1))
-    j, r = j[order], r[order]
-    gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
-    score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
-    belief = np.diag(problem.weight**2)
-    pull = problem.weight**2 * (u - problem.start)
-    factor = max(1.0, float(np.sqrt(np.mean(r**2))))
-    steps = np.empty((DRAWS, p))
-    for k in range(DRAWS):
-        times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
-        believed = pull - problem.weight * rng.standard_normal(p)
-        h = np.tensordot(times, gram, 1) + belief
-        steps[k] = -np.linalg.solve(h, times @ score + believed)
-    information = gram.sum(0)
-    covariance = np.linalg.inv(information + belief)
-    own = np.sqrt(np.diag(covariance @ (factor**2 * information + belief) @ covariance))
-    seen = steps.std(0)
-    steps = (steps - steps.mean(0)) * np.maximum(1.0, own / np.maximum(seen, 1e-12))
-    return Posterior(u, steps, information)
-
-
-def conclude(
-    problem: Problem,
-    sure: Mapping[str, Any],
-    history: pd.DataFrame,
-    families: dict[str, float],
-    break_spread: np.ndarray | None,
-) -> Identified:
-    """Return the result: what hardly any data spoke of goes back to nominal, and is named."""
-    space, u = problem.space, np.asarray(sure["u"], dtype=float)
-    steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
-    prior = problem.sigma / space.spread  # on the unit cube
-    share = steps.std(0) / prior
-    unseen = share > 0.9
-    u = np.where(unseen, problem.start, u)
-    samples = space.from_unit(u + steps)
-    low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
-    half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
-    identifiable = half < prior / SHARPER
-    # in units of the prior, I + prior H prior: a direction that the data do not see keeps an eigenvalue of 1
-    gained, directions = np.linalg.eigh(np.eye(len(u)) + prior[:, None] * information * prior)
-    null = []
-    for g, v in zip(gained, directions.T, strict=True):
-        if g < 4.0:  # half of the prior's sigma is left, or more
-            parts = sorted(zip(space.names, v.tolist(), strict=True), key=lambda p: -abs(p[1]))
-            null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts[:6] if abs(part) > 0.2}))
-    names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
-    found = Estimate(space.from_unit(u), low, high, identifiable, samples)
-    return Identified(space, found, history, families, null, names, break_spread)
-
-
-def prediction_errors(
-    robot: Robot,
-    nominal: Dynamics,
-    identified: Dynamics,
-    recording: Recording,
-    *,
-    window_s: float,
-    cutoff_hz: float,
-    nthread: int = 0,
-) -> dict:
-    """Return one side of summary.json: torque RMSE per joint and, for commanded torque, open-loop errors.
-
-    position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after 0.1, 0.5
-    and 2 s open loop (horizons that no trajectory reaches are left out).
-    """
-    space = parameter_space(robot, nominal, {"offset": [-1.0, 1.0]})
-    torque = TorqueResidual(robot, space, recording, cutoff_hz=cutoff_hz)
-    out: dict = {"rows": len(recording.t), "seconds": recording.duration}
-    for name, dynamics in (("", identified), ("nominal_", nominal)):
-        error = torque.off(dynamics)
-        out[f"{name}torque_rmse_Nm"] = np.sqrt((error**2).mean(0)).tolist()
-    if recording.torque == "measured":
-        return out
-    windows = cut_windows(recording, window_s)
-    for name, dynamics in (("", identified), ("nominal_", nominal)):
-        error = replay(robot, dynamics, windows, nthread) - windows.q
-        out[f"{name}position_rmse_mrad"] = (1e3 * np.sqrt((error**2).mean((0, 1)))).tolist()
-        out[f"{name}ee_error_mm"] = _open_loop_ee(robot, dynamics, recording, nthread)
-    return out
-
-
-def _open_loop_ee(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
-    """Return {"0.1": mm, ...}: mean distance between simulated and recorded end effector after each horizon."""
-    errors = {}
-    for horizon in HORIZONS:
-        try:
-            windows = cut_windows(recording, horizon, limit=100)
-        except UserError:
-            continue
-        sim = Simulator(robot, dynamics, len(windows.q0), nthread)
-        q = replay(robot, dynamics, windows, nthread)[:, -1]
-        places = []
-        for state in (q, windows.q[:, -1]):
-            sim.reset(state, np.zeros_like(state))
-            places.append(sim.ee.copy())
-        errors[f"{horizon:g}"] = float(1e3 * np.linalg.norm(places[0] - places[1], axis=-1).mean())
-    return errors

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from numbers import Integral, Real
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -216,7 +217,13 @@ class Learner(nn.Module, ABC):
         return dict(batch) | both
 
     def descend(self, loss: Tensor) -> None:
-        """Take one step of Adam down the gradient of `loss`."""
+        """Take one step of Adam down the gradient of `loss`.
+
+        Raises:
+            FloatingPointError: the loss is not finite; nothing has changed.
+        """
+        if not torch.isfinite(loss):
+            raise FloatingPointError(f"the loss of update {self.updates + 1} is {float(loss.detach())}")
         loss.backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
@@ -231,6 +238,58 @@ class Learner(nn.Module, ABC):
         # torch would keep the moments it is given, and then two learners would write into them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.updates = state["updates"]
+
+
+class EntropyLearner(Learner):
+    """What SAC and TQC have in common: a stochastic policy and a temperature that holds its entropy.
+
+    Args:
+        scale, torque, shared: see Learner.
+        alpha_init: first temperature. target_entropy: None is minus the number of joints.
+
+    Raises:
+        UserError: a setting of the wrong kind or out of range.
+    """
+
+    def __init__(
+        self,
+        scale: tuple[Tensor, Tensor],
+        torque: Tensor,
+        *,
+        alpha_init: float,
+        target_entropy: float | None,
+        **shared: Any,
+    ):
+        check_number("alpha_init", alpha_init, "(0, inf)")
+        if target_entropy is not None:
+            check_number("target_entropy", target_entropy, "(-inf, inf)")
+        super().__init__(scale, torque, **shared)
+        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
+        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
+        self.optimizer.add_param_group({"params": [self.log_alpha]})
+
+    @abstractmethod
+    def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
+        """Return critic, actor and alpha losses and the entropy of a batch.
+
+        Args:
+            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
+            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
+        """
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """Return sampled actions (B, n) for observations (B, d)."""
+        loc, scale = self.actor(self.normalizer(observation))
+        return torch.tanh(loc + scale * torch.randn_like(loc))
+
+    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
+        batch = self.normalized(batch)
+        out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
+        self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
+        polyak(self.targets, self.critics, self.tau)
+        return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ of the pseudo-inertia relative to the nominal one: J = U0 V V^T U0^T, V = exp(al
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -219,6 +219,13 @@ def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:
     return np.trace(inertia, axis1=-2, axis2=-1) / np.trace(nominal, axis1=-2, axis2=-1)
 
 
+def check_parameters(where: str, names: Iterable[str]) -> None:
+    """Raise UserError if one of the names is no parameter."""
+    for name in names:
+        if name not in UNITS:
+            raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(UNITS)}{nearest(name, UNITS)}")
+
+
 def parameter_space(
     robot: Robot,
     nominal: Dynamics,
@@ -233,9 +240,8 @@ def parameter_space(
     """
     if not bounds:
         raise UserError(f"bounds: no parameter is named; allowed: {choices(UNITS)}")
+    check_parameters("bounds", bounds)
     for name, pair in bounds.items():
-        if name not in UNITS:
-            raise UserError(f"bounds: unknown parameter '{name}'; allowed: {choices(UNITS)}{nearest(name, UNITS)}")
         if len(pair) != 2 or not pair[0] < pair[1] or (name in LOGARITHMIC and pair[0] <= 0):
             raise UserError(f"bounds.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
         others = {k for f in FAMILIES for k in f.names} - set(nominal.family.names)

@@ -23,7 +23,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from r2s.friction import BRISTLE
-from r2s.identify import SHARPER, Identified
+from r2s.identified import SHARPER, Identified
 from r2s.parameters import LINK, UNITS, WHOLE_ARM, Estimate, ParameterSpace, inertia_scale
 from r2s.robot import Robot
 from r2s.viewer import Episode, colours

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from r2s.friction import BRISTLE
-from r2s.identify import SHARPER, Identified
+from r2s.identified import SHARPER, Identified
 from r2s.parameters import LINK, WHOLE_ARM
 from r2s.recording import Recording
 from r2s.report import (

@@ -12,10 +12,13 @@ torque, too, where it is a fast start.
 Both are in units of their own standard deviation, as far as `adapt` could tell it.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
+from scipy.ndimage import maximum_filter1d
+from scipy.signal import butter, savgol_filter, sosfiltfilt
 from scipy.sparse import csr_array
 
 from r2s.actuation import Motors
@@ -27,14 +30,19 @@ from r2s.regressor import GRAVITY, Links, regressor, rigid_body
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
 
-VELOCITY_SAMPLES = 31  # Savitzky-Golay window for a window's start state, samples at 1 kHz
+STATE_SAMPLES = 31  # of the local fit that a window's start state comes from, at 1 kHz
 PRESLIDING = 1e-3  # rad, over which friction turns, where it is not searched
+SHORTEST = 0.25  # of a window: what is shorter is not worth its start
+MOVED = 0.02  # rad that a joint must move to count as moving
+SCATTER = 0.1  # Nm, of the commands at which a joint lets go, from posture to posture
+LATE = 11  # ms, odd, in which a command may be felt
 HISTORY = 40  # ms of commands before a window: what delay and lag still remember
 USUAL, HUBER = (
     0.9,
     1.5,
 )  # share of windows that noise is estimated from; size, over the median, from which less counts
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
+BLOCK_S = 0.5  # s, stretches that the bootstrap draws
 FRICTION_HZ = 500  # friction is evaluated this often, then filtered as the torque is
 FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over that of the torque
 Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite differences by start state and torque
@@ -49,6 +57,7 @@ class Windows:
         before: (W, HISTORY, n) Nm, the commands before the start. turn: (W, n), how far the motion before it bent the
             bristles of friction with a memory.
         q: (W, S, n) rad, after each step.
+        length: (W,) steps that count; what comes after them fills the array up.
     """
 
     t: np.ndarray
@@ -58,6 +67,7 @@ class Windows:
     before: np.ndarray
     q: np.ndarray
     turn: np.ndarray
+    length: np.ndarray
 
     def felt(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
         """Return (W, S, n) Nm, what the joints feel of the commands after `delay` and `lag`, s."""
@@ -66,44 +76,138 @@ class Windows:
         return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
 
 
-def cut_windows(recording: Recording, seconds: float, limit: int | None = None) -> Windows:
-    """Cut a commanded recording into windows of `seconds`, none across two trajectories, end to end.
+def cut_windows(
+    recording: Recording,
+    seconds: float,
+    limit: int | None = None,
+    slowest: float = 0.0,
+    edges: np.ndarray | None = None,
+) -> Windows:
+    """Cut a commanded recording into windows of at most `seconds`, none across two trajectories, end to end.
 
-    The start state is a cubic Savitzky-Golay fit over 31 ms of measured angles: its derivative is less noisy than
-    the logged velocity and has no delay. With `limit`, that many windows spread evenly are kept.
+    With `slowest`, rad/s, a window ends where any joint gets slower than that, and none starts before all are faster
+    again: in a dead zone a joint is let go one step sooner or later with the smallest change of any parameter, and
+    every other joint feels it. With `edges` (n, 2) Nm, the commands at which a joint at rest was seen to let go,
+    only joints count whose command lies between. A joint that never moves does not count.
+
+    The start state is a cubic fitted to 31 ms of measured angles and velocities about it, see `Local`. With `limit`,
+    that many windows spread evenly are kept.
 
     Raises:
-        UserError: no trajectory is as long as a window.
+        UserError: no trajectory is as long as a window, or hardly ever do all joints move at once.
     """
     grid = recording.resample(SIM_DT)
-    steps = round(seconds / SIM_DT)
-    q, dq, turn, starts = np.empty_like(grid.q), np.empty_like(grid.q), np.empty_like(grid.q), []
+    steps, half = round(seconds / SIM_DT), STATE_SAMPLES // 2
+    longest = max(s.stop - s.start for s in grid.stretches)
+    if longest <= max(steps, STATE_SAMPLES) + half:
+        raise UserError(
+            f"no trajectory is as long as a window of {seconds:g} s; the longest is {longest * SIM_DT:g} s"
+        )
+    still = np.ptp(grid.q, axis=0) < MOVED
+    dq, turn, local = np.empty_like(grid.q), np.empty_like(grid.q), Local.of(grid)
     first = np.empty(len(grid.t), dtype=int)
+    starts: list[int] = []
+    lengths: list[int] = []
     for s in grid.stretches:
         first[s] = s.start
-        if s.stop - s.start <= max(steps, VELOCITY_SAMPLES):
+        if s.stop - s.start <= STATE_SAMPLES:
             continue
-        q[s] = savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, axis=0)
-        dq[s] = savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
+        dq[s] = savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
         turn[s] = presliding(dq[s], SIM_DT, PRESLIDING)
-        starts += list(range(s.start, s.stop - steps, steps))
+        if not slowest:
+            whole = list(range(s.start + half, s.stop - max(steps, half), steps))
+            starts += whole
+            lengths += [steps] * len(whole)
+            continue
+        slow = (np.abs(dq[s]) < slowest) & ~still
+        if edges is not None:
+            slow &= maximum_filter1d(_between(grid.tau[s], edges), LATE, axis=0, origin=(LATE - 1) // 2)
+        slow = np.flatnonzero(slow.any(1))
+        for a, b in pairwise([-1, *slow.tolist(), s.stop - s.start - 1]):
+            run = b - a - 2 - half  # the fit of the start state must not see what was before
+            if run < SHORTEST * steps:
+                continue
+            parts = -(-run // steps)
+            starts += [s.start + b - 1 - run + k * (run // parts) for k in range(parts)]
+            lengths += [run // parts] * parts
     if not starts:
-        longest = max(s.stop - s.start for s in grid.stretches) * SIM_DT
-        raise UserError(f"no trajectory is as long as a window of {seconds:g} s; the longest is {longest:g} s")
-    at = np.array(starts)
+        raise UserError(
+            f"the joints hardly ever move all at once: there are no {SHORTEST * seconds:g} s with all of them "
+            f"faster than {slowest:g} rad/s; record a motion of r2s (arm=, data.excitation=), or take "
+            "friction.family=bristle, which has no dead zone"
+        )
+    at, length = np.array(starts), np.array(lengths)
     if limit is not None and len(at) > limit:
-        at = at[np.linspace(0, len(at) - 1, limit).round().astype(int)]
-    rows = at[:, None] + np.arange(steps)
+        keep = np.linspace(0, len(at) - 1, limit).round().astype(int)
+        at, length = at[keep], length[keep]
+    rows = np.minimum(at[:, None] + np.arange(steps), (at + length - 1)[:, None])
+    q0, dq0 = local(grid, at)
     earlier = np.maximum(at[:, None] - np.arange(HISTORY, 0, -1), first[at][:, None])
     return Windows(
         t=grid.t[at],
-        q0=q[at],
-        dq0=dq[at],
+        q0=q0,
+        dq0=dq0,
         tau=grid.tau[rows],
         before=grid.tau[earlier],
         q=grid.q[rows + 1],
         turn=turn[at],
+        length=length,
     )
+
+
+def _between(tau: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return (T, n) bool: whether commands tau (T, n) may leave a joint at rest, give or take what edges scatter."""
+    return (tau > edges[:, 0] - SCATTER) & (tau < edges[:, 1] + SCATTER)
+
+
+@dataclass(frozen=True)
+class Local:
+    """The state to start a replay from, by a cubic fitted to 31 ms of measured angles and velocities about it.
+
+    The two sensors of a joint are weighed by their noise. Logged velocities are late, by half a step in a simulator,
+    by a filter on an arm: how late a joint's are is found by comparing them with the derivative of its angles.
+
+    Attributes:
+        noise: (n,) rad, of the angles, robust. kernel: (n, 2, 2 STATE_SAMPLES) from angles and velocities to both.
+        sigma: (2, n) rad, rad/s, standard deviation of what the fit returns.
+    """
+
+    noise: np.ndarray
+    kernel: np.ndarray
+    sigma: np.ndarray
+
+    @staticmethod
+    def of(grid: Recording) -> "Local":
+        """Return the fit for a recording at 1 kHz."""
+        n = grid.n_joints
+        seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
+
+        def smooth(deriv: int) -> np.ndarray:
+            fits = (savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv, SIM_DT, axis=0) for s in seen)
+            return np.concatenate([np.zeros((1, n)), *fits])
+
+        q, dq = (np.concatenate([np.zeros((1, n)), *(a[s] for s in seen)]) for a in (grid.q, grid.dq))
+        noise = np.maximum(1.48 * np.median(np.abs(q - smooth(0)), axis=0), 3e-6)
+        ddq, lead = smooth(2), dq - smooth(1)
+        late = -(lead * ddq).sum(0) / np.maximum((ddq**2).sum(0), 1e-12)
+        off = np.maximum(np.sqrt(((lead + late * ddq) ** 2).mean(0)), 1e-5)
+        t, k = SIM_DT * (np.arange(STATE_SAMPLES) - STATE_SAMPLES // 2)[:, None], np.arange(4)
+        speeds = k * t ** np.maximum(k - 1, 0)
+        gains = k * (k - 1) * t ** np.maximum(k - 2, 0)
+        size = np.repeat(np.stack([noise, off], 1), STATE_SAMPLES, axis=1)  # (n, 2 S)
+        angles = np.broadcast_to(t**k, (n, STATE_SAMPLES, 4))
+        both = np.concatenate([angles, speeds - late[:, None, None] * gains], 1) / size[..., None]
+        cubic = np.linalg.pinv(both) / size[:, None]
+        # MuJoCo moves by the velocity that a step ends with: q(t) = q0 + v t + a t^2 / 2 starts from v - a h / 2
+        kernel = np.stack([cubic[:, 0], cubic[:, 1] - SIM_DT * cubic[:, 2]], 1)
+        return Local(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
+
+    def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return q, dq (W, n) rad, rad/s at rows `at` (W,), each at least half of 31 rows from its stretch's ends."""
+        rows = at[:, None] + np.arange(STATE_SAMPLES) - STATE_SAMPLES // 2
+        seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
+        q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)
+        return q, dq
 
 
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
@@ -114,10 +218,9 @@ def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0)
 
 
 class ReplayResidual:
-    """Residual of a commanded recording: simulated minus recorded joint angles, every `stride` ms, made white.
+    """Residual of a commanded recording: simulated minus recorded angles, means of `stride` ms each, made white.
 
-    Within a window a joint counts until it is slower than `slowest` rad/s for the first time: inside the dead zone
-    its angle jumps with the parameters. With `limit`, that many windows.
+    `slowest`, `limit` and `edges`: see `cut_windows`.
 
     A window's error has three sources, and generalised least squares weighs rows by what they make together:
         error = Z b + e,   b ~ N(0, diag(d)) start angle, start velocity and a torque that no candidate explains,
@@ -137,26 +240,24 @@ class ReplayResidual:
         *,
         window_s: float = 0.2,
         stride: int = 5,
-        slowest: float = 0.02,
+        slowest: float = 0.0,
         limit: int | None = None,
+        edges: np.ndarray | None = None,
         batch: int = 36,
         nthread: int = 0,
     ):
-        self.space, self.windows, self._batch = space, cut_windows(recording, window_s, limit), batch
+        self.space, self.windows, self._batch = space, cut_windows(recording, window_s, limit, slowest, edges), batch
         w = self.windows
         self.count = len(w.q0)
-        self._every = slice(stride - 1, None, stride)
-        self._target = w.q[:, self._every]
-        speed = np.abs(np.gradient(savgol_filter(w.q, VELOCITY_SAMPLES, 3, axis=1), SIM_DT, axis=1))
-        still = np.maximum.accumulate(speed < slowest, axis=1)
-        self._seen = ~still[:, self._every]
+        self._stride = stride
+        self._target = self._means(w.q)
+        last = stride * (1 + np.arange(self._target.shape[1]))
+        self._seen = np.repeat((last <= w.length[:, None])[..., None], robot.n, axis=2)
         self.clusters = np.repeat(np.arange(self.count), self._target[0].size)
         self._sim = Simulator(robot, space.nominal, batch * self.count, nthread)
         self.candidates = 0
-        self._noise = _encoder_noise(recording)
-        smooth = np.linalg.norm(savgol_coeffs(VELOCITY_SAMPLES, 3))
-        slope = np.linalg.norm(savgol_coeffs(VELOCITY_SAMPLES, 3, deriv=1, delta=SIM_DT))
-        start = np.concatenate([smooth * self._noise, slope * self._noise])
+        local = Local.of(recording.resample(SIM_DT))
+        self._noise, start = local.noise / np.sqrt(stride), local.sigma.ravel()
         self._least = np.concatenate([start, np.full(robot.n, 1e-4)])
         self._spread = np.concatenate([start, np.full(robot.n, 0.05)])
         self.adapt(space.start, fitted=False)
@@ -186,9 +287,15 @@ class ReplayResidual:
         n = q0.shape[-1]
         q0, dq0, turn = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.turn))
         self._sim.reset(q0, dq0, ids, turn)
-        q = self._sim.rollout(felt.reshape(-1, *felt.shape[2:]), ids=ids)["qpos"][:, self._every]
-        error = (q.reshape(count, *self._target.shape) - self._target) * self._seen
+        q = self._sim.rollout(felt.reshape(-1, *felt.shape[2:]), ids=ids)["qpos"]
+        error = (self._means(q).reshape(count, *self._target.shape) - self._target) * self._seen
         return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _means(self, q: np.ndarray) -> np.ndarray:
+        """Return (..., S', n): means of `stride` rows of q (..., S, n); the noise of each is its own."""
+        whole = q.shape[-2] // self._stride
+        parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
+        return parts.mean(-2)
 
     def adapt(self, x: np.ndarray, fitted: bool) -> None:
         """Find Z about x (P,) and the whitening; with `fitted`, d and s as well, from what x leaves unexplained."""
@@ -248,17 +355,6 @@ class ReplayResidual:
         return 1e6 * (self.error(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
 
 
-def _encoder_noise(recording: Recording) -> np.ndarray:
-    """Return (n,) rad: robust standard deviation of angles about their own 31 ms fit."""
-    grid = recording.resample(SIM_DT)
-    left = [
-        grid.q[s] - savgol_filter(grid.q[s], VELOCITY_SAMPLES, 3, axis=0)
-        for s in grid.stretches
-        if s.stop - s.start > VELOCITY_SAMPLES
-    ]
-    return np.maximum(1.48 * np.median(np.abs(np.concatenate(left)), axis=0), 3e-6)
-
-
 def _random_effects(
     z: np.ndarray,
     error: np.ndarray,
@@ -271,7 +367,9 @@ def _random_effects(
     """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
 
     The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b), from
-    `spread` and `noise` on. No d falls below `least` (K,): of start angle and velocity what the encoder gives.
+    `spread` and `noise` on. What b has in common over all windows is a parameter that is still wrong, an offset above
+    all, and no noise: taken for noise it would keep the next fit from putting it right. No d falls below `least`
+    (K,): of start angle and velocity what the encoder gives.
     """
     _, rows, k = z.shape
     n = len(noise)
@@ -290,7 +388,8 @@ def _random_effects(
         new = np.array([total[joint == j].sum() for j in range(n)]) / np.maximum(counted, 1)
         noise = np.maximum(np.where(counted > 0, np.sqrt(new), noise), 1e-6)
         determined = 1.0 - np.einsum("wii->wi", covariance) / spread**2
-        spread = np.maximum(np.sqrt((mean**2).sum(0) / np.maximum(determined.sum(0), 1e-3)), least)
+        about = mean - mean.mean(0)
+        spread = np.maximum(np.sqrt((about**2).sum(0) / np.maximum(determined.sum(0), 1e-3)), least)
     return spread, noise
 
 
@@ -311,7 +410,7 @@ class TorqueResidual:
         *,
         cutoff_hz: float = 10.0,
         rate_hz: float = 100.0,
-        block_s: float = 0.5,
+        block_s: float = BLOCK_S,
         presliding_rad: float = PRESLIDING,
     ):
         self.space = space
@@ -330,6 +429,13 @@ class TorqueResidual:
         self.candidates = 0
         self._scale = np.ones(robot.n)
         self.adapt(space.start, fitted=False)
+
+    def on(self, space: ParameterSpace) -> "TorqueResidual":
+        """Return this residual for candidates of another space."""
+        other = copy(self)
+        other.space = space
+        other.adapt(space.start, fitted=False)
+        return other
 
     def predict(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm: rigid-body torque + friction - offset at the measured motion, of one arm."""

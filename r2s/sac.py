@@ -7,18 +7,18 @@ the tests hold this file to.
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from r2s.networks import Learner, check_number, polyak, sample_tanh
+from r2s.networks import EntropyLearner, sample_tanh
 
 
-class SAC(Learner):
+class SAC(EntropyLearner):
     """Learner of a stochastic policy, with pessimistic critics.
 
     Args:
         scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.networks.Learner.
         n_critics: the smallest of their values counts, for target and actor.
-        alpha_init: first temperature. target_entropy: None is minus the number of joints.
+        alpha_init, target_entropy: see r2s.networks.EntropyLearner.
 
     Raises:
         UserError: a setting of the wrong kind or out of range.
@@ -38,9 +38,6 @@ class SAC(Learner):
         target_entropy: float | None = None,
         action_l2: float = 0.0,
     ):
-        check_number("alpha_init", alpha_init, "(0, inf)")
-        if target_entropy is not None:
-            check_number("target_entropy", target_entropy, "(-inf, inf)")
         super().__init__(
             scale,
             torque,
@@ -51,24 +48,12 @@ class SAC(Learner):
             tau=tau,
             lr=lr,
             action_l2=action_l2,
+            alpha_init=alpha_init,
+            target_entropy=target_entropy,
         )
-        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
-        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
-        self.optimizer.add_param_group({"params": [self.log_alpha]})
-
-    @torch.no_grad()
-    def explore(self, observation: Tensor) -> Tensor:
-        """Return sampled actions (B, n) for observations (B, d)."""
-        loc, scale = self.actor(self.normalizer(observation))
-        return torch.tanh(loc + scale * torch.randn_like(loc))
 
     def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return critic, actor and alpha losses of a batch.
-
-        Args:
-            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
-            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
-        """
+        """Return critic, actor and alpha losses and the entropy, see EntropyLearner."""
         alpha = self.log_alpha.exp().detach()
         with torch.no_grad():
             next_action, next_log_prob = sample_tanh(self.actor(batch["next_observation"]), noise[0])
@@ -88,11 +73,3 @@ class SAC(Learner):
             "loss_alpha": temperature,
             "entropy": -log_prob.mean(),
         }
-
-    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
-        batch = self.normalized(batch)
-        out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
-        self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
-        polyak(self.targets, self.critics, self.tau)
-        return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cma
 import numpy as np
 
-from r2s.identify import Problem, Report
+from r2s.problem import Problem, Report
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from pymoo.core.termination import NoTermination
 from pymoo.operators.crossover.sbx import SBX
 from pymoo.operators.mutation.pm import PM
 
-from r2s.identify import Problem, Report
+from r2s.problem import Problem, Report
 
 
 @dataclass(frozen=True)

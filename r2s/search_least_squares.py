@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r2s.identify import Problem, Report
 from r2s.least_squares import minimise
+from r2s.problem import Problem, Report
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ the commanded simulator has no gravity. What the compensation gets wrong (it bel
 acts as a torque of its own (r2s/friction.py).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -151,6 +152,24 @@ class Simulator:
         self._memory[at] = turn
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return copies of everything that makes the arms what they are, for `set_state`."""
+        return {name: array.copy() for name, array in self._arrays().items()}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go back to what `state` returned; what the arms do next is the same, bit for bit."""
+        for name in ("_user", "_inertia", "_iquat", "_mass", "_com"):
+            self._arrays()[name][:] = state[name]
+        self.batch.set_const()
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for name in ("q", "dq", "_memory", "_damping"):
+            self._arrays()[name][:] = state[name]
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        names = ("q", "dq", "_memory", "_damping", "_user", "_inertia", "_iquat", "_mass", "_com")
+        return {name: getattr(self, name) for name in names}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
         """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""

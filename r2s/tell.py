@@ -10,7 +10,7 @@ import pandas as pd
 from r2s import report
 from r2s.evaluate import Episodes
 from r2s.friction import SIGMOID
-from r2s.identify import Identified
+from r2s.identified import Identified
 from r2s.parameters import parameter_space
 from r2s.recording import Recording
 from r2s.report_figures import (
@@ -21,14 +21,13 @@ from r2s.report_figures import (
     whiteness_table,
 )
 from r2s.report_identification import identification_sections
-from r2s.residual import TorqueResidual, cut_windows, replay
+from r2s.residual import BLOCK_S, TorqueResidual, cut_windows, replay
 from r2s.robot import Robot
 from r2s.runs import Run
 from r2s.simulator import Dynamics
 from r2s.viewer import Episode, Overlay, write_recording
 
 SHOWN = 4  # episodes, as in the paper's figures
-BLOCK_S = 0.5  # s, of TorqueResidual: what the bootstrap draws where there are no windows
 
 
 def identification(

@@ -10,18 +10,18 @@ The verbs are those of r2s.networks.Learner; `losses` is what the tests compare.
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from r2s.networks import Learner, check_number, polyak, sample_tanh
+from r2s.networks import EntropyLearner, check_number, sample_tanh
 
 
-class TQC(Learner):
+class TQC(EntropyLearner):
     """Learner of a stochastic policy, with quantile critics whose highest atoms are left out.
 
     Args:
-        scale, torque, hidden, gamma, tau, lr, action_l2: see Learner.
+        scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.networks.Learner.
         n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
-        alpha_init: first temperature. target_entropy: None is minus the number of joints.
+        alpha_init, target_entropy: see r2s.networks.EntropyLearner.
 
     Raises:
         UserError: a setting of the wrong kind or out of range.
@@ -45,9 +45,6 @@ class TQC(Learner):
     ):
         check_number("n_quantiles", n_quantiles, "[1, inf)", whole=True)
         check_number("drop_per_critic", drop_per_critic, f"[0, {n_quantiles})", whole=True)
-        check_number("alpha_init", alpha_init, "(0, inf)")
-        if target_entropy is not None:
-            check_number("target_entropy", target_entropy, "(-inf, inf)")
         super().__init__(
             scale,
             torque,
@@ -58,25 +55,13 @@ class TQC(Learner):
             tau=tau,
             lr=lr,
             action_l2=action_l2,
+            alpha_init=alpha_init,
+            target_entropy=target_entropy,
         )
         self.keep = n_critics * (n_quantiles - drop_per_critic)
-        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
-        self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
-        self.optimizer.add_param_group({"params": [self.log_alpha]})
-
-    @torch.no_grad()
-    def explore(self, observation: Tensor) -> Tensor:
-        """Return sampled actions (B, n) for observations (B, d)."""
-        loc, scale = self.actor(self.normalizer(observation))
-        return torch.tanh(loc + scale * torch.randn_like(loc))
 
     def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return critic, actor and alpha losses of a batch.
-
-        Args:
-            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
-            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
-        """
+        """Return critic, actor and alpha losses and the entropy, see EntropyLearner."""
         alpha = self.log_alpha.exp().detach()
         with torch.no_grad():
             next_action, next_log_prob = sample_tanh(self.actor(batch["next_observation"]), noise[0])
@@ -97,14 +82,6 @@ class TQC(Learner):
             "loss_alpha": temperature,
             "entropy": -log_prob.mean(),
         }
-
-    def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
-        batch = self.normalized(batch)
-        out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
-        self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
-        polyak(self.targets, self.critics, self.tau)
-        return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
 
 
 class QuantileHuber(torch.autograd.Function):
@@ -142,7 +119,7 @@ class QuantileHuber(torch.autograd.Function):
         over = over + (first[:, -1:] - s_high) - (m - high) * (theta + 0.5)
         d_under = low + (mid - low) * theta - (s_mid - s_low)
         d_over = (high - mid) * theta - (s_high - s_mid) - (m - high)
-        fraction = ((torch.arange(n, dtype=y.dtype) + 0.5) / n).repeat(count)
+        fraction = ((torch.arange(n, dtype=y.dtype, device=y.device) + 0.5) / n).repeat(count)
         loss = ((1.0 - fraction) * under + fraction * over).sum() / (n * m * b)
         gradient = ((1.0 - fraction) * d_under + fraction * d_over) / (n * m * b)
         ctx.save_for_backward(gradient.reshape(b, count, n).transpose(0, 1).to(quantiles.dtype))

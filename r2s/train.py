@@ -1,24 +1,27 @@
 """The training loop, the same for every algorithm: act, step all arms, store, update, now and then evaluate.
 
 The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows what is spent.
-With env_steps alone a seed gives the same run, bit for bit at a fixed number of threads; minutes make the curriculum
-follow the clock.
+With env_steps alone a seed gives the same run, bit for bit at a fixed number of threads, stopped and resumed or not;
+minutes make the curriculum follow the clock.
 """
 
 import ctypes
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 
+from r2s.checkpoint import Checkpoint
 from r2s.env import ReachEnv
+from r2s.errors import UserError
 from r2s.evaluate import Episodes, measures
-from r2s.networks import Policy
-from r2s.tqc import TQC
+from r2s.networks import Learner, Policy
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ def keep_memory() -> None:
 
 def train(
     env: ReachEnv,
-    algo: TQC,
+    algo: Learner,
     evaluate: Callable[[Policy], Episodes],
     weights: Callable[[float], np.ndarray],
     *,
@@ -59,6 +62,8 @@ def train(
     lr_decay: float = 0.6,
     lr_end: float = 0.1,
     eval_env_steps: int = 80_000,
+    checkpoint: Checkpoint | None = None,
+    dump: Path | None = None,
     log: Callable[[dict], None] = lambda row: None,
     evaluated: Callable[[dict], None] = lambda row: None,
     progress: Callable[[float, dict], None] = lambda share, row: None,
@@ -76,8 +81,13 @@ def train(
         replay_size: transitions kept.
         lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
         eval_env_steps: environment steps between two evaluations; one more comes at the end.
+        checkpoint: written after every evaluation; where it holds a state, training goes on from there.
+        dump: file for what led to a number that is not finite, for `replay`.
         log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
         progress: gets the fraction spent and what is worth showing, every step.
+
+    Raises:
+        FloatingPointError: an action, observation, reward or loss is not finite.
     """
     keep_memory()
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
@@ -87,6 +97,13 @@ def train(
     state = env.reset()
     row: dict = {}
     shown: dict = {}
+    if checkpoint and (saved := checkpoint.load(replay, replay_size)):
+        algo.load_state_dict(saved["algo"])
+        env.set_state(_arrays(saved["env"]))
+        state = state.update(saved["state"])
+        env_steps, updates, next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
+        shown, began = saved["shown"], began - saved["seconds"]
+        torch.set_rng_state(saved["torch"])
 
     def evaluation() -> dict:
         out = measures(evaluate(algo.policy))
@@ -97,7 +114,12 @@ def train(
         algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / (1.0 - lr_decay))
         warm = env_steps >= learning_starts
         state["action"] = algo.explore(state["observation"]) if warm else env.action_spec.rand()
-        step, state_next = env.step_and_maybe_reset(state)
+        before = env.state()
+        try:
+            step, state_next = env.step_and_maybe_reset(state)
+        except FloatingPointError as error:
+            where = {"env": before, "action": state["action"], "weights": env.weights}
+            raise _dumped(error, dump, where, f"{env_steps} env steps") from None
         replay.extend(_transition(step))
         state = state_next
         env_steps += env.sim.nsim
@@ -107,10 +129,14 @@ def train(
         for _ in range(updates_per_step):
             batch = replay.sample()
             batch["reward"] = batch["reward_terms"] @ price
-            row = algo.update(batch)
+            random = torch.get_rng_state()
+            try:
+                row = algo.update(batch)
+            except FloatingPointError as error:
+                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random}
+                raise _dumped(error, dump, where, f"{env_steps} env steps") from None
             updates += 1
         if updates % 1000 < updates_per_step or updates == updates_per_step:
-            _check(row, updates)
             numbers = {k: float(v) for k, v in row.items()}
             head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}
             log(head | numbers | {f"weight_{i}": float(w) for i, w in enumerate(env.weights)})
@@ -118,8 +144,61 @@ def train(
             next_eval += eval_env_steps
             shown = evaluation()
             evaluated(shown)
+            if checkpoint:
+                now = {"env_steps": env_steps, "updates": updates, "next_eval": next_eval, "shown": shown}
+                now |= {"seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
+                now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
+                checkpoint.save(now, replay, env_steps, replay_size)
         progress(spent, {"env_steps": env_steps, "updates": updates} | shown)
     evaluated(evaluation())
+
+
+def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any], when: str) -> FloatingPointError:
+    """Write what led to the error and return one that says so."""
+    if path is None:
+        return FloatingPointError(f"{error}, after {when}")
+    torch.save(_tensors(where), path)
+    return FloatingPointError(f"{error}, after {when}; replay it with r2s.train.replay on {path}")
+
+
+def replay(path: Path, env: ReachEnv, algo: Learner) -> None:
+    """Do again what led to a number that is not finite.
+
+    Args:
+        path: the dump. env, algo: made as they were for the training.
+
+    Raises:
+        FloatingPointError: the same as then.
+        UserError: there is no dump.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} is no dump of a training")
+    where = torch.load(path, weights_only=True)
+    if "batch" in where:
+        algo.load_state_dict(where["algo"])
+        torch.set_rng_state(where["torch"])
+        algo.update(where["batch"])
+        return
+    env.reset()
+    env.set_state(_arrays(where["env"]))
+    env.weights = where["weights"].numpy()
+    state = env.read()
+    state["action"] = where["action"]
+    env.step(state)
+
+
+def _tensors(node: Any) -> Any:
+    """Return nested dicts with tensors in place of arrays: what torch loads without pickles."""
+    if isinstance(node, dict):
+        return {k: _tensors(v) for k, v in node.items()}
+    return torch.from_numpy(np.ascontiguousarray(node)) if isinstance(node, np.ndarray) else node
+
+
+def _arrays(node: Any) -> Any:
+    """Return nested dicts with arrays in place of tensors."""
+    if isinstance(node, dict):
+        return {k: _arrays(v) for k, v in node.items()}
+    return node.numpy() if isinstance(node, torch.Tensor) else node
 
 
 def _transition(step) -> dict:
@@ -137,9 +216,3 @@ def _transition(step) -> dict:
         },
         batch_size=step.batch_size,
     )
-
-
-def _check(row: dict, updates: int) -> None:
-    for name, value in row.items():
-        if not torch.isfinite(value):
-            raise FloatingPointError(f"{name} is {float(value)} at update {updates}")

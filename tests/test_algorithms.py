@@ -24,7 +24,7 @@ from r2s.policy import export_onnx, load_policy, save_policy
 from r2s.sac import SAC
 from r2s.td3 import TD3
 from r2s.tqc import TQC
-from r2s.train import _check, train
+from r2s.train import train
 
 ALL = (DDPG, TD3, SAC, TQC)
 NEAR = {"rtol": 1e-5, "atol": 1e-5}
@@ -207,7 +207,7 @@ def test_a_seed_gives_the_same_updates_twice(kind):
         torch.manual_seed(seed)
         for _ in range(5):
             row = algo.update(batch)
-            _check(row, 1)
+            assert all(torch.isfinite(v) for v in row.values())
         assert all(v.shape == () and not v.requires_grad for v in row.values())
         results.append(torch.cat([bits(algo), algo.explore(batch["observation"]).flatten()]))
     assert torch.equal(results[0], results[1])

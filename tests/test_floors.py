@@ -15,8 +15,11 @@ FLOORS = [
         *("errors", "recording", "readers", "readers_robot", "robot", "regressor", "friction", "actuation"),
         *("parameters", "simulator", "excitation", "motion_checks"),
     ],
-    ["randomization", "breakaway", "residual", "least_squares", "identify", "search_*", "rewards", "env"],
-    ["networks", "ddpg", "td3", "sac", "tqc", "policy", "train", "evaluate"],
+    [
+        *("randomization", "breakaway", "residual", "least_squares", "problem", "validation"),
+        *("identified", "identify", "search_*", "rewards", "env"),
+    ],
+    ["networks", "ddpg", "td3", "sac", "tqc", "checkpoint", "policy", "train", "evaluate"],
     ["engines", "engines.*", "arm", "arm.*"],
     ["runs", "report", "report_figures", "report_identification", "viewer", "tell", "pipeline"],
 ]

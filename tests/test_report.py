@@ -21,10 +21,11 @@ from rich.console import Console
 
 from r2s import report, report_figures, report_identification, tell, viewer
 from r2s.friction import BRISTLE
-from r2s.identify import Identified, prediction_errors
+from r2s.identified import Identified
 from r2s.parameters import LINK, Estimate, nominal_dynamics, of_family, parameter_space
 from r2s.recording import Recording
 from r2s.robot import Robot, load_robot
+from r2s.validation import prediction_errors
 from r2s.viewer import Episode, Overlay
 
 EVERY_SHAPE = """

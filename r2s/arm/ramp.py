@@ -27,6 +27,13 @@ RATE_SHARE = 0.9  # of dtau_max
 BRAKE_SHARE = 0.1  # of tau_max: so little that the rate limit never adds to the delay of the stop
 
 
+def poses_about(robot: Robot, count: int) -> np.ndarray:
+    """Return (count, n) rad: postures at and about home, a turn of 0.3 rad of every joint apart."""
+    turn = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
+    poses = robot.q_home + np.arange(count)[:, None] * turn
+    return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
+
+
 def ramp(
     arm: Arm,
     poses: np.ndarray | Sequence[Sequence[float]],
