@@ -312,6 +312,7 @@ def train(cfg, overrides):
     import torch
 
     from r2s import report, tell
+    from r2s.checkpoint import Checkpoint
     from r2s.env import ReachEnv, observation_scale
     from r2s.errors import UserError
     from r2s.evaluate import make_evaluation
@@ -338,16 +339,25 @@ def train(cfg, overrides):
     best: dict = {}
     last: dict = {}
 
+    def is_best(row):
+        nonlocal best, last
+        last = row
+        rank = (row["success_1cm"], -row["distance_median_m"])
+        better = not best or rank >= (best["success_1cm"], -best["distance_median_m"])
+        best = row if better else best
+        return better
+
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         progress = Progress(f"train {name}")
+        checkpoint = Checkpoint(run.folder / "checkpoints")
+        if cfg.resume:
+            run.rewind("metrics", "env_steps", checkpoint.env_steps)
+            for row in run.rewind("evaluations", "env_steps", checkpoint.env_steps):
+                is_best(row)
 
         def evaluated(row):
-            nonlocal best, last
-            last = row
             run.log("evaluations", row)
-            rank = (row["success_1cm"], -row["distance_median_m"])
-            if not best or rank >= (best["success_1cm"], -best["distance_median_m"]):
-                best = row
+            if is_best(row):
                 save_policy(run.folder, algo.policy)
 
         def show(share, row):
@@ -365,11 +375,14 @@ def train(cfg, overrides):
             budget=budget,
             **loop,
             eval_env_steps=cfg.evaluation.env_steps,
+            checkpoint=checkpoint,
+            dump=run.folder / "dump.pt",
             log=lambda row: run.log("metrics", row),
             evaluated=evaluated,
             progress=show,
         )
         progress.close()
+        checkpoint.clear()
         export_onnx(run.folder / "policy.onnx", load_policy(run.folder, robot, task), robot, task)
         run.summary({"best": best, "last": last})
         tell.training(run, robot)
@@ -425,23 +438,23 @@ def transfer(cfg, overrides):
 
 
 def compare(cfg, overrides):
-    """Put runs of stage=train side by side: table, learning curves."""
+    """Put runs of stage=train side by side: tables with intervals over seeds, learning curves."""
     from glob import glob
 
     from r2s import report, tell
+    from r2s.comparison import read_runs
     from r2s.errors import UserError
-    from r2s.runs import read_summary
 
-    folders = [f for f in sorted(glob(cfg.runs or "")) if (Path(f) / "summary.json").is_file()]
-    folders = [f for f in folders if (Path(f) / "evaluations.csv").is_file()]
+    folders = sorted(glob(cfg.runs or ""))
     if not folders:
-        raise UserError(f"runs: no finished run of stage=train matches '{cfg.runs}'; such as runs='runs/train/*'")
-    with open_run(cfg, overrides, parents=folders) as run:
-        rows = {Path(f).name: read_summary(f, "runs")["last"] for f in folders}
-        run.summary(rows)
-        tell.comparison(run, make_robot(cfg), folders)
-        report.reach_table(console(), rows, f"{len(rows)} runs, last evaluation")
-    print(f"written: {run.folder}")
+        raise UserError(f"runs: nothing matches '{cfg.runs}'; such as runs='runs/train/*'")
+    runs = read_runs(folders)
+    with open_run(cfg, overrides, parents=[str(r.folder) for r in runs]) as run:
+        tables = tell.compare(run, make_robot(cfg), runs)
+        run.summary({name: table.to_dict("records") for name, table in tables.items()})
+        title = f"{len(runs)} runs, last evaluation: interquartile mean [95 % interval over seeds]"
+        report.print_table(console(), report.scores_rows(tables["scores"]), title)
+    print(f"written: {run.folder} (look: {run.folder / 'report.md'})")
 
 
 def pipeline(cfg, overrides):
@@ -552,8 +565,8 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith("resume=")]:
         raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
     before = OmegaConf.load(folder / "config.yaml")
-    if before.stage != "identify":
-        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify")
+    if before.stage not in ("identify", "train"):
+        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
     if json.loads((folder / "meta.json").read_text())["status"] == "done":
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)

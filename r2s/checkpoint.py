@@ -21,6 +21,12 @@ class Checkpoint:
         self.folder = folder
         self._kept, self._chunks = 0, list[str]()  # transitions in the chunks, and their names
 
+    @property
+    def env_steps(self) -> int:
+        """Environment steps that it holds; 0 where there is none."""
+        path = self.folder / "state.pt"
+        return torch.load(path, weights_only=True)["seen"] if path.is_file() else 0
+
     def save(self, state: dict[str, Any], replay: TensorDictReplayBuffer, seen: int, size: int) -> None:
         """Write the state and the transitions since the last call.
 

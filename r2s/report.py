@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from r2s.comparison import Trained, band
 from r2s.friction import BRISTLE
 from r2s.identified import SHARPER, Identified
 from r2s.parameters import LINK, UNITS, WHOLE_ARM, Estimate, ParameterSpace, inertia_scale
@@ -147,6 +148,60 @@ def learning_figure(path: Path, runs: Mapping[str, pd.DataFrame]) -> Path:
             axis.set_title(title, loc="left")
             axis.set_xlabel("wall clock, minutes")
     return path
+
+
+def bands_figure(path: Path, grouped: Mapping[str, Sequence[Trained]]) -> Path:
+    """Draw learning curves of groups of seeds: interquartile mean and range, over env steps, updates and minutes."""
+    shown = {"success_1cm": "success at 1 cm, %", "return_paper": "return, eq. (2) over 4 s"}
+    over = {"env_steps": ("environment steps, thousand", 1e-3), "updates": ("updates, thousand", 1e-3)}
+    over |= {"wall_clock_s": ("wall clock, minutes", 1 / 60)}
+    colour = colours(grouped)
+    with panels(
+        path, len(shown) * len(over), len(over), "learning: seeds' interquartile mean, all seeds", 3.0
+    ) as axes:
+        places = [(y, x) for y in shown for x in over]
+        for axis, (y, x) in zip(axes, places, strict=True):
+            scale = 100 if y in SUCCESS else 1
+            for label, group in grouped.items():
+                at, (middle, low, high) = band(group, x, y)
+                axis.fill_between(over[x][1] * at, scale * low, scale * high, color=colour[label], alpha=0.18, lw=0)
+                axis.plot(over[x][1] * at, scale * middle, color=colour[label], label=label)
+            axis.set_title(shown[y], loc="left")
+            axis.set_xlabel(over[x][0])
+    return path
+
+
+def scores_figure(path: Path, table: pd.DataFrame) -> Path:
+    """Draw what `summary_table` returns: a dot and a 95 % interval per group, one panel per measure."""
+    names = {"success_1cm": "success at 1 cm, %", "success_5mm": "success at 5 mm, %"}
+    names |= {"distance_median_m": "median distance, mm", "return_paper": "return, eq. (2) over 4 s"}
+    scale = {"success_1cm": 100, "success_5mm": 100, "distance_median_m": 1e3, "return_paper": 1}
+    labels = list(dict.fromkeys(table["group"]))
+    colour = colours(labels)
+    with panels(path, len(names), 2, "last evaluation: interquartile mean and 95 % interval over seeds", 3.0) as axes:
+        for axis, measure in zip(axes, names, strict=True):
+            rows = table[table["measure"] == measure].set_index("group")
+            for i, label in enumerate(labels):
+                r = scale[measure] * rows.loc[label, ["iqm", "low", "high"]].astype(float)
+                axis.plot([r["low"], r["high"]], [i, i], color=colour[label], linewidth=4, alpha=0.4)
+                axis.plot([r["iqm"]], [i], "o", color=colour[label])
+            axis.set_yticks(range(len(labels)), labels)
+            axis.invert_yaxis()
+            axis.set_title(names[measure], loc="left")
+    return path
+
+
+def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Return one row of strings per group: interquartile mean [95 % interval] of each measure."""
+    names = {m: title for m, title in SUCCESS.items() if m in set(table["measure"])}
+    names |= {"distance_median_m": "median distance, mm", "return_paper": "return"}
+    out: dict[str, dict[str, str]] = {}
+    for r in table.to_dict("records"):
+        scale = 100 if r["measure"] in SUCCESS else 1e3 if r["measure"] == "distance_median_m" else 1
+        cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
+        middle, low, high = (scale * r[k] for k in ("iqm", "low", "high"))
+        cells[names[r["measure"]]] = f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+    return pd.DataFrame.from_dict(out, orient="index").rename_axis("success within")
 
 
 def reach_figure(path: Path, episodes: Mapping[str, Sequence[Episode]]) -> Path:

@@ -134,6 +134,19 @@ class Run:
         writer.writerow({k: f"{v:.7g}" if isinstance(v, float) else v for k, v in row.items()})
         file.flush()
 
+    def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
+        """Keep the rows of <table>.csv whose `column` is at most that, go on after them, and return them."""
+        path = self.folder / f"{table}.csv"
+        if not path.is_file():
+            return []
+        with open(path, newline="") as file:
+            rows = [{k: float(v) if v else math.nan for k, v in row.items()} for row in csv.DictReader(file)]
+        path.unlink()
+        kept = [row for row in rows if row[column] <= most]
+        for row in kept:
+            self.log(table, {k: int(v) if v.is_integer() else v for k, v in row.items()})
+        return kept
+
     def summary(self, document: Mapping[str, Any]) -> None:
         """Write summary.json, the last word."""
         write_json(self.folder / "summary.json", document)

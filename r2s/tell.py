@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from r2s import report
+from r2s.comparison import Trained, groups, improvement_table, sensitivity_table, summary_table
 from r2s.evaluate import Episodes
 from r2s.friction import SIGMOID
 from r2s.identified import Identified
@@ -99,14 +100,40 @@ def transfer(run: Run, robot: Robot, episodes: Mapping[str, Episodes]) -> None:
     write_recording(run.folder / "recording.rrd", robot, episodes=shown)
 
 
-def comparison(run: Run, robot: Robot, folders: Sequence[str]) -> None:
-    """Draw the learning curves of several runs together, and their last evaluations as a CSV."""
-    curves = {Path(f).name: pd.read_csv(Path(f) / "evaluations.csv") for f in folders}
-    pd.DataFrame({name: c.iloc[-1] for name, c in curves.items()}).T.to_csv(
-        run.folder / "last.csv", index_label="run"
-    )
-    learning = report.learning_figure(run.figure("learning"), curves)
-    write_recording(run.folder / "recording.rrd", robot, curves=curves, figures={"learning": learning})
+def compare(run: Run, robot: Robot, runs: Sequence[Trained]) -> dict[str, pd.DataFrame]:
+    """Write what can be said of several trainings: tables as CSV, figures, a report and one recording.
+
+    Returns:
+        {"scores", "improvement", "sensitivity"}: tables of r2s/comparison.py.
+    """
+    grouped = groups(runs)
+    tables = {"scores": summary_table(grouped), "improvement": improvement_table(grouped)}
+    tables["sensitivity"] = sensitivity_table(grouped)
+    last = {r.folder.name: {"group": label, "seed": r.seed} | r.last for label, g in grouped.items() for r in g}
+    pd.DataFrame.from_dict(last, orient="index").to_csv(run.folder / "last.csv", index_label="run")
+    for name, table in tables.items():
+        if len(table):
+            table.to_csv(run.folder / f"{name}.csv", index=False)
+    figures = {"learning": report.bands_figure(run.figure("learning"), grouped)}
+    figures["scores"] = report.scores_figure(run.figure("scores"), tables["scores"])
+    curves = {r.folder.name: r.curve for r in runs}
+    write_recording(run.folder / "recording.rrd", robot, curves=curves, figures=figures)
+    sections: dict[str, Sequence] = {
+        f"{len(runs)} runs in {len(grouped)} groups": [
+            "Interquartile mean over seeds of the last evaluation, with a 95 % bootstrap interval.",
+            report.scores_rows(tables["scores"]),
+        ]
+    }
+    if len(tables["improvement"]):
+        sections["Probability that a run of the one is better than a run of the other"] = [
+            tables["improvement"].round(3).astype(str).set_index("better")
+        ]
+    if len(tables["sensitivity"]):
+        sections["How much the return depends on the settings (smaller spread: less to tune)"] = [
+            tables["sensitivity"].round(2).astype(str).set_index("algo")
+        ]
+    report.report_markdown(run.folder / "report.md", sections | {"Figures": list(figures.values())})
+    return tables
 
 
 def pipeline(

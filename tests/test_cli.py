@@ -202,7 +202,7 @@ MISTAKES = {
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
     "calibration=nowhere": r"calibration: no parameters.yaml",
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
-    "stage=compare runs=nowhere/*": r"no finished run",
+    "stage=compare runs=nowhere/*": r"nothing matches 'nowhere/\*'",
     "budget.minutes=null": r"budget",
     "friction.phi1=[1,2]": r"friction.phi1: 2 values for the 7 joints",
 }

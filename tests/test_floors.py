@@ -21,7 +21,7 @@ FLOORS = [
     ],
     ["networks", "ddpg", "td3", "sac", "tqc", "checkpoint", "policy", "train", "evaluate"],
     ["engines", "engines.*", "arm", "arm.*"],
-    ["runs", "report", "report_figures", "report_identification", "viewer", "tell", "pipeline"],
+    ["runs", "report", "report_figures", "report_identification", "viewer", "tell", "pipeline", "comparison"],
 ]
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))
 

@@ -1,0 +1,189 @@
+"""A training that stopped goes on where it was; a number that is not finite stops it, and can be had again."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from conftest import conf
+
+from r2s import rewards
+from r2s.env import ReachEnv, Task, observation_scale
+from r2s.errors import UserError
+from r2s.evaluate import make_evaluation
+from r2s.friction import BRISTLE
+from r2s.parameters import nominal_dynamics, of_family
+from r2s.randomization import draw
+from r2s.robot import load_robot
+from r2s.simulator import Dynamics
+from r2s.tqc import TQC
+from r2s.train import Budget, replay, train
+
+ROOT = Path(__file__).parent.parent
+QUICK = [
+    "root=runs",
+    "threads=1",
+    "budget.minutes=null",
+    "evaluation.episodes=4",
+    "algo.hidden=[32,32]",
+    "algo.batch_size=32",
+]
+QUICK += [
+    "algo.batch_size=32",
+    "budget.env_steps=9600",
+    "evaluation.env_steps=3200",
+    "algo.learning_starts=1600",
+    "algo.replay_size=5000",
+]
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return load_robot(**conf("robot/panda"))
+
+
+def dynamics_of(panda, family="sigmoid"):
+    dynamics = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    return of_family(dynamics, family)
+
+
+def make_env(panda, family="sigmoid", seed=0):
+    """Return an environment of 4 arms whose friction, delay and lag are drawn anew at every reset."""
+    settings = {k: v for k, v in conf("dr/paper").items() if k != "name"}
+
+    def drawn(rng: np.random.Generator, m: int) -> Dynamics:
+        d = draw(rng, dynamics_of(panda, family), m, **settings)
+        timing = {"delay": rng.uniform(1e-3, 5e-3, m), "lag": rng.uniform(0, 2e-3, m)}
+        return Dynamics(**{**vars(d), **timing})
+
+    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    return ReachEnv(panda, task, drawn, 4, nthread=1, seed=seed, stagger=True)
+
+
+def make_algo(env):
+    torch.manual_seed(0)
+    mean, std = (torch.from_numpy(s) for s in observation_scale(env.robot, env.task))
+    return TQC((mean, std), torch.from_numpy(env.task.torque(env.robot)), hidden=(16, 16))
+
+
+@pytest.mark.parametrize("family", ["sigmoid", "bristle"])
+def test_an_environment_goes_back_to_its_state(panda, family):
+    """From `state`, another environment does the same steps, resets and draws included, to the bit."""
+    one, other = make_env(panda, family), make_env(panda, family)
+    at, actions = one.reset(), torch.rand(260, 4, 7, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    for action in actions[:30]:
+        at["action"] = action
+        at = one.step_and_maybe_reset(at)[1]
+    kept, seen = one.state(), at.clone()
+    rows = []
+    for env, start in ((one, at), (other, seen)):
+        if env is other:
+            env.reset()
+            env.set_state(kept)
+        row, state = [], start
+        for action in actions[30:]:
+            state["action"] = action
+            step, state = env.step_and_maybe_reset(state)
+            row.append(torch.cat([step["next"]["observation"], step["next"]["reward_terms"]], -1))
+        rows.append(torch.stack(row))
+    assert torch.equal(*rows)
+    assert family != BRISTLE.name or np.abs(one.sim.state()["_memory"]).max() > 0
+
+
+def run(folder, *words):
+    """Start run.py on a training of seconds."""
+    command = [sys.executable, str(ROOT / "run.py"), *words]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    )
+
+
+def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
+    """Killed after its first checkpoint and resumed: the same policy and evaluations as without, to the bit."""
+    whole = run(tmp_path, *QUICK, "name=whole")
+    stopped = run(tmp_path, *QUICK, "name=stopped")
+    state = tmp_path / "runs" / "train" / "stopped" / "checkpoints" / "state.pt"
+    while not state.is_file():
+        assert stopped.poll() is None, stopped.communicate()[0]
+        time.sleep(0.02)
+    stopped.send_signal(signal.SIGKILL)
+    stopped.wait()
+    assert whole.wait() == 0, whole.communicate()[0]
+    resumed = run(tmp_path, f"resume={state.parent.parent}")
+    assert resumed.wait() == 0, resumed.communicate()[0]
+    folders = [tmp_path / "runs" / "train" / name for name in ("whole", "stopped")]
+    policies = [torch.load(f / "policy.pt", weights_only=True)["state"] for f in folders]
+    assert all(torch.equal(v, policies[1][k]) for k, v in policies[0].items())
+    for table in ("evaluations", "metrics"):
+        first, second = (pd.read_csv(f / f"{table}.csv").drop(columns="wall_clock_s") for f in folders)
+        pd.testing.assert_frame_equal(first, second)
+    assert not (folders[1] / "checkpoints").exists()
+    again = run(tmp_path, f"resume={folders[1]}")
+    assert again.wait() == 2
+    assert again.communicate()[0].strip().endswith("is finished")
+
+
+def train_until_it_breaks(env, algo, dump):
+    with pytest.raises(FloatingPointError) as caught:
+        train(
+            env,
+            algo,
+            make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
+            lambda spent: rewards.PAPER,
+            budget=Budget(None, 4000),
+            batch_size=16,
+            learning_starts=80,
+            dump=dump,
+        )
+    return str(caught.value)
+
+
+def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
+    """NaN in the physics: the line names what, which arm and when, and the dump leads to it again."""
+    env = make_env(panda)
+    algo = make_algo(env)
+    inner, count = env._step, 0
+
+    def broken(state):
+        nonlocal count
+        count += 1
+        if count == 50:
+            env.goal[2, 1] = np.nan
+        return inner(state)
+
+    env._step = broken  # type: ignore[method-assign]
+    said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
+    assert "observation of arm 2 is nan" in said
+    assert "after 196 env steps" in said
+    saved = torch.load(tmp_path / "dump.pt", weights_only=True)
+    saved["env"]["goal"][2, 1] = float("nan")  # the injection came after the state was kept
+    torch.save(saved, tmp_path / "dump.pt")
+    with pytest.raises(FloatingPointError, match="observation of arm 2 is nan"):
+        replay(tmp_path / "dump.pt", make_env(panda, seed=3), algo)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
+    """A network that leaves the numbers: the line says which update, and the dump leads to it again."""
+    env = make_env(panda)
+    algo = make_algo(env)
+    inner = algo.update
+
+    def broken(batch):
+        if algo.updates == 40:
+            algo.critics.weight[0].data[0, 0, 0] = float("nan")
+        return inner(batch)
+
+    algo.update = broken  # type: ignore[method-assign]
+    said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
+    assert said.startswith("the loss of update 41 is nan, after ")
+    with pytest.raises(FloatingPointError, match=r"^the loss of update 41 is nan$"):
+        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env))
+    with pytest.raises(UserError, match="is no dump"):
+        replay(tmp_path / "nothing.pt", make_env(panda), algo)
