@@ -5,6 +5,7 @@ Read it from the bottom: `main` composes, `STAGES` names what there is, one func
 
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parent
@@ -322,6 +323,8 @@ def train(cfg, overrides):
     from r2s.train import Budget
     from r2s.train import train as run_train
 
+    if cfg.algo.name == "oracle":
+        return reference(cfg, overrides)
     if not cfg.budget.minutes and not cfg.budget.env_steps:
         raise UserError("budget: set budget.minutes or budget.env_steps; a training needs an end")
     robot, task, settings = make_robot(cfg), make_task(cfg), plain(cfg.algo)
@@ -390,6 +393,29 @@ def train(cfg, overrides):
     print(f"written: {run.folder}")
 
 
+def reference(cfg, overrides):
+    """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
+    from r2s import report
+    from r2s.evaluate import make_evaluation, measures
+
+    robot, task = make_robot(cfg), make_task(cfg)
+    draw = make_draw(cfg, robot, make_dynamics(cfg, robot))
+    with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
+        evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
+        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(evaluate(oracle(cfg, robot, task)))
+        run.log("evaluations", row)
+        run.summary({"best": row, "last": row})
+        report.reach_table(console(), {"oracle": row}, f"oracle in MuJoCo, dr: {plain(cfg.dr)}")
+    print(f"written: {run.folder}")
+
+
+def oracle(cfg, robot, task):
+    """Return the controller of algo=oracle."""
+    from r2s.oracle import Oracle
+
+    return Oracle(robot, task, make_dynamics(cfg, robot), cfg.algo.move_s)
+
+
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
     import numpy as np
@@ -403,15 +429,16 @@ def transfer(cfg, overrides):
     from r2s.runs import Progress
 
     source = Path(cfg.policy) if cfg.policy else None
-    if source is None or not (source / "policy.pt").is_file():
+    if source is None or not (source / "summary.json").is_file():
         names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
         raise UserError(
-            f"policy: '{cfg.policy}' is no run folder with a policy.pt{nearest(source.name, names) if source else ''}"
+            f"policy: '{cfg.policy}' is no finished run folder of stage=train"
+            f"{nearest(source.name, names) if source else ''}"
         )
     trained = OmegaConf.load(source / "config.yaml")
     robot, task = make_robot(trained), make_task(trained)
     set_threads(cfg)
-    policy = load_policy(source, robot, task)
+    policy = oracle(trained, robot, task) if trained.algo.name == "oracle" else load_policy(source, robot, task)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     rows, episodes = {}, {}
     with open_run(cfg, overrides, parents=[str(source)]) as run:
@@ -519,6 +546,8 @@ def check_overrides(words):
         known = [*keys(cfg), *groups]
         base: list[str] = []
         for word in words:
+            if word.lstrip("+~").startswith(("hydra.", "hydra/")):
+                continue  # Hydra's own
             try:
                 parsed = OverridesParser.create().parse_override(word)
                 name = parsed.key_or_group
@@ -607,11 +636,13 @@ def main():
         try:
             if cfg.resume:
                 cfg, overrides = resumed(cfg, overrides)
+            elif cfg.only_missing and is_there(cfg):
+                return
             STAGES[cfg.stage](cfg, overrides)
         except (UserError, FloatingPointError) as error:
-            sys.exit(stop(error))
+            failed(error)
         except MissingMandatoryValue as error:
-            sys.exit(stop(f"{error.full_key} must be given: {error.full_key}=..."))
+            failed(f"{error.full_key} must be given: {error.full_key}=...")
         except KeyboardInterrupt:
             print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
             sys.exit(130)
@@ -619,9 +650,43 @@ def main():
     try:
         if not asked_for_help:
             check_overrides(words)
-        job()
+        with tempfile.TemporaryDirectory() as folder:
+            if {"-m", "--multirun"} & set(sys.argv[1:]):  # a job that fails leaves the others alone
+                os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
+            job()
+            lines = Path(folder) / "failed.txt"
+            if lines.is_file():
+                count = len(lines.read_text().splitlines())
+                sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
+
+
+def is_there(cfg):
+    """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
+    import json
+
+    from r2s.errors import UserError
+
+    if not cfg.name:
+        raise UserError("only_missing: give the run folder a name=, such as name='${algo.name}_${seed}'")
+    folder = Path(cfg.root) / cfg.stage / cfg.name
+    if not (folder / "meta.json").is_file():
+        return False
+    if json.loads((folder / "meta.json").read_text())["status"] == "done":
+        print(f"already there: {folder}")
+        return True
+    cfg.resume = str(folder)
+    return False
+
+
+def failed(error):
+    """End a job that cannot go on: with exit status 2, or in a sweep with a note for its end."""
+    status = stop(error)
+    if "R2S_FAILED" not in os.environ:
+        sys.exit(status)
+    with open(os.environ["R2S_FAILED"], "a") as file:
+        file.write(f"{error}\n")
 
 
 def stop(error):

@@ -13,6 +13,7 @@ from r2s.problem import Problem
 from r2s.simulator import Dynamics
 
 DRAWS = 512  # of the joint distribution
+UNSEEN = 0.9  # of its prior's deviation: a value with so much left is hardly seen
 SHARPER = 4.0  # a parameter is identifiable when the half width of its interval is this much below its prior's sigma
 
 
@@ -131,12 +132,11 @@ def conclude(
 
     `space` is the problem's, with the dead zone that was found since.
     """
-    u = np.asarray(sure["u"], dtype=float)
+    u = np.array(sure["u"], dtype=float)
     steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
     prior = problem.sigma / space.spread  # on the unit cube
     share = steps.std(0) / prior
-    unseen = share > 0.9
-    u = np.where(unseen, problem.start, u)
+    u, unseen = _settled(u, problem.start, information + np.diag(problem.weight**2), share)
     samples = space.from_unit(u + steps)
     low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
     half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
@@ -151,3 +151,30 @@ def conclude(
     names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
     found = Estimate(space.from_unit(u), low, high, identifiable, samples)
     return Identified(space, found, history, families, null, names, break_spread)
+
+
+def _settled(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return u (P,) with as many unseen values at `start` as cost nothing, and which (P,) bool those are.
+
+    A value may be unseen by itself and seen together with others, as the masses of two links in a row are: a value
+    goes back only if the others, moved to where that is best, explain the data and the belief as well as before: the
+    sum of squares may rise by 1 in all.
+
+    Args:
+        u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
+        share: (P,) of its prior's deviation that each value's has left.
+    """
+    order = np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]
+    best, unseen = u, np.zeros(len(u), dtype=bool)
+    low, high = 0, len(order)
+    while low < high:  # the cost rises with the count
+        count = (low + high + 1) // 2
+        some = np.zeros(len(u), dtype=bool)
+        some[order[:count]] = True
+        step = np.where(some, start - u, 0.0)
+        step[~some] = -np.linalg.solve(h[np.ix_(~some, ~some)], h[np.ix_(~some, some)] @ step[some])
+        if step @ h @ step <= 1.0:
+            low, best, unseen = count, u + step, some
+        else:
+            high = count - 1
+    return np.clip(best, 0.0, 1.0), unseen

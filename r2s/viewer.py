@@ -110,7 +110,8 @@ def write_recording(
     part = path.with_name(f"{path.stem}.part.rrd")
     episodes = {label: sequence for label, sequence in (episodes or {}).items() if sequence}
     overlays, curves, figures = overlays or {}, curves or {}, figures or {}
-    stream = rr.RecordingStream(f"r2s {path.absolute().parent.name}")  # the viewer keeps one layout per name
+    name = path.absolute().parent.name.replace(".", "-")  # the viewer keeps a layout per name, without dots
+    stream = rr.RecordingStream(f"r2s {name}")
     try:
         stream.save(part, default_blueprint=_blueprint(robot, episodes, overlays, curves, figures))
         _arms(stream, robot, episodes)

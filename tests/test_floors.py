@@ -19,7 +19,7 @@ FLOORS = [
         *("randomization", "breakaway", "residual", "least_squares", "problem", "validation"),
         *("identified", "identify", "search_*", "rewards", "env"),
     ],
-    ["networks", "ddpg", "td3", "sac", "tqc", "checkpoint", "policy", "train", "evaluate"],
+    ["networks", "ddpg", "td3", "sac", "tqc", "checkpoint", "policy", "oracle", "train", "evaluate"],
     ["engines", "engines.*", "arm", "arm.*"],
     ["runs", "report", "report_figures", "report_identification", "viewer", "tell", "pipeline", "comparison"],
 ]

@@ -15,6 +15,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.excitation import fourier
 from r2s.friction import FAMILIES, family
+from r2s.identified import _settled
 from r2s.identify import identify
 from r2s.parameters import LINK, inertia_scale, nominal_dynamics, of_family, parameter_space
 from r2s.problem import searched
@@ -712,3 +713,16 @@ def test_the_papers_new_column_is_found_from_its_old_one(panda):
     np.testing.assert_allclose(inertia_scale(found.inertia, new.inertia), 1.0, atol=0.03)
     assert abs(float(found.delay) - DELAY) < 2e-4
     assert np.all(np.abs(found.breakaway - new.breakaway) < np.maximum(0.02 * np.abs(new.breakaway), 0.01))
+
+
+def test_what_only_a_sum_shows_does_not_go_back_to_nominal_by_itself():
+    """Of two values seen as a sum alone, one may be nominal if the other takes over; a third, unseen, is nominal."""
+    h = np.eye(3)
+    h[:2, :2] += 1e4
+    u, start = np.array([0.1, 0.1, 0.3]), np.zeros(3)
+    settled, unseen = _settled(u, start, h, np.array([0.99, 0.98, 0.97]))
+    assert unseen.tolist() == [True, False, True]
+    np.testing.assert_allclose(settled, [0.0, 0.2, 0.0], atol=1e-3)
+    nothing, kept = _settled(u, start, h, np.array([0.5, 0.5, 0.5]))
+    assert not kept.any()
+    np.testing.assert_array_equal(nothing, u)
