@@ -164,17 +164,12 @@ def _settled(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray)
         u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
         share: (P,) of its prior's deviation that each value's has left.
     """
-    order = np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]
     best, unseen = u, np.zeros(len(u), dtype=bool)
-    low, high = 0, len(order)
-    while low < high:  # the cost rises with the count
-        count = (low + high + 1) // 2
-        some = np.zeros(len(u), dtype=bool)
-        some[order[:count]] = True
+    for k in np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]:
+        some = unseen.copy()
+        some[k] = True
         step = np.where(some, start - u, 0.0)
         step[~some] = -np.linalg.solve(h[np.ix_(~some, ~some)], h[np.ix_(~some, some)] @ step[some])
         if step @ h @ step <= 1.0:
-            low, best, unseen = count, u + step, some
-        else:
-            high = count - 1
+            best, unseen = u + step, some
     return np.clip(best, 0.0, 1.0), unseen
