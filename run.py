@@ -395,16 +395,18 @@ def train(cfg, overrides):
 
 def reference(cfg, overrides):
     """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
-    from r2s import report
+    from r2s import report, tell
     from r2s.evaluate import make_evaluation, measures
 
     robot, task = make_robot(cfg), make_task(cfg)
     draw = make_draw(cfg, robot, make_dynamics(cfg, robot))
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
-        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(evaluate(oracle(cfg, robot, task)))
+        done = evaluate(oracle(cfg, robot, task))
+        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
+        tell.transfer(run, robot, {"oracle": done})
         report.reach_table(console(), {"oracle": row}, f"oracle in MuJoCo, dr: {plain(cfg.dr)}")
     print(f"written: {run.folder}")
 

@@ -91,6 +91,28 @@ def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, 
     assert "is finished" in done.stderr
 
 
+def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
+    """One bad value: a line of its own, exit status 2, the other job done; repeated, that one is left alone."""
+    sweep = ["-m", *TOY, f"root={tmp_path}", "only_missing=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
+    done = r2s(*sweep)
+    assert done.returncode == 2
+    assert "error: lr: 2.0 is not allowed; a number in (0, 1] is\n" in done.stderr
+    assert done.stderr.endswith("error: 1 job of the sweep failed, see above; the others are done\n")
+    assert json.loads((tmp_path / "train" / "lr0.001" / "meta.json").read_text())["status"] == "done"
+    assert [p.name for p in (tmp_path / "train").iterdir()] == ["lr0.001"]
+    assert f"already there: {tmp_path}/train/lr0.001" in r2s(*sweep).stdout
+
+
+def test_the_grid_is_what_its_file_says(tmp_path):
+    """paper_grid, cut down to two jobs, runs them side by side in folders named by their settings."""
+    grid = ["-m", "+experiment=[paper_grid,toy]", f"root={tmp_path}", 'grid.algo="td3,tqc"', 'grid.lr="1e-3"']
+    succeed(*grid, 'grid.batch_size="16"', 'grid.gamma="0.9"', 'grid.seed="3"')
+    names = sorted(p.name for p in (tmp_path / "train").iterdir())
+    assert names == [f"grid_{a}_lr0.001_batch16_gamma0.9_seed3" for a in ("td3", "tqc")]
+    config = yaml.safe_load((tmp_path / "train" / names[0] / "config.yaml").read_text())
+    assert (config["seed"], config["threads"], config["algo"]["policy_delay"]) == (3, 1, 2)
+
+
 @pytest.mark.parametrize("command", [c for c in readme_commands() if not c.startswith("resume=")])
 def test_readme_command(command, root, recording, trained, identified):
     """Every `python run.py` line of the README ends well and says where its files are."""
