@@ -6,9 +6,11 @@ Read it from the bottom: `main` composes, `STAGES` names what there is, one func
 import os
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 ROOT = Path(__file__).parent
+OPEN = ExitStack()  # arms and emulators of this job
 CONF = ROOT / "conf"
 
 
@@ -57,14 +59,40 @@ def make_draw(cfg, robot, center):
 
 
 def make_arm(cfg, robot):
-    """Return conf/arm."""
-    from r2s.errors import UserError, nearest
+    """Return conf/arm; what has to be closed is in OPEN."""
+    from functools import partial
 
-    if cfg.arm.name == "twin":
+    from r2s.errors import UserError
+
+    name, arm = cfg.arm.name, cfg.arm
+    if name == "twin":
         from r2s.arm.twin import Twin
 
-        return Twin(robot, cfg.arm.seed)
-    raise UserError(f"arm: '{cfg.arm.name}' cannot be commanded; allowed: twin{nearest(cfg.arm.name, ['twin'])}")
+        return Twin(robot, arm.seed)
+    if name == "none":
+        raise UserError("arm: none cannot be commanded; allowed: twin, panda_emulated, fr3_emulated, panda, fr3")
+    from r2s.arm.fr3 import FR3
+    from r2s.arm.panda import Panda
+
+    make = Panda if name.startswith("panda") else FR3
+    if name.endswith("_emulated"):
+        from r2s.arm.emulator import Emulator
+        from r2s.arm.twin import Twin
+
+        version = 5 if name.startswith("panda") else 10
+        emulator = Emulator(partial(Twin, robot, arm.seed), version=version, realtime=arm.realtime)
+        client = make(robot, OPEN.enter_context(emulator), clear=lambda reason: True)
+    else:
+        client = make(robot, arm.address, clear=operator_agrees, realtime=arm.realtime)
+    OPEN.callback(client.close)
+    return client
+
+
+def operator_agrees(reason):
+    """Ask whether a stop of the arm may be cleared; nobody at the terminal: no."""
+    if not sys.stdin.isatty():
+        return False
+    return input(f"\nthe arm has stopped itself: {reason}\nis it safe to go on? [y/N] ").strip().lower() == "y"
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
@@ -450,9 +478,9 @@ def transfer(cfg, overrides):
             rows["mujoco"], episodes["mujoco"] = measures(done), done
         if cfg.arm.name != "none":
             progress = Progress(f"reach on {cfg.arm.name}")
-            done, stops = reach(
-                policy, make_arm(cfg, robot), task, starts, goals, lambda k, n: progress(k / n, f"{k} goals")
-            )
+            arm, fade = make_arm(cfg, robot), cfg.arm.soft_start_s
+            shown = lambda k, n: progress(k / n, f"{k} goals")  # noqa: E731
+            done, stops = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
             progress.close()
             rows[cfg.arm.name] = measures(done) | {"stops": len(stops)}
             episodes[cfg.arm.name] = done
@@ -640,7 +668,8 @@ def main():
                 cfg, overrides = resumed(cfg, overrides)
             elif cfg.only_missing and is_there(cfg):
                 return
-            STAGES[cfg.stage](cfg, overrides)
+            with OPEN:
+                STAGES[cfg.stage](cfg, overrides)
         except (UserError, FloatingPointError) as error:
             failed(error)
         except MissingMandatoryValue as error:

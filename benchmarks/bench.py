@@ -7,6 +7,7 @@ import copy
 import json
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -152,17 +153,74 @@ def learner(robot, threads: int) -> tuple[float, float]:
     return duel(ours, peer, 10)
 
 
+class Sb3:
+    """sb3-contrib's TQC in its own virtual environment, runs/bench/sb3, made at the first use."""
+
+    def __init__(self) -> None:
+        folder = ROOT / "runs" / "bench" / "sb3"
+        python = folder / "bin" / "python"
+        if not (folder / ".ready").is_file():
+            print(f"setting up {folder} (once; a minute or two)", flush=True)
+            subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+            pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+            subprocess.run([*pip, f"torch=={torch.__version__.split('+')[0]}", "sb3-contrib==2.9.2"], check=True)
+            (folder / ".ready").touch()
+        worker = [str(python), str(ROOT / "benchmarks" / "sb3_worker.py")]
+        self._process = subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline().strip() == "ready"
+
+    def update(self, threads: int, count: int) -> float:
+        """Return the seconds that `count` updates take."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{threads} {count}\n")
+        return float(self._process.stdout.readline())
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.terminate()
+
+
+def against_sb3(robot, threads: int, sb3: Sb3) -> tuple[float, float]:
+    """TQC updates with replay sampling against sb3-contrib's `train`, which samples too, in turn, updates/s."""
+    from tensordict import TensorDict
+    from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+    torch.set_num_threads(threads)
+    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    d, n, count = len(mean), robot.n, 20
+    algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
+    rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
+    rows |= {"action": torch.rand(2000, n) * 2 - 1, "reward": torch.randn(2000), "terminated": torch.zeros(2000)}
+    replay.extend(TensorDict(rows, batch_size=[2000]))
+    seconds: list[list[float]] = [[], []]
+    for k in range(REPEATS + 2):
+        began = time.perf_counter()
+        for _ in range(count):
+            algo.update(replay.sample())
+        ours = time.perf_counter() - began
+        theirs = sb3.update(threads, count)
+        if k >= 2:
+            seconds[0].append(ours)
+            seconds[1].append(theirs)
+    return count / float(np.median(seconds[0])), count / float(np.median(seconds[1]))
+
+
 def main() -> None:
     """Run all and print one table."""
     robot = load_robot(**conf("robot/panda"))
     dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     cores = os.cpu_count() or 1
-    rows = {}
+    rows, sb3 = {}, Sb3()
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"
         rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)
         rows[f"TorchRL environment / bare Batch, arm steps/s, {at}"] = environment(robot, dynamics, threads)
         rows[f"TQC / TorchRL's TQCLoss, updates/s, {at}"] = learner(robot, threads)
+        rows[f"TQC / sb3-contrib's TQC, updates/s, {at}"] = against_sb3(robot, threads, sb3)
+    sb3.close()
     table = Table(title=f"{_cpu()}, {cores} cores, mujoco {mujoco.__version__}, torch {torch.__version__}")
     for column in ("what", "r2s", "peer", "ratio"):
         table.add_column(column, justify="left" if column == "what" else "right")

@@ -1,18 +1,25 @@
-"""A policy on an arm: observe, ask the policy at its own rate, condition its torque, command at 1 kHz."""
+"""A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz."""
 
 from collections.abc import Callable
+from typing import Protocol
 
 import mujoco
 import numpy as np
 import torch
 
 from r2s import rewards
-from r2s.actuation import Actuation, SoftLimits
+from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.env import Task, observe
 from r2s.evaluate import Episodes
-from r2s.networks import Policy
-from r2s.robot import SIM_DT
+
+
+class Acts(Protocol):
+    """What reaches: a policy (r2s/networks.py) or the model-based reference (r2s/oracle.py)."""
+
+    def action(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return actions (B, n) in [-1, 1] for observations (B, d)."""
+        ...
 
 
 class Kinematics:
@@ -33,12 +40,14 @@ class Kinematics:
 
 @torch.no_grad()
 def reach(
-    policy: Policy,
+    policy: Acts,
     arm: Arm,
     task: Task,
     starts: np.ndarray,
     goals: np.ndarray,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    soft_start_s: float = 0.0,
 ) -> tuple[Episodes, list[str]]:
     """Run one episode per goal; return them as measured by the arm, and why an arm stopped, where it did.
 
@@ -50,22 +59,26 @@ def reach(
         task: rates, limits and length.
         starts: (E, n) rad. goals: (E, 3) m.
         progress: called after every episode with done, total.
+        soft_start_s: s, over which the torque of an episode fades in; hardware deserves some, the twin needs none.
     """
     robot, count = arm.robot, len(goals)
     kinematics = Kinematics(robot)
-    actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
     torque = task.torque(robot)
-    soft, step = SoftLimits.of(robot, torque), robot.dtau_max * SIM_DT
+    driver = Driver(robot, torque, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
     for e in range(count):
-        state = arm.move_to(starts[e])
-        actuation.reset()
-        sent = np.zeros(robot.n)
+        driver.reset()
+        stopped = False
+        try:
+            state = arm.move_to(starts[e])
+        except ArmStopped as stop:
+            state, stopped = arm.read(), True
+            stops.append(f"episode {e + 1}, on the way to its start: {stop}")
         place, jacobian = kinematics(state.q)
         distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
-        before, stopped = state.dq, False
+        before = state.dq
         for k in range(task.steps):
             if not stopped:
                 seen = observe(
@@ -74,21 +87,20 @@ def reach(
                     place[None],
                     goals[e][None],
                     jacobian[None],
-                    actuation.last / torque,
+                    driver.effort[None] / torque,
                 )
-                action = policy.action(torch.from_numpy(seen)).numpy().astype(np.float64)
+                action = policy.action(torch.from_numpy(seen))[0].numpy().astype(np.float64)
                 try:
-                    for _ in range(task.substeps):
-                        wanted = actuation(action * torque, 1)[0, 0] + soft(state.q, state.dq)
-                        wanted = np.clip(wanted, -robot.tau_max, robot.tau_max)
-                        sent = sent + np.clip(wanted - sent, -step, step)  # the rate limit comes last
-                        arm.command(sent)
+                    for ms in range(task.substeps):
+                        arm.command(driver(state, action * torque if ms == 0 else None))
                         state = arm.read()
+                        if driver.done:
+                            raise ArmStopped(driver.stopping)
                 except ArmStopped as stop:
                     stops.append(f"episode {e + 1}, {state.t:.2f} s: {stop}")
                     stopped = True
                 place, jacobian = kinematics(state.q)
-            q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, sent
+            q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, state.tau_J_d
             distance[e, k] = np.linalg.norm(goals[e] - place)
             ddq = (state.dq - before) * task.ctrl_hz
             before = state.dq

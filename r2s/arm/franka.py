@@ -10,11 +10,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, Protocol
 
-import mujoco
 import numpy as np
 
 from r2s.arm import fci
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes, felt_inertia
 from r2s.arm.record import Tracker
 from r2s.errors import UserError
 from r2s.excitation import Excitation
@@ -220,7 +219,7 @@ class Franka:
 
     def _damp(self) -> None:
         """Take speed out, and torque back, before the arm's own controller takes over."""
-        gain = REST_RATE * _felt_inertia(self.robot, self._state.q)
+        gain = REST_RATE * felt_inertia(self.robot, self._state.q)
         most, step = REST_SHARE * self.robot.tau_max, RATE_SHARE * self.robot.dtau_max * SIM_DT
         for _ in range(round(REST_S / SIM_DT)):
             s = self._state
@@ -280,14 +279,3 @@ def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray) -> tuple[Excita
     dq = (end - start) * 30 * u**2 * (1 - u) ** 2 / duration
     ddq = (end - start) * 60 * u * (1 - u) * (1 - 2 * u) / duration**2
     return Excitation(t, q, dq, ddq), moving
-
-
-def _felt_inertia(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return (n,) kg m^2, what each joint feels with the others free, by the nominal model."""
-    model = robot.model(gravity=False)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_forward(model, data)
-    mass = np.empty((robot.n, robot.n))
-    mujoco.mj_fullM(model, data, mass)
-    return 1 / np.diag(np.linalg.inv(mass))

@@ -8,6 +8,7 @@ came with, `command` ends the cycle and waits for the next.
 from dataclasses import dataclass
 from typing import Protocol
 
+import mujoco
 import numpy as np
 
 from r2s.robot import SIM_DT, Robot
@@ -104,3 +105,14 @@ class Reflexes:
             raise ArmStopped(f"joint {i + 1}: position {q[i]:.4f} rad, allowed {r.q_min[i]:g} to {r.q_max[i]:g} rad")
         i = int(np.argmax(np.abs(dq) / r.dq_max))
         raise ArmStopped(f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, allowed +-{r.dq_max[i]:g} rad/s")
+
+
+def felt_inertia(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return (n,) kg m^2, what each joint feels with the others free, by the nominal model."""
+    model = robot.model(gravity=False)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    mass = np.empty((robot.n, robot.n))
+    mujoco.mj_fullM(model, data, mass)
+    return 1 / np.diag(np.linalg.inv(mass))

@@ -1,0 +1,140 @@
+"""Between a policy and an arm, once a millisecond: whatever the policy says, what is sent is within the arm's rules.
+
+In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> push away from position and velocity
+limits -> clip -> rate limit, last, against what the arm applied last. No clock and no arm in here: `Driver` is a
+function of states and targets, and the tests give it a million hostile ones.
+"""
+
+import numpy as np
+
+from r2s.actuation import Actuation, SoftLimits, low_pass_gain
+from r2s.arm.interface import ArmState, felt_inertia
+from r2s.robot import SIM_DT, Robot
+
+DEADLINE_S = 0.05  # without a fresh finite target: then the arm is damped, and stopped when it rests
+DAMP_S = 0.5  # at most
+FREE = 0.75  # of the speed that is allowed: above, joints are braked and the policy loses authority
+WALL_DDQ = 0.35  # of ddq_max, the deceleration that a way to a position limit is judged by
+WALL_Q = 0.05  # rad within the position limits, where the allowed speed has come down to nothing
+WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears
+AHEAD_S = 0.03  # that speeds are judged ahead, by accelerations below
+AHEAD_HZ = 60.0
+Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
+DQ_INSIDE = 0.95  # of the velocity limits
+STILL = 0.02  # rad/s
+
+
+class Driver:
+    """The last word on every command.
+
+    Attributes:
+        stopping: why the arm is being brought to rest, or None. done: it rests, or has had its time: stop it now.
+
+    Args:
+        robot: its limits. torque: (n,) Nm, the most that a target may ask for.
+        cutoff_hz: low-pass on the target.
+        soft_start_s: s, over which the targets of a motion fade in; 0: not at all.
+    """
+
+    def __init__(self, robot: Robot, torque: np.ndarray, *, cutoff_hz: float = 100.0, soft_start_s: float = 0.0):
+        self.robot, self._torque, self._fade = robot, torque, round(soft_start_s / SIM_DT)
+        self._actuation = Actuation(robot, 1, cutoff_hz=cutoff_hz)
+        self._soft = SoftLimits.of(robot, torque)
+        self._step = robot.dtau_max * SIM_DT
+        self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
+        self._fast = DQ_INSIDE * robot.dq_max
+        self._damping = WALL_RATE * felt_inertia(robot, robot.q_home)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a motion, from zero torque."""
+        self._actuation.reset()
+        self._target, self._ddq = np.zeros(self.robot.n), np.zeros(self.robot.n)
+        self._dq: np.ndarray | None = None
+        self._cycle, self._silent, self._damped = 0, 0, 0
+        self.stopping: str | None = None
+
+    @property
+    def effort(self) -> np.ndarray:
+        """(n,) Nm, the target as it has come through the low-pass: what a policy sees of its own commands."""
+        return self._actuation.last[0]
+
+    @property
+    def done(self) -> bool:
+        """Whether a motion that is being stopped is at rest, or has had its time."""
+        return self.stopping is not None and (self._rests or self._damped * SIM_DT >= DAMP_S)
+
+    def __call__(self, state: ArmState, target: np.ndarray | None) -> np.ndarray:
+        """Return the command (n,) Nm of this cycle.
+
+        Args:
+            state: of this cycle; where it is not finite the torque fades out.
+            target: (n,) Nm that the policy wants; None where it has said nothing.
+        """
+        self._cycle += 1
+        seen = bool(np.isfinite(state.q).all() and np.isfinite(state.dq).all())
+        if target is not None and np.isfinite(target).all():
+            self._target = np.clip(target, -self._torque, self._torque)
+            self._silent = 0
+        else:
+            self._silent += 1
+        self._watch(state, seen)
+        soon = self._ahead(state.dq) if seen else state.dq
+        self._rests = seen and bool((np.abs(state.dq) < STILL).all())
+        wanted = self._target
+        if self.stopping is not None:
+            self._damped += 1
+            wanted = np.zeros(self.robot.n)
+        else:
+            fade = self._cycle / self._fade if self._cycle < self._fade else 1.0
+            wanted = wanted * (fade * self._authority(state.q, soon))
+        wanted = self._actuation(wanted[None], 1)[0, 0]
+        if seen:
+            wanted = wanted + self._soft(state.q, state.dq) + self._wall(state.q, soon)
+        wanted = np.clip(wanted, -self.robot.tau_max, self.robot.tau_max)
+        return state.tau_J_d + np.clip(wanted - state.tau_J_d, -self._step, self._step)
+
+    def _ahead(self, dq: np.ndarray) -> np.ndarray:
+        """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms."""
+        before = dq if self._dq is None else self._dq
+        self._ddq += low_pass_gain(AHEAD_HZ) * ((dq - before) / SIM_DT - self._ddq)
+        self._dq = dq
+        return dq + AHEAD_S * self._ddq
+
+    def _bounds(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
+        r, brake = self.robot, 2 * WALL_DDQ * self.robot.ddq_max
+        up = np.sqrt(brake * np.maximum(r.q_max - WALL_Q - q, 0.0))
+        down = np.sqrt(brake * np.maximum(q - r.q_min - WALL_Q, 0.0))
+        return np.minimum(r.dq_max, up), np.minimum(r.dq_max, down)
+
+    def _authority(self, q: np.ndarray, dq: np.ndarray) -> float:
+        """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
+
+        A light joint between heavy ones is thrown about by torques that are not its own.
+        """
+        up, down = self._bounds(q)
+        near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
+        return float(np.clip((1.0 - near) / (1.0 - FREE), 0.0, 1.0)) if np.isfinite(near) else 0.0
+
+    def _wall(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm that brakes what is too fast, for where it is; anything, when the motion is to end."""
+        if self.stopping is not None:
+            return -self._damping * dq
+        up, down = self._bounds(q)
+        return -self._damping * (np.maximum(dq - FREE * up, 0.0) - np.maximum(-dq - FREE * down, 0.0))
+
+    def _watch(self, state: ArmState, seen: bool) -> None:
+        """Decide whether the motion goes on."""
+        if self.stopping is not None:
+            return
+        if self._silent * SIM_DT > DEADLINE_S:
+            self.stopping = f"no finite action for {1e3 * DEADLINE_S:g} ms"
+        elif not seen:
+            self.stopping = "the arm's state is not finite"
+        elif (state.q < self._low).any() or (state.q > self._high).any():
+            j = int(np.maximum(self._low - state.q, state.q - self._high).argmax())
+            self.stopping = f"joint {j + 1} is at {state.q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
+        elif (np.abs(state.dq) > self._fast).any():
+            j = int((np.abs(state.dq) / self._fast).argmax())
+            self.stopping = f"joint {j + 1} is at {state.dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"

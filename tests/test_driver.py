@@ -1,0 +1,169 @@
+"""Whatever a policy says, what reaches the arm is within its rules; and a good policy is left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import conf
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r2s.actuation import Actuation, SoftLimits
+from r2s.arm.driver import DEADLINE_S, Driver
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.simulated import SimulatedArm
+from r2s.env import Task
+from r2s.parameters import nominal_dynamics
+from r2s.robot import SIM_DT, load_robot
+
+PANDA = load_robot(**conf("robot/panda"))
+TASK = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+TORQUE = TASK.torque(PANDA)
+KINDS = ("nan", "inf", "huge", "flip", "silence", "full", "noise", "wrong shape of time")
+
+
+def target(kind, k, rng):
+    """Return what a bad policy says in cycle k."""
+    if kind == "nan":
+        return np.where(rng.random(7) < 0.3, np.nan, TORQUE)
+    if kind == "inf":
+        return np.full(7, np.inf if k % 2 else -np.inf)
+    if kind == "huge":
+        return 1e9 * np.where(rng.random(7) < 0.5, -1.0, 1.0)
+    if kind == "flip":
+        return 1e3 * TORQUE * (-1) ** k
+    if kind == "silence":
+        return None
+    if kind == "full":
+        return TORQUE * np.where(np.arange(7) % 2, -1.0, 1.0)
+    if kind == "noise":
+        return TORQUE * rng.normal(size=7)
+    return TORQUE * rng.normal(size=7) if k % 37 == 0 else None
+
+
+def hostile(cycles, seed):
+    """Drive a simulated arm by one bad policy after the other; return cycles, reflexes that fired and orderly stops.
+
+    The reflexes of the arm are those of libfranka: torque range, torque rate, position and velocity limits.
+    """
+    rng = np.random.default_rng(seed)
+    dynamics = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    dynamics = replace(dynamics, delay=4e-3, lag=1e-3)
+    arm = SimulatedArm(PANDA, dynamics, position_noise=2e-5, velocity_noise=3e-3, seed=seed)
+    driver, check = Driver(PANDA, TORQUE, cutoff_hz=TASK.cutoff_hz), Reflexes(PANDA)
+    reflexes, stops, k = [], [], 0
+    while k < cycles:
+        kind = KINDS[rng.integers(len(KINDS))]
+        state = arm.move_to(rng.uniform(PANDA.q_min + 0.15, PANDA.q_max - 0.15))
+        driver.reset()
+        for _ in range(2000):
+            k += 1
+            tau = driver(state, target(kind, k, rng))
+            check.command(tau, state.tau_J_d)  # torque and rate, to the letter
+            try:
+                arm.command(tau)
+            except ArmStopped as reflex:
+                reflexes.append(f"{kind}: {reflex}")
+                break
+            state = arm.read()
+            if driver.done:
+                stops.append(f"{kind}: {driver.stopping}")
+                break
+    return k, reflexes, stops
+
+
+def test_a_hostile_policy_never_breaks_a_rule():
+    """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
+    _, reflexes, stops = hostile(40_000, seed=0)
+    assert not reflexes
+    assert any("no finite action" in s for s in stops)
+
+
+@pytest.mark.slow
+def test_a_hostile_policy_never_breaks_a_rule_in_a_million_cycles():
+    """The same for 1e6 cycles."""
+    cycles, reflexes, _ = hostile(1_000_000, seed=1)
+    assert cycles >= 1_000_000
+    assert not reflexes
+
+
+def state_of(q, dq, tau):
+    return ArmState(t=0.0, q=q, dq=dq, tau_J=tau, tau_J_d=tau)
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.lists(numbers, min_size=7, max_size=7), min_size=1, max_size=8), st.integers(0, 2**31))
+def test_any_floats_give_a_command_that_the_arm_takes(targets, seed):
+    """Any targets, from any state and any last command: finite, within torque range and rate."""
+    rng, check = np.random.default_rng(seed), Reflexes(PANDA)
+    driver = Driver(PANDA, TORQUE, soft_start_s=rng.choice([0.0, 0.5]))
+    tau = rng.uniform(-1, 1, 7) * PANDA.tau_max
+    for wanted in targets:
+        q, dq = rng.uniform(PANDA.q_min, PANDA.q_max), rng.normal(size=7) * PANDA.dq_max
+        if rng.random() < 0.2:
+            q[rng.integers(7)] = np.nan
+        new = driver(state_of(q, dq, tau), np.array(wanted))
+        check.command(new, tau)
+        tau = new
+
+
+def test_a_good_policy_is_left_alone():
+    """Away from limits the command is the low-passed, rate-limited target, bit for bit, as in training."""
+    driver, plain = Driver(PANDA, TORQUE, cutoff_hz=100.0), Actuation(PANDA, 1, cutoff_hz=100.0)
+    rng, tau = np.random.default_rng(0), np.zeros(7)
+    for k in range(400):
+        wanted = 0.5 * TORQUE * np.sin(0.01 * k + np.arange(7))
+        tau = driver(state_of(PANDA.q_home, 0.1 * rng.normal(size=7), tau), wanted)
+        np.testing.assert_allclose(tau, plain(wanted[None], 1)[0, 0], atol=1e-12)
+        np.testing.assert_array_equal(driver.effort, plain.last[0])
+    assert driver.stopping is None
+
+
+def test_silence_is_damped_then_stopped():
+    """Up to the deadline the last target holds; after it the torque works against the speed, until the arm rests."""
+    driver, tau = Driver(PANDA, TORQUE), np.zeros(7)
+    driver(state_of(PANDA.q_home, np.zeros(7), tau), 0.2 * TORQUE)
+    for _ in range(round(DEADLINE_S / SIM_DT)):
+        tau = driver(state_of(PANDA.q_home, np.zeros(7), tau), None)
+    assert driver.stopping is None
+    np.testing.assert_allclose(tau, 0.2 * TORQUE, rtol=1e-6)
+    speed = np.full(7, 0.5)
+    for _ in range(60):
+        tau = driver(state_of(PANDA.q_home, speed, tau), None)
+    assert driver.stopping == "no finite action for 50 ms"
+    assert np.all(tau * speed < 0)
+    assert not driver.done
+    driver(state_of(PANDA.q_home, np.zeros(7), tau), None)
+    assert driver.done
+
+
+def test_torque_fades_in():
+    """With a soft start of 1 s, a constant target is at about half of itself after half of that, and whole after."""
+    driver, tau = Driver(PANDA, TORQUE, soft_start_s=1.0), np.zeros(7)
+    for k in range(1200):
+        tau = driver(state_of(PANDA.q_home, np.zeros(7), tau), 0.3 * TORQUE)
+        if k == 500:
+            np.testing.assert_allclose(tau, 0.15 * TORQUE, rtol=0.02)
+    np.testing.assert_allclose(tau, 0.3 * TORQUE, rtol=1e-3)
+
+
+def test_limits_push_back_and_stop():
+    """Inside the margin the soft limit acts as in simulation; near the limit, or near top speed, the motion ends."""
+    soft, q = SoftLimits.of(PANDA, TORQUE), PANDA.q_home.copy()
+    q[1] = PANDA.q_max[1] - 0.05
+    driver, tau = Driver(PANDA, TORQUE), np.zeros(7)
+    for _ in range(200):
+        tau = driver(state_of(q, np.zeros(7), tau), np.zeros(7))
+    np.testing.assert_allclose(tau, soft(q, np.zeros(7)), atol=1e-9)
+    assert driver.stopping is None
+    q[1] = PANDA.q_max[1] - 0.01
+    driver(state_of(q, np.zeros(7), tau), np.zeros(7))
+    assert driver.stopping is not None
+    assert driver.stopping.startswith("joint 2 is at ")
+    driver.reset()
+    driver(state_of(PANDA.q_home, 0.97 * PANDA.dq_max * np.eye(7)[4], tau), np.zeros(7))
+    assert driver.stopping is not None
+    assert "joint 5" in driver.stopping
