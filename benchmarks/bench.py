@@ -76,8 +76,10 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
     arms, steps, task = 32, 50, Task(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
 
+    spread = {k: v for k, v in conf("dr/paper").items() if k != "name"}
+
     def draw(rng, m):
-        return randomization.draw(rng, dynamics, m, **conf("dr/paper"))
+        return randomization.draw(rng, dynamics, m, **spread)
 
     env = ReachEnv(robot, task, draw, arms, nthread=threads, stagger=True)
     state = env.reset()
