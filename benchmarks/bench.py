@@ -41,14 +41,14 @@ def conf(path: str) -> dict:
 
 
 def duel(ours: Callable[[], object], peer: Callable[[], object], work: float) -> tuple[float, float]:
-    """Return (ours, peer): median rates, work per second, of calls in turn."""
+    """Return (ours, peer): median rates, work per second, of calls in turn; a call may say how long it took, s."""
     seconds: list[list[float]] = [[], []]
     for k in range(REPEATS + 2):
         for side, call in enumerate((ours, peer)):
             began = time.perf_counter()
-            call()
+            told = call()
             if k >= 2:
-                seconds[side].append(time.perf_counter() - began)
+                seconds[side].append(told if isinstance(told, float) else time.perf_counter() - began)
     return work / float(np.median(seconds[0])), work / float(np.median(seconds[1]))
 
 
@@ -197,17 +197,12 @@ def against_sb3(robot, threads: int, sb3: Sb3) -> tuple[float, float]:
     rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
     rows |= {"action": torch.rand(2000, n) * 2 - 1, "reward": torch.randn(2000), "terminated": torch.zeros(2000)}
     replay.extend(TensorDict(rows, batch_size=[2000]))
-    seconds: list[list[float]] = [[], []]
-    for k in range(REPEATS + 2):
-        began = time.perf_counter()
+
+    def ours() -> None:
         for _ in range(count):
             algo.update(replay.sample())
-        ours = time.perf_counter() - began
-        theirs = sb3.update(threads, count)
-        if k >= 2:
-            seconds[0].append(ours)
-            seconds[1].append(theirs)
-    return count / float(np.median(seconds[0])), count / float(np.median(seconds[1]))
+
+    return duel(ours, lambda: sb3.update(threads, count), count)
 
 
 def main() -> None:

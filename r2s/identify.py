@@ -20,7 +20,7 @@ from r2s.errors import UserError
 from r2s.friction import BRISTLE, FAMILIES
 from r2s.identified import Identified, conclude, posterior
 from r2s.parameters import check_parameters, of_family, parameter_space
-from r2s.problem import Problem, Report, Search, check_choices, check_prior, searched
+from r2s.problem import NONE, Problem, Report, Search, check_choices, check_prior, searched
 from r2s.recording import Recording
 from r2s.residual import MOVED, ReplayResidual, TorqueResidual
 from r2s.robot import Robot
@@ -30,7 +30,6 @@ from r2s.validation import compare_families, joints_kept
 REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
 MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
 TRUST = 0.01  # and by how much less the error must be to go that far
-NONE = 1e-4  # standard deviation of the belief in a value that is not searched any more
 CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 

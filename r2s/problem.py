@@ -17,6 +17,7 @@ from r2s.residual import ReplayResidual, TorqueResidual
 from r2s.robot import Robot
 from r2s.simulator import Dynamics
 
+NONE = 1e-4  # standard deviation of the belief in a value that is not searched
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
 TERMS = ("viscous", "offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
 Report = Callable[[dict], None]
@@ -92,7 +93,7 @@ class Problem:
         uniform = space.spread / np.sqrt(12)
         self.sigma = np.minimum(space.spread_out(prior, np.inf), uniform)
         if kept is not None:
-            self.sigma[space.of_joints(kept)] = 1e-4
+            self.believe(space.of_joints(kept), NONE)
         self.clusters = data.clusters
 
     @property
