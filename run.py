@@ -88,6 +88,18 @@ def make_arm(cfg, robot):
     return client
 
 
+def make_engine(cfg, robot):
+    """Return Dynamics -> the engine of simulator=dart or gazebo, of an arm with these links."""
+    if cfg.simulator.name == "gazebo":
+        from r2s.engines.gazebo import GazeboEngine, bindings
+
+        sim = bindings()
+        return lambda d: GazeboEngine(robot, d, sim)
+    from r2s.engines.dart import DartEngine
+
+    return lambda d: DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
+
+
 def operator_agrees(reason):
     """Ask whether a stop of the arm may be cleared; nobody at the terminal: no."""
     if not sys.stdin.isatty():
@@ -145,6 +157,19 @@ def set_threads(cfg):
 
     torch.set_num_threads(cfg.threads or os.cpu_count() or 1)
     torch.manual_seed(cfg.seed)
+
+
+def device(cfg):
+    """Return where learner and replay buffer live; the physics stays on the processor."""
+    import torch
+
+    from r2s.errors import UserError
+
+    if cfg.device not in ("cpu", "cuda"):
+        raise UserError(f"device: '{cfg.device}' is not allowed; cpu and cuda are")
+    if cfg.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("device: cuda is not there; torch sees no GPU, device=cpu works")
+    return cfg.device
 
 
 # --- stages ---------------------------------------------------------------------------------------------------
@@ -241,6 +266,7 @@ def identify(cfg, overrides):
     from r2s import report, tell
     from r2s.arm.interface import ArmStopped
     from r2s.breakaway import Ramps
+    from r2s.engines.description import write_description
     from r2s.errors import UserError
     from r2s.excitation import load
     from r2s.identify import identify as run_identify
@@ -327,6 +353,7 @@ def identify(cfg, overrides):
         }
         save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)
+        write_description(run.folder / "model", robot, found.dynamics)
         run.summary(summary)
         drawn = {k: settings[k] for k in ("window_s", "cutoff_hz")}
         tell.identification(run, robot, nominal, found, validation, summary, **drawn)
@@ -336,6 +363,7 @@ def identify(cfg, overrides):
 
 def train(cfg, overrides):
     """Train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
+    import copy
     from functools import partial
 
     import torch
@@ -365,7 +393,7 @@ def train(cfg, overrides):
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
     torque = torch.from_numpy(task.torque(robot))
     mean, std = (torch.from_numpy(s) for s in observation_scale(robot, task))
-    algo = learner(name)((mean, std), torque, **settings)
+    algo = learner(name)((mean, std), torque, **settings).to(device(cfg))
     weights = partial(curriculum, **plain(cfg.reward))
     best: dict = {}
     last: dict = {}
@@ -389,7 +417,7 @@ def train(cfg, overrides):
         def evaluated(row):
             run.log("evaluations", row)
             if is_best(row):
-                save_policy(run.folder, algo.policy)
+                save_policy(run.folder, copy.deepcopy(algo.policy).cpu())
 
         def show(share, row):
             text = f"{row['env_steps'] / 1e3:.0f}k env steps, {row['updates']} updates"
@@ -405,6 +433,8 @@ def train(cfg, overrides):
             weights,
             budget=budget,
             **loop,
+            compile=cfg.compile,
+            matmul=cfg.matmul,
             eval_env_steps=cfg.evaluation.env_steps,
             checkpoint=checkpoint,
             dump=run.folder / "dump.pt",
@@ -453,6 +483,7 @@ def transfer(cfg, overrides):
 
     from r2s import report, tell
     from r2s.arm.deploy import reach
+    from r2s.engines.episodes import reach as engine_reach
     from r2s.errors import UserError, nearest
     from r2s.evaluate import fixed_episodes, make_evaluation, measures
     from r2s.policy import load_policy
@@ -472,22 +503,28 @@ def transfer(cfg, overrides):
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     rows, episodes = {}, {}
     with open_run(cfg, overrides, parents=[str(source)]) as run:
-        if cfg.simulator.name == "mujoco":
+        if cfg.simulator.name != "none":
             draw = make_draw(trained, robot, make_dynamics(trained, robot))
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
+        if cfg.simulator.name in ("dart", "gazebo"):
+            progress = Progress(f"reach in {cfg.simulator.name}")
+            shown = lambda k, n: progress(k / n, f"{k} goals")  # noqa: E731
+            done = engine_reach(policy, make_engine(cfg, robot), robot, task, draw, starts, goals, shown)
+            progress.close()
+            rows[cfg.simulator.name], episodes[cfg.simulator.name] = measures(done), done
         if cfg.arm.name != "none":
             progress = Progress(f"reach on {cfg.arm.name}")
             arm, fade = make_arm(cfg, robot), cfg.arm.soft_start_s
             shown = lambda k, n: progress(k / n, f"{k} goals")  # noqa: E731
             done, stops = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
             progress.close()
-            rows[cfg.arm.name] = measures(done) | {"stops": len(stops)}
-            episodes[cfg.arm.name] = done
+            rows[cfg.arm.name], episodes[cfg.arm.name] = measures(done) | {"stops": len(stops)}, done
             (run.folder / "stops.txt").write_text("\n".join(stops) + "\n" if stops else "none\n")
-            if cfg.simulator.name == "mujoco":
-                path = np.linalg.norm(done.ee - episodes["mujoco"].ee, axis=-1)
-                rows[cfg.arm.name]["ee_path_rmse_mm"] = float(1e3 * np.sqrt((path**2).mean()))
+        for name in rows.keys() - {"mujoco"}:
+            if "mujoco" in rows:
+                away = np.linalg.norm(episodes[name].ee - episodes["mujoco"].ee, axis=-1)
+                rows[name]["ee_path_rmse_mm"] = float(1e3 * np.sqrt((away**2).mean()))
         run.summary(rows)
         tell.transfer(run, robot, episodes)
         report.reach_table(console(), rows, f"{source.name} on {len(goals)} goals")

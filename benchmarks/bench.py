@@ -113,6 +113,7 @@ def learner(robot, threads: int) -> tuple[float, float]:
     mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
     d, n, b = len(mean), robot.n, 256
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
+    algo.compile(b)
 
     class Critic(nn.Module):
         def __init__(self) -> None:
@@ -193,6 +194,7 @@ def against_sb3(robot, threads: int, sb3: Sb3) -> tuple[float, float]:
     mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
     d, n, count = len(mean), robot.n, 20
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
+    algo.compile(256)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
     rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
     rows |= {"action": torch.rand(2000, n) * 2 - 1, "reward": torch.randn(2000), "terminated": torch.zeros(2000)}

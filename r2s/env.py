@@ -24,6 +24,7 @@ from r2s.simulator import Dynamics, Simulator
 
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
+GROUPS = 8  # of arms that are reset together: a reset of four costs hardly more than one of one
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ class ReachEnv(EnvBase):
         draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator.
         nsim: arms. nthread: 0 is all.
         seed: of goals, starts and draws.
-        stagger: let the first episodes end at different times, so that resets do not come all at once.
+        stagger: let the first episodes of eight groups of arms end at different times, not those of all at once.
     """
 
     batch_locked = True
@@ -164,13 +165,14 @@ class ReachEnv(EnvBase):
         seed: int = 0,
         stagger: bool = False,
     ):
-        super().__init__(device="cpu", batch_size=[nsim])
+        super().__init__(device=None, batch_size=[nsim])
         self.robot, self.task, self.draw = robot, task, draw
         self.rng = np.random.default_rng(seed)
-        self.sim = Simulator(robot, draw(self.rng, nsim), nsim, nthread)
+        drawn = draw(self.rng, nsim)
+        self.sim = Simulator(robot, drawn, nsim, nthread)
         self.sim.set_soft_limits(SoftLimits.of(robot, task.torque(robot)))
         self.actuation = Actuation(robot, nsim, cutoff_hz=task.cutoff_hz)
-        self.motors = Motors(nsim, robot.n)
+        self.motors = Motors(nsim, robot.n, drawn.delay, drawn.lag)
         self.weights = rewards.PAPER
         self._torque = task.torque(robot)
         self._stagger = stagger
@@ -210,7 +212,7 @@ class ReachEnv(EnvBase):
             q = self.robot.q_home + self.rng.uniform(-spread, spread, (len(ids), self.robot.n))
             self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
             if self._stagger:
-                self._count[ids] = self.rng.integers(self.task.steps, size=len(ids))
+                self._count[ids] = ids * GROUPS // self.sim.nsim * self.task.steps // GROUPS
                 self._stagger = False
         return self.read()
 
@@ -280,8 +282,9 @@ class ReachEnv(EnvBase):
 
     def _finite(self, what: str, rows: np.ndarray) -> None:
         """Raise FloatingPointError where a row of (nsim, ...) has a value that is not finite."""
-        bad = ~np.isfinite(rows).all(-1)
-        if bad.any():
+        finite = np.isfinite(rows)
+        if not finite.all():
+            bad = ~finite.all(-1)
             arm = int(bad.argmax())
             value = rows[arm][~np.isfinite(rows[arm])][0]
             raise FloatingPointError(f"{what} of arm {arm} is {value} at step {self._count[arm]} of its episode")

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
+import mujoco
 import numpy as np
 import torch
 
 from r2s.env import ReachEnv, Task, sample_goals
-from r2s.networks import Policy
 from r2s.rewards import PAPER
 from r2s.robot import Robot
 from r2s.simulator import Dynamics
@@ -33,6 +34,30 @@ class Episodes:
     tau: np.ndarray
     distance: np.ndarray
     reward: np.ndarray
+
+
+class Acts(Protocol):
+    """What reaches: a policy (r2s/networks.py) or the model-based reference (r2s/oracle.py)."""
+
+    def action(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return actions (B, n) in [-1, 1] for observations (B, d)."""
+        ...
+
+
+class Kinematics:
+    """Where the arm's hand is, from joint angles and the nominal geometry: what a real arm knows, too."""
+
+    def __init__(self, robot: Robot):
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._site = self._model.site(robot.ee_site).id
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ee (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        self._data.qpos = q
+        mujoco.mj_kinematics(self._model, self._data)
+        ee = self._data.site_xpos[self._site].copy()
+        return ee, np.cross(self._data.xaxis, ee - self._data.xanchor).T
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
@@ -73,13 +98,13 @@ def make_evaluation(
     *,
     episodes: int = 200,
     nthread: int = 0,
-) -> Callable[[Policy], Episodes]:
+) -> Callable[[Acts], Episodes]:
     """Return policy -> Episodes: all fixed episodes at once, each arm with its own (fixed) draw of the dynamics."""
     env = ReachEnv(robot, task, draw, episodes, nthread=nthread, seed=GOAL_SEED)
     starts, goals = fixed_episodes(robot, task, episodes)
 
     @torch.no_grad()
-    def evaluate(policy: Policy) -> Episodes:
+    def evaluate(policy: Acts) -> Episodes:
         env.place(starts, goals)
         state = env.read()
         rows: dict[str, list[np.ndarray]] = {k: [] for k in ("q", "dq", "ee", "tau", "distance", "reward")}

@@ -1,6 +1,7 @@
 """What every algorithm shares: a normaliser, an actor, an ensemble of critics, and the learner that holds them."""
 
 import copy
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
@@ -157,6 +158,7 @@ class Learner(nn.Module, ABC):
     """
 
     torque: Tensor
+    heavy: tuple[str, ...] = ("losses",)  # the methods that an update spends its time in
 
     def __init__(
         self,
@@ -212,9 +214,41 @@ class Learner(nn.Module, ABC):
             group["lr"] = share * self.lr
 
     def normalized(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the batch with both observations normalised."""
+        """Return what an update needs of the batch, with both observations normalised."""
         both = {k: self.normalizer(batch[k]) for k in ("observation", "next_observation")}
-        return dict(batch) | both
+        return both | {k: batch[k] for k in ("action", "reward", "terminated")}
+
+    def compile(self, batch_size: int) -> bool:  # type: ignore[override]
+        """Turn the losses and their gradients into machine code for batches of this size, before the first update.
+
+        Takes 5 to 20 s, less when it was done before on the same machine. On a GPU the code is captured as a graph.
+        Where it cannot be done, as without a C++ compiler, one warning says so and the learner stays as it is.
+
+        Returns:
+            Whether it was done.
+        """
+        mode = "reduce-overhead" if self.torque.is_cuda else "default"
+        eager = {name: getattr(self, name) for name in self.heavy}
+        before, random = copy.deepcopy(self.state_dict()), torch.get_rng_state()
+        sizes = {"observation": len(self.normalizer.mean), "action": len(self.torque)}
+        sizes["next_observation"] = sizes["observation"]
+        batch = {k: torch.zeros(batch_size, size, device=self.torque.device) for k, size in sizes.items()}
+        batch |= {k: torch.zeros(batch_size, device=self.torque.device) for k in ("reward", "terminated")}
+        try:
+            for name, method in eager.items():
+                setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
+            self.update(batch)
+        except RuntimeError as error:
+            why = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            warnings.warn(f"the losses are not compiled, updates take about twice as long: {why}", stacklevel=2)
+            for name in eager:
+                delattr(self, name)
+            return False
+        finally:
+            self.zero_grad(set_to_none=True)
+            self.load_state_dict(before)
+            torch.set_rng_state(random)
+        return True
 
     def descend(self, loss: Tensor) -> None:
         """Take one step of Adam down the gradient of `loss`.

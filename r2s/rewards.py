@@ -7,13 +7,15 @@ every stored transition is worth what the present weights say.
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
-PRECISION_M = np.array([0.03, 0.01])  # lengths of the bonus: within them, closer still pays
+PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
 STILL = 0.2  # rad/s, scale of its stillness: a redundant arm can drift with its hand on the goal
 TERMS = ("distance", "smoothness", "precision")
 
 
+@njit(cache=True)
 def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     """Return (m, 3): the two halves of eq. (2), which add up to it, and a bonus for precision.
 
@@ -26,13 +28,19 @@ def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.n
         dq: (m, n) rad/s.
         ddq: (m, n) rad/s^2, mean over the last control period.
     """
-    d = distance / distance0
-    speed = np.tanh(np.abs(dq)).sum(-1)
-    jerkiness = np.tanh(np.abs(ddq)).sum(-1)
-    smoothness = -K2 * speed - K3 * jerkiness / np.abs(K4 - np.minimum(1.0, d)) - K5 * jerkiness / (K6 + d)
-    still = 1.0 - 0.5 * np.tanh(np.abs(dq) / STILL).mean(-1)
-    near = 1.0 - np.tanh(distance[:, None] / PRECISION_M).mean(-1)
-    return np.stack([-K1 * d, smoothness, near * still], -1)
+    out = np.empty((len(distance), 3))
+    for i in range(len(distance)):
+        d = distance[i] / distance0[i]
+        speed, jerkiness, moving = 0.0, 0.0, 0.0
+        for j in range(dq.shape[1]):
+            speed += np.tanh(abs(dq[i, j]))
+            jerkiness += np.tanh(abs(ddq[i, j]))
+            moving += np.tanh(abs(dq[i, j]) / STILL)
+        near = 1.0 - 0.5 * (np.tanh(distance[i] / PRECISION_M[0]) + np.tanh(distance[i] / PRECISION_M[1]))
+        out[i, 0] = -K1 * d
+        out[i, 1] = -K2 * speed - K3 * jerkiness / abs(K4 - min(1.0, d)) - K5 * jerkiness / (K6 + d)
+        out[i, 2] = near * (1.0 - 0.5 * moving / dq.shape[1])
+    return out
 
 
 PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)

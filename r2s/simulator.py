@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import mujoco.batch
 import numpy as np
+from numba import njit
 
 from r2s import friction
 from r2s.actuation import SoftLimits
@@ -54,6 +55,23 @@ class Dynamics:
     def friction(self, dq: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
         """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `turn`: Family.torque."""
         return self.family.torque(dq, self.phi, turn)
+
+    def one(self, k: int) -> "Dynamics":
+        """Return the k-th of a batch (m, ...); fields that all arms share stay as they are."""
+        single = {
+            "phi": 2,
+            "offset": 1,
+            "breakaway": 2,
+            "inertia": 3,
+            "mass": 1,
+            "com": 2,
+            "load": 1,
+            "drag": 2,
+            "gain": 1,
+        }
+        single |= {"delay": 0, "lag": 0}
+        values = {name: getattr(self, name) for name in single}
+        return replace(self, **{n: v[k] for n, v in values.items() if v is not None and np.ndim(v) > single[n]})
 
     def scaled(self, scale: np.ndarray) -> "Dynamics":
         """Return these dynamics with link tensors times `scale` (..., n): the paper's inertia genes."""
@@ -101,7 +119,7 @@ class Simulator:
             return np.repeat(a, repeat, axis=0) if a.ndim > without and repeat > 1 else a
 
         at = arms[:, None], self._bodies
-        self._user[arms, :, : friction.Q_LOW] = spread(self._rows(dynamics, mass, com), 2)
+        self._user[arms, :, : friction.Q_LOW] = spread(_law_columns(self.robot, self.model, dynamics), 2)
         self._damping[arms] = self.model.dof_damping
         self._inertia[at] = spread(moments, 2)
         self._iquat[at] = spread(_quaternions(axes), 2)
@@ -109,34 +127,9 @@ class Simulator:
         self._com[at] = spread(com, 2)
         self.batch.set_const(ids)
 
-    def _rows(self, d: Dynamics, mass: np.ndarray, com: np.ndarray) -> np.ndarray:
-        """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
-        robot, f = self.robot, friction
-        moment = mass[..., None] * com
-        load = np.zeros(robot.n) if d.load is None else d.load
-        drag = np.zeros((robot.n, 2)) if d.drag is None else d.drag
-        arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], load, drag[..., 0])
-        rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
-        rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, d.family.code
-        rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
-        rows[..., f.OFFSET] = d.offset
-        rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
-        rows[..., f.DQ_MIN], rows[..., f.DAMPING] = d.dq_min, self.model.dof_damping
-        rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = drag
-        rows[..., f.LOAD], rows[..., f.BODY] = load, self._bodies
-        rows[..., f.STEP] = self.model.opt.timestep
-        nominal = robot.mass[:, None] * robot.com
-        rows[..., f.MASS_ERROR] = mass - robot.mass
-        rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = moment - nominal
-        rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
-        rows[..., f.LINK] = d.load is not None or d.mass is not None or d.com is not None
-        return rows
-
     def set_soft_limits(self, limits: SoftLimits) -> None:
         """Let the driver's soft limits act in all arms; without this call there are none."""
-        columns = (limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain)
-        for i, column in zip(range(friction.Q_LOW, friction.WIDTH), columns, strict=True):
-            self._user[:, :, i] = column
+        self._user[:, :, friction.Q_LOW :] = _soft_columns(limits)
 
     def reset(
         self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, turn: np.ndarray | float = 0.0
@@ -188,7 +181,65 @@ class Simulator:
     @property
     def jacobian(self) -> np.ndarray:
         """(nsim, 3, n) m/rad, translational Jacobian of the end effector: axis x (ee - anchor) for hinges."""
-        return np.cross(self._xaxis, self.ee[:, None] - self._xanchor).transpose(0, 2, 1)
+        return _jacobian(self._xaxis, self._xanchor, self.ee)
+
+
+@njit(cache=True)
+def _jacobian(axis, anchor, ee):
+    out = np.empty((axis.shape[0], 3, axis.shape[1]))
+    for i in range(axis.shape[0]):
+        for j in range(axis.shape[1]):
+            x, y, z = ee[i] - anchor[i, j]
+            a, b, c = axis[i, j]
+            out[i, 0, j], out[i, 1, j], out[i, 2, j] = b * z - c * y, c * x - a * z, a * y - b * x
+    return out
+
+
+def single_arm(robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None) -> mujoco.MjModel:
+    """Return one arm's model with its links, its friction law and the driver's soft limits in it, without gravity."""
+    friction.install()
+    model = robot.model(gravity=False, user=friction.WIDTH)
+    moments, axes = np.linalg.eigh(dynamics.inertia)
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
+    at = model.jnt_bodyid
+    model.body_inertia[at], model.body_iquat[at] = moments, _quaternions(axes)
+    model.body_mass[at] = robot.mass if dynamics.mass is None else dynamics.mass
+    model.body_ipos[at] = robot.com if dynamics.com is None else dynamics.com
+    model.jnt_user[:, : friction.Q_LOW] = _law_columns(robot, model, dynamics)
+    if soft is not None:
+        model.jnt_user[:, friction.Q_LOW :] = _soft_columns(soft)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
+    """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
+    f = friction
+    mass = robot.mass if d.mass is None else d.mass
+    moment = mass[..., None] * (robot.com if d.com is None else d.com)
+    load = np.zeros(robot.n) if d.load is None else d.load
+    drag = np.zeros((robot.n, 2)) if d.drag is None else d.drag
+    arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], load, drag[..., 0])
+    rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
+    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, d.family.code
+    rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
+    rows[..., f.OFFSET] = d.offset
+    rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
+    rows[..., f.DQ_MIN], rows[..., f.DAMPING] = d.dq_min, model.dof_damping
+    rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = drag
+    rows[..., f.LOAD], rows[..., f.BODY] = load, model.jnt_bodyid
+    rows[..., f.STEP] = model.opt.timestep
+    nominal = robot.mass[:, None] * robot.com
+    rows[..., f.MASS_ERROR] = mass - robot.mass
+    rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = moment - nominal
+    rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
+    rows[..., f.LINK] = d.load is not None or d.mass is not None or d.com is not None
+    return rows
+
+
+def _soft_columns(limits: SoftLimits) -> np.ndarray:
+    """Return the columns of `jnt_user` that are soft limits, (n, WIDTH - Q_LOW)."""
+    return np.stack([limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain], -1)
 
 
 def _quaternions(rotation: np.ndarray) -> np.ndarray:

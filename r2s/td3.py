@@ -30,6 +30,8 @@ class TD3(Learner):
 
     last_actor_loss: Tensor
 
+    heavy = ("_critic_loss", "_actor_loss")
+
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],

@@ -5,9 +5,11 @@ With env_steps alone a seed gives the same run, bit for bit at a fixed number of
 minutes make the curriculum follow the clock.
 """
 
+import copy
 import ctypes
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +50,16 @@ def keep_memory() -> None:
         pass  # another C library: only slower
 
 
+@contextmanager
+def products(precision: str) -> Iterator[None]:
+    """Let float32 matrix products in here have this precision; elsewhere, as in a policy's, it is the highest."""
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision("highest")
+
+
 def train(
     env: ReachEnv,
     algo: Learner,
@@ -62,6 +74,8 @@ def train(
     lr_decay: float = 0.6,
     lr_end: float = 0.1,
     eval_env_steps: int = 80_000,
+    compile: bool = False,
+    matmul: str = "highest",
     checkpoint: Checkpoint | None = None,
     dump: Path | None = None,
     log: Callable[[dict], None] = lambda row: None,
@@ -81,6 +95,9 @@ def train(
         replay_size: transitions kept.
         lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
         eval_env_steps: environment steps between two evaluations; one more comes at the end.
+        compile: turn the losses into machine code first; the time counts.
+        matmul: precision of the products within an update, for torch.set_float32_matmul_precision: "highest", or
+            "medium", which rounds their factors to bfloat16 where the processor multiplies those faster.
         checkpoint: written after every evaluation; where it holds a state, training goes on from there.
         dump: file for what led to a number that is not finite, for `replay`.
         log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
@@ -91,9 +108,12 @@ def train(
     """
     keep_memory()
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
-    replay = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(replay_size), sampler=RandomSampler(), batch_size=batch_size
-    )
+    device = algo.torque.device
+    if compile:
+        with products(matmul):
+            algo.compile(batch_size)
+    storage = LazyTensorStorage(replay_size, device=device)
+    replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=batch_size)
     state = env.reset()
     row: dict = {}
     shown: dict = {}
@@ -106,14 +126,15 @@ def train(
         torch.set_rng_state(saved["torch"])
 
     def evaluation() -> dict:
-        out = measures(evaluate(algo.policy))
+        out = measures(evaluate(copy.deepcopy(algo.policy).cpu()))
         return {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began} | out
 
     while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
         env.weights = weights(spent)
         algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / (1.0 - lr_decay))
         warm = env_steps >= learning_starts
-        state["action"] = algo.explore(state["observation"]) if warm else env.action_spec.rand()
+        seen = state["observation"].to(device)
+        state["action"] = algo.explore(seen).cpu() if warm else env.action_spec.rand()
         before = env.state()
         try:
             step, state_next = env.step_and_maybe_reset(state)
@@ -125,13 +146,14 @@ def train(
         env_steps += env.sim.nsim
         if env_steps < learning_starts:
             continue
-        price = torch.from_numpy(env.weights.astype(np.float32))
+        price = torch.from_numpy(env.weights.astype(np.float32)).to(device)
         for _ in range(updates_per_step):
             batch = replay.sample()
             batch["reward"] = batch["reward_terms"] @ price
             random = torch.get_rng_state()
             try:
-                row = algo.update(batch)
+                with products(matmul):
+                    row = algo.update(batch)
             except FloatingPointError as error:
                 where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random}
                 raise _dumped(error, dump, where, f"{env_steps} env steps") from None
@@ -149,7 +171,7 @@ def train(
                 now |= {"seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
                 now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
                 checkpoint.save(now, replay, env_steps, replay_size)
-        progress(spent, {"env_steps": env_steps, "updates": updates} | shown)
+        progress(spent, shown | {"env_steps": env_steps, "updates": updates})
     evaluated(evaluation())
 
 

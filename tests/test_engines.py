@@ -1,11 +1,22 @@
 """DART is the same arm as MuJoCo, for the Panda and for a file with everything the Panda's lacks."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
+import torch
+from conftest import conf
 
+from r2s import randomization
 from r2s.engines.dart import DartEngine
+from r2s.engines.episodes import reach
+from r2s.engines.interface import MujocoEngine
+from r2s.env import Task
 from r2s.errors import UserError
+from r2s.evaluate import fixed_episodes, make_evaluation
+from r2s.parameters import nominal_dynamics
+from r2s.policy import make_policy
 from r2s.robot import load_robot
 
 ODD_ARM = """
@@ -145,3 +156,27 @@ def test_implicit_damping_of_one_step():
 def test_wrong_shapes_are_named():
     with pytest.raises(UserError, match="masses"):
         DartEngine(panda(), gravity=True, masses=np.ones(3))
+
+
+def test_a_policy_meets_the_same_arm_in_every_engine():
+    """Friction, breakaway, offsets, soft limits, delay: an episode in DART is the batch's, within 1e-3 mm."""
+    robot, task = load_robot(**conf("robot/panda")), Task(episode_s=0.9, torque_fraction=0.15)
+    truth = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass)
+
+    def draw(rng, m):
+        return randomization.draw(rng, truth, m, phi_relative=0.1, inertia_relative=0.05)
+
+    torch.manual_seed(0)
+    policy = make_policy(robot, task, (16,))
+    starts, goals = fixed_episodes(robot, task, 4)
+    home = make_evaluation(robot, task, draw, episodes=4, nthread=1)(policy)
+    assert np.abs(home.dq).max() > 0.3  # it moves
+
+    def dart(d):
+        return DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
+
+    for make in (dart, lambda d: MujocoEngine(robot, d)):
+        away = reach(policy, make, robot, task, draw, starts, goals)
+        assert np.linalg.norm(away.ee - home.ee, axis=-1).max() < 1e-6  # no joint gets to a hard stop
+        np.testing.assert_allclose(away.reward, home.reward, atol=1e-3)

@@ -319,7 +319,7 @@ def test_a_list_of_torque_fractions_must_fit(panda):
 
 def test_the_observation_is_the_one_an_arm_gives(make):
     """What the environment returns is `observe` of state, nominal kinematics, goal and last command, as on an arm."""
-    from r2s.arm.deploy import Kinematics
+    from r2s.evaluate import Kinematics
 
     env = make(4)
     run(env, actions(3, 4))

@@ -47,7 +47,7 @@ def test_a_wrong_model_shows(panda, task, dynamics):
 def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dynamics):
     """The hand is at the goal to 0.2 mm."""
     oracle = Oracle(panda, task, dynamics)
-    from r2s.arm.deploy import Kinematics
+    from r2s.evaluate import Kinematics
 
     kinematics = Kinematics(panda)
     for start, goal in zip(*fixed_episodes(panda, task, 40), strict=True):

@@ -1,9 +1,7 @@
 """A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz."""
 
 from collections.abc import Callable
-from typing import Protocol
 
-import mujoco
 import numpy as np
 import torch
 
@@ -11,31 +9,7 @@ from r2s import rewards
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.env import Task, observe
-from r2s.evaluate import Episodes
-
-
-class Acts(Protocol):
-    """What reaches: a policy (r2s/networks.py) or the model-based reference (r2s/oracle.py)."""
-
-    def action(self, observation: torch.Tensor) -> torch.Tensor:
-        """Return actions (B, n) in [-1, 1] for observations (B, d)."""
-        ...
-
-
-class Kinematics:
-    """Where the arm's hand is, from joint angles and the nominal geometry: what a real arm knows, too."""
-
-    def __init__(self, robot):
-        self._model = robot.model(gravity=False)
-        self._data = mujoco.MjData(self._model)
-        self._site = self._model.site(robot.ee_site).id
-
-    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ee (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
-        self._data.qpos = q
-        mujoco.mj_kinematics(self._model, self._data)
-        ee = self._data.site_xpos[self._site].copy()
-        return ee, np.cross(self._data.xaxis, ee - self._data.xanchor).T
+from r2s.evaluate import Acts, Episodes, Kinematics
 
 
 @torch.no_grad()

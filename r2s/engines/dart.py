@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from r2s.engines.description import Links, about, make_pose, shaped
 from r2s.errors import UserError
 from r2s.robot import SIM_DT, Robot
 
@@ -45,8 +46,8 @@ class DartEngine:
         model = robot.model(gravity=gravity, dt=dt)
         n = robot.n
         bodies = model.jnt_bodyid
-        links = _Links(model)
-        links.override(bodies, _shaped("masses", masses, (n,)), _shaped("coms", coms, (n, 3)), inertias, n)
+        links = Links(model)
+        links.override(bodies, shaped("masses", masses, (n,)), shaped("coms", coms, (n, 3)), inertias, n)
         self.robot = robot
         # DART has no armature. Damping A/h with the torque (A/h) v put back is the same thing exactly: the
         # implicit step solves (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
@@ -74,13 +75,13 @@ class DartEngine:
         self._world.addSkeleton(self._skeleton)
         _as_gazebo(dart, self._world)
 
-    def _add_link(self, dart: ModuleType, model: mujoco.MjModel, links: "_Links", i: int, parent):
+    def _add_link(self, dart: ModuleType, model: mujoco.MjModel, links: "Links", i: int, parent):
         body = int(model.jnt_bodyid[i])
         anchor, pose = links.moving_parent(model.body_parentid[body])
         if parent is None and anchor != 0:
             raise UserError(f"robot.mjcf: link '{model.body(body).name}' does not hang on a fixed base")
-        to_joint = _pose(model.jnt_pos[i], None)
-        zero = _pose(None, _about(model.jnt_axis[i], -model.qpos0[i]))  # the file's pose is the one at qpos0
+        to_joint = make_pose(model.jnt_pos[i], None)
+        zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))  # the file's pose is the one at qpos0
         properties = dart.dynamics.RevoluteJointProperties()
         properties.mName = model.joint(i).name or f"joint{i + 1}"
         properties.mAxis = model.jnt_axis[i]
@@ -150,49 +151,6 @@ class DartEngine:
         return result
 
 
-class _Links:
-    """Masses, centres and tensors of all bodies, and where welded bodies sit on the moving ones."""
-
-    def __init__(self, model: mujoco.MjModel):
-        self.model = model
-        self.mass, self.com = model.body_mass.copy(), model.body_ipos.copy()
-        axes = [_rotation(quat) for quat in model.body_iquat]
-        self.inertia = np.array([r * d @ r.T for r, d in zip(axes, model.body_inertia, strict=True)])
-        poses = zip(model.body_pos, model.body_quat, strict=True)
-        self.local = [_pose(position, _rotation(quat)) for position, quat in poses]
-
-    def override(self, bodies, masses, coms, inertias, n) -> None:
-        if masses is not None:
-            self.mass[bodies] = masses
-        if coms is not None:
-            self.com[bodies] = coms
-        if (inertias := _shaped("inertias", inertias, (n, 3, 3))) is not None:
-            self.inertia[bodies] = inertias
-
-    def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
-        """Return the nearest body with a joint at or above `body` (0: the world), body's pose in it."""
-        pose = np.eye(4)
-        while body and self.model.body_dofnum[body] == 0:
-            pose = self.local[body] @ pose
-            body = int(self.model.body_parentid[body])
-        return body, pose
-
-    def lumped(self, body: int) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return mass, centre and tensor about it of `body` with everything welded to it."""
-        parts = [(self.mass[body], self.com[body], self.inertia[body])]
-        for other in range(1, self.model.nbody):
-            anchor, pose = self.moving_parent(other)
-            if other != body and anchor == body and self.mass[other] > 0:
-                r = pose[:3, :3]
-                parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
-        mass = sum(m for m, _, _ in parts)
-        if len(parts) == 1 or mass == 0:
-            return float(mass), parts[0][1], parts[0][2]
-        com = sum(m * c for m, c, _ in parts) / mass
-        steiner = [m * ((c - com) @ (c - com) * np.eye(3) - np.outer(c - com, c - com)) for m, c, _ in parts]
-        return float(mass), com, sum(i for _, _, i in parts) + sum(steiner)
-
-
 def _dartpy() -> ModuleType:
     try:
         import dartpy
@@ -208,33 +166,6 @@ def _as_gazebo(dart: ModuleType, world) -> None:
     options = dart.simulation.DeactivationOptions()
     options.mEnabled = False
     world.setDeactivationOptions(options)
-
-
-def _shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
-    if value is not None and np.shape(value) != shape:
-        raise UserError(f"{name} must be {shape}; it is {np.shape(value)}")
-    return value
-
-
-def _rotation(quat: np.ndarray) -> np.ndarray:
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
-
-
-def _about(axis: np.ndarray, angle: float) -> np.ndarray:
-    quat = np.empty(4)
-    mujoco.mju_axisAngle2Quat(quat, axis, angle)
-    return _rotation(quat)
-
-
-def _pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    pose = np.eye(4)
-    if position is not None:
-        pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation
-    return pose
 
 
 def _isometry(dart: ModuleType, pose: np.ndarray):

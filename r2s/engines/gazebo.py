@@ -1,0 +1,124 @@
+"""Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
+
+One blocking `server.run` per millisecond. The world has physics and nothing else, and is written from the same
+description as the other engines' (r2s/engines/description.py). Gazebo is on no Python index: it comes from OSRF's
+packages or conda-forge, with bindings of its own.
+"""
+
+import importlib
+import os
+import tempfile
+import uuid
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from r2s.engines.description import chain, write_sdf
+from r2s.errors import UserError
+from r2s.robot import Robot
+from r2s.simulator import Dynamics
+
+RELEASES = ("gz.sim", "gz.sim9", "gz.sim8")  # Jetty, Ionic, Harmonic
+
+
+class GazeboEngine:
+    """One arm in a Gazebo server.
+
+    A command lasts one step. A reset is what the bindings can do: positions and velocities are set inside the next
+    update and integrated through it, so `reset` keeps them, and the first `step` after it applies both with its
+    torque: that step starts at q, dq exactly.
+
+    Args:
+        robot, dynamics: masses, centres and tensors; friction is not Gazebo's (r2s/engines/interface.py).
+        sim: the bindings; None imports those that are installed.
+
+    Raises:
+        UserError: no bindings here, or they cannot load the world.
+    """
+
+    def __init__(self, robot: Robot, dynamics: Dynamics, sim: ModuleType | None = None):
+        self._sim = bindings() if sim is None else sim
+        os.environ.setdefault("GZ_IP", "127.0.0.1")
+        os.environ.setdefault("GZ_PARTITION", f"r2s-{uuid.uuid4().hex}")  # no other server hears us
+        self._robot = robot
+        self._names = [link.joint for link in chain(robot, dynamics)[0]]
+        self._joints: list = []
+        self._error: BaseException | None = None
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
+        self._tau = np.zeros(robot.n)
+        self._q, self._dq = robot.q_home.copy(), np.zeros(robot.n)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "world.sdf"
+            write_sdf(path, robot, dynamics, world=True)
+            self._fixture = self._sim.TestFixture(str(path))
+            self._fixture.on_pre_update(self._guarded(self._before))
+            self._fixture.on_post_update(self._guarded(self._after))
+            self._fixture.finalize()
+            self._server = self._fixture.server()
+            self._run()  # the first update finds the joints and switches their readings on
+        if not self._joints:
+            raise UserError("simulator=gazebo: the server runs but has not loaded the arm; see its messages above")
+
+    def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
+        """Let the next step start at q, dq (n,) rad, rad/s."""
+        self._start = np.array(q, dtype=float), np.array(dq, dtype=float)
+        self._q, self._dq = self._start
+
+    def step(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Apply tau (n,) Nm for 1 ms; return the new (q, dq), (n,) rad, rad/s."""
+        self._tau = tau
+        self._run()
+        return self._q, self._dq
+
+    def _run(self) -> None:
+        self._server.run(True, 1, False)
+        if self._error is not None:
+            raise self._error
+
+    def _guarded(self, update):
+        """Return `update` for the bindings: an exception must not cross them, it waits for `_run`."""
+
+        def call(info, ecm):
+            try:
+                update(ecm)
+            except Exception as error:
+                self._error = error
+
+        return call
+
+    def _before(self, ecm) -> None:
+        if not self._joints:
+            sim = self._sim
+            model = sim.Model(sim.World(sim.world_entity(ecm)).model_by_name(ecm, self._robot.name))
+            self._joints = [sim.Joint(model.joint_by_name(ecm, name)) for name in self._names]
+            for joint in self._joints:
+                joint.enable_position_check(ecm, True)
+                joint.enable_velocity_check(ecm, True)
+            return
+        if self._start is not None:
+            for joint, q, dq in zip(self._joints, *self._start, strict=True):
+                joint.reset_position(ecm, [float(q)])
+                joint.reset_velocity(ecm, [float(dq)])
+            self._start = None
+        for joint, torque in zip(self._joints, self._tau, strict=True):
+            joint.set_force(ecm, [float(torque)])
+
+    def _after(self, ecm) -> None:
+        seen = [(joint.position(ecm), joint.velocity(ecm)) for joint in self._joints]
+        if all(q is not None and dq is not None for q, dq in seen):
+            self._q = np.array([q[0] for q, _ in seen])
+            self._dq = np.array([dq[0] for _, dq in seen])
+
+
+def bindings() -> ModuleType:
+    """Return gz-sim's Python module, the newest release that is installed."""
+    for name in RELEASES:
+        try:
+            return importlib.import_module(name)
+        except ImportError:
+            continue
+    raise UserError(
+        "simulator=gazebo: gz-sim's Python bindings (gz.sim, gz.sim9 or gz.sim8) are not installed; Gazebo comes "
+        "from OSRF's apt repository or conda-forge, not from PyPI. simulator=dart is its physics engine"
+    )
