@@ -31,6 +31,7 @@ from r2s.robot import load_robot  # noqa: E402
 from r2s.runs import _cpu  # noqa: E402
 from r2s.simulator import Simulator  # noqa: E402
 from r2s.tqc import TQC  # noqa: E402
+from r2s.train import keep_memory, products  # noqa: E402
 
 REPEATS = 15
 
@@ -100,8 +101,11 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     return duel(ours, peer, arms * steps)
 
 
-def learner(robot, threads: int) -> tuple[float, float]:
-    """TQC updates against TorchRL's eager TQCLoss with the same networks, batch and optimiser, updates/s."""
+def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
+    """TQC updates against TorchRL's eager TQCLoss with the same networks, batch and optimiser, updates/s.
+
+    Ours are compiled, as a training's are; `matmul` is the precision of their products (r2s/train.py).
+    """
     from tensordict import TensorDict
     from tensordict.nn import TensorDictModule
     from torch import nn
@@ -113,7 +117,8 @@ def learner(robot, threads: int) -> tuple[float, float]:
     mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
     d, n, b = len(mean), robot.n, 256
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
-    algo.compile(b)
+    with products(matmul):
+        algo.compile(b)
 
     class Critic(nn.Module):
         def __init__(self) -> None:
@@ -142,8 +147,9 @@ def learner(robot, threads: int) -> tuple[float, float]:
     batch["terminated"] = torch.zeros(b)
 
     def ours() -> None:
-        for _ in range(10):
-            algo.update(batch)
+        with products(matmul):
+            for _ in range(10):
+                algo.update(batch)
 
     def peer() -> None:
         for _ in range(10):
@@ -185,24 +191,26 @@ class Sb3:
         self._process.terminate()
 
 
-def against_sb3(robot, threads: int, sb3: Sb3) -> tuple[float, float]:
+def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, float]:
     """TQC updates with replay sampling against sb3-contrib's `train`, which samples too, in turn, updates/s."""
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
     torch.set_num_threads(threads)
     mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
-    d, n, count = len(mean), robot.n, 20
+    d, n, count = len(mean), robot.n, 50
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
-    algo.compile(256)
+    with products(matmul):
+        algo.compile(256)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
     rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
     rows |= {"action": torch.rand(2000, n) * 2 - 1, "reward": torch.randn(2000), "terminated": torch.zeros(2000)}
     replay.extend(TensorDict(rows, batch_size=[2000]))
 
     def ours() -> None:
-        for _ in range(count):
-            algo.update(replay.sample())
+        with products(matmul):
+            for _ in range(count):
+                algo.update(replay.sample())
 
     return duel(ours, lambda: sb3.update(threads, count), count)
 
@@ -212,13 +220,16 @@ def main() -> None:
     robot = load_robot(**conf("robot/panda"))
     dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     cores = os.cpu_count() or 1
+    keep_memory()  # as a training does
     rows, sb3 = {}, Sb3()
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"
         rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)
         rows[f"TorchRL environment / bare Batch, arm steps/s, {at}"] = environment(robot, dynamics, threads)
-        rows[f"TQC / TorchRL's TQCLoss, updates/s, {at}"] = learner(robot, threads)
-        rows[f"TQC / sb3-contrib's TQC, updates/s, {at}"] = against_sb3(robot, threads, sb3)
+        for matmul, name in (("highest", "float32"), ("medium", "bfloat16")):
+            way = f"updates/s, {name} products, {at}"
+            rows[f"TQC / TorchRL's TQCLoss, {way}"] = learner(robot, threads, matmul)
+            rows[f"TQC / sb3-contrib's TQC, {way}"] = against_sb3(robot, threads, matmul, sb3)
     sb3.close()
     table = Table(title=f"{_cpu()}, {cores} cores, mujoco {mujoco.__version__}, torch {torch.__version__}")
     for column in ("what", "r2s", "peer", "ratio"):

@@ -33,7 +33,7 @@ class DDPG(Learner):
         hidden: Sequence[int] = (128, 128),
         gamma: float = 0.95,
         tau: float = 0.01,
-        lr: float = 5e-4,
+        lr: float = 1e-3,
         explore_std: float = 0.1,
         action_l2: float = 0.0,
     ):

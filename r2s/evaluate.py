@@ -65,7 +65,8 @@ def measures(episodes: Episodes) -> dict[str, float]:
 
     success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
     of the mean distance in that time. return_paper: mean sum of eq. (2). time_to_reach_s: median time after which the
-    hand stays within 2 cm, of the episodes that got there.
+    hand stays within 2 cm, of the episodes that got there. overshoot_m: how far out of 2 cm it came again after it
+    had first been within, mean of those that had.
     """
     step = episodes.t[1] - episodes.t[0]
     last = episodes.distance[:, -round(HOLD_S / step) :]
@@ -73,6 +74,12 @@ def measures(episodes: Episodes) -> dict[str, float]:
     steps = episodes.distance.shape[1]
     since = np.where(away.any(1), steps - np.argmax(away[:, ::-1], axis=1), 0)
     there = since < steps
+    first = np.argmin(away, axis=1)
+    later = [
+        max(0.0, row[k:-1].max(initial=0.0) - 0.02)
+        for row, k, out in zip(episodes.distance, first, away, strict=True)
+        if not out.all()
+    ]
     return {
         "success_5cm": float((last.max(1) < 0.05).mean()),
         "success_2cm": float((last.max(1) < 0.02).mean()),
@@ -81,6 +88,16 @@ def measures(episodes: Episodes) -> dict[str, float]:
         "distance_median_m": float(np.median(last.mean(1))),
         "return_paper": float(episodes.reward.sum(1).mean()),
         "time_to_reach_s": float(np.median(since[there]) * step) if there.any() else float("nan"),
+        "overshoot_m": float(np.mean(later)) if later else float("nan"),
+    }
+
+
+def gap(one: Episodes, other: Episodes) -> dict[str, float]:
+    """Return how far apart one policy came out on the same goals: RMSE of the hand's path, mm, and of torques, Nm."""
+    path = np.linalg.norm(one.ee - other.ee, axis=-1)
+    return {
+        "ee_path_rmse_mm": float(1e3 * np.sqrt((path**2).mean())),
+        "tau_rmse_Nm": float(np.sqrt(((one.tau - other.tau) ** 2).mean())),
     }
 
 

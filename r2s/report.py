@@ -390,6 +390,25 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
     return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
 
 
+def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
+    """Return one row per label: how far from the simulation that the policy was trained in, and how it moved."""
+    columns = {
+        "path from simulation, mm": ("ee_path_rmse_mm", 1, "{:.2g}"),
+        "torque from simulation, Nm": ("tau_rmse_Nm", 1, "{:.2g}"),
+        "time to reach, s": ("time_to_reach_s", 1, "{:.2f}"),
+        "overshoot, mm": ("overshoot_m", 1e3, "{:.1f}"),
+        "stops": ("stops", 1, "{:.0f}"),
+    }
+    table = {
+        label: {
+            title: number(None if row.get(key) is None else scale * row[key], form)
+            for title, (key, scale, form) in columns.items()
+        }
+        for label, row in rows.items()
+    }
+    return pd.DataFrame.from_dict(table, orient="index").rename_axis("")
+
+
 def reach_table(console: Console, rows: Mapping[str, Mapping], title: str) -> None:
     """Print what `reach_rows` returns."""
     print_table(console, reach_rows(rows), title)

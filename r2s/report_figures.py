@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.signal import butter, freqz_sos
 
+from r2s.evaluate import Episodes
 from r2s.friction import BRISTLE
 from r2s.report import clock_of, joint_panels, log_axis, number, panels, thin
 from r2s.robot import SIM_DT
@@ -16,6 +17,24 @@ from r2s.viewer import colours
 
 LAGS_S = 1.0  # of the residual's autocorrelation
 SCANS = ("family", "breakaway")  # steps of the history whose cost, where they have one, is of another kind
+
+
+def traces_figure(path: Path, episodes: Mapping[str, Episodes], goals: int = 4) -> Path:
+    """Draw the reward of eq. (2) and the torque of joints 1 and 2 over time: a column per goal, a line per label."""
+    colour = colours(episodes)
+    count = min(goals, *(len(e.goal) for e in episodes.values()))
+    n = next(iter(episodes.values())).q.shape[-1]
+    rows = ["reward, eq. (2)", *(f"torque of joint {j + 1}, Nm" for j in range(min(2, n)))]
+    with panels(path, len(rows) * count, count, "the same policy and goals", height=2.4) as axes:
+        for i, name in enumerate(rows):
+            for k in range(count):
+                axis = axes[i * count + k]
+                for label, e in episodes.items():
+                    axis.plot(e.t, e.tau[k, :, i - 1] if i else e.reward[k], color=colour[label], label=label, lw=1.2)
+                axis.set(xlabel="time, s" if i == len(rows) - 1 else "", ylabel=name if k == 0 else "")
+                if i == 0:
+                    axis.set_title(f"goal {k + 1}", loc="left")
+    return path
 
 
 def position_figure(

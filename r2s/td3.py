@@ -41,7 +41,7 @@ class TD3(Learner):
         n_critics: int = 2,
         gamma: float = 0.95,
         tau: float = 0.01,
-        lr: float = 5e-4,
+        lr: float = 1e-3,
         explore_std: float = 0.1,
         smoothing_std: float = 0.2,
         smoothing_clip: float = 0.5,

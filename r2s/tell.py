@@ -18,6 +18,7 @@ from r2s.report_figures import (
     convergence_figure,
     friction_figure,
     position_figure,
+    traces_figure,
     whiteness_figure,
     whiteness_table,
 )
@@ -91,13 +92,33 @@ def training(run: Run, robot: Robot) -> None:
     write_recording(run.folder / "recording.rrd", robot, curves=curves, figures={"learning": learning})
 
 
-def transfer(run: Run, robot: Robot, episodes: Mapping[str, Episodes]) -> None:
-    """Draw distance over time for four goals, and record the arms reaching for them, side by side."""
+def transfer(
+    run: Run,
+    robot: Robot,
+    episodes: Mapping[str, Episodes],
+    rows: Mapping[str, Mapping],
+    timing: Sequence[Mapping] = (),
+    stops: Sequence[str] = (),
+) -> None:
+    """Draw distance, reward and torque for four goals, record the arms side by side, and say it all on one page.
+
+    Args:
+        run, robot: whose. episodes: per simulator and arm.
+        rows: the same with what was measured. timing: of the arm's cycle. stops: why the arm stopped.
+    """
     shown = {label: first(e) for label, e in episodes.items()}
     for label, e in shown.items():
         np.savez_compressed(run.folder / f"episodes_{label}.npz", **stack(e))  # type: ignore[arg-type]
-    report.reach_figure(run.figure("reach"), shown)
-    write_recording(run.folder / "recording.rrd", robot, episodes=shown)
+    reach = report.reach_figure(run.figure("reach"), shown)
+    traces = traces_figure(run.figure("traces"), episodes)
+    write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures={"traces": traces})
+    sections: dict[str, Sequence] = {"The same policy and goals": [report.reach_rows(rows), report.gap_rows(rows)]}
+    if timing:
+        cycle = pd.DataFrame(timing).set_index("what").map(lambda x: f"{x:.3g}")
+        sections["On the clock of this computer"] = [cycle]
+    if "stops" in str(rows):
+        sections["Why the arm stopped"] = [list(stops) or "It did not."]
+    report.report_markdown(run.folder / "report.md", sections | {"Figures": [reach, traces]})
 
 
 def compare(run: Run, robot: Robot, runs: Sequence[Trained]) -> dict[str, pd.DataFrame]:

@@ -5,6 +5,10 @@ tests/test_tqc.py holds what is TQC's own, and the helpers for batches and Torch
 
 import copy
 import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -252,6 +256,46 @@ def test_two_learners_from_one_state_are_apart(kind):
         for _ in range(2):
             one.update(batch)
     assert torch.equal(bits(algo), bits(alone))
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("kind", [TQC, *(pytest.param(k, marks=SLOW) for k in (DDPG, TD3, SAC))])
+def test_compiled_learns_the_same(kind):
+    """Machine code gives the same updates within 1e-5, from the same state, and leaves random numbers alone."""
+    plain, compiled = make(kind), make(kind)
+    random = torch.get_rng_state()
+    assert compiled.compile(B)
+    assert torch.equal(torch.get_rng_state(), random)
+    assert torch.equal(bits(plain), bits(compiled))
+    for seed in range(3):
+        logs = []
+        for algo in (plain, compiled):
+            torch.manual_seed(seed)
+            logs.append(algo.update(in_si(make_batch(seed))))
+        torch.testing.assert_close(*logs, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(bits(plain), bits(compiled), rtol=1e-4, atol=1e-5)
+
+
+def test_without_a_compiler_one_warning(tmp_path):
+    """The learner stays as it is and learns on."""
+    code = (
+        "import warnings; warnings.simplefilter('always')\n"
+        "from test_algorithms import *\n"
+        "algo = make(DDPG); before = bits(algo).clone()\n"
+        "with warnings.catch_warnings(record=True) as seen:\n"
+        "    assert not algo.compile(B)\n"
+        "assert [str(w.message) for w in seen if 'not compiled' in str(w.message)], seen\n"
+        "assert torch.equal(bits(algo), before)\n"
+        "algo.update(in_si(make_batch()))\n"
+        "assert not torch.equal(bits(algo), before)\n"
+    )
+    here = {"CXX": str(tmp_path / "none"), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, env=os.environ | here, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("kind", [DDPG, TD3])

@@ -7,12 +7,16 @@ import shlex
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from conftest import REAL, ROOT
+
+from r2s.engines.gazebo import RELEASES
 
 TOY = ["+experiment=toy"]
 
@@ -226,6 +230,8 @@ MISTAKES = {
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
     "stage=compare runs=nowhere/*": r"nothing matches 'nowhere/\*'",
     "budget.minutes=null": r"budget",
+    "device=tpu": r"device: 'tpu' is not allowed; cpu and cuda are",
+    "matmul=low": r"matmul: 'low' is not allowed; medium, high and highest are",
     "friction.phi1=[1,2]": r"friction.phi1: 2 values for the 7 joints",
 }
 
@@ -270,6 +276,32 @@ def test_mistake_gets_one_line(mistake, recording, tmp_path):
     assert len(lines) == 1, done.stderr
     assert re.search(MISTAKES[mistake], lines[0])
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_gets_one_line(tmp_path):
+    done = r2s("device=cuda", f"root={tmp_path}")
+    assert done.returncode == 2
+    assert done.stderr.strip() == "error: device: cuda is not there; torch sees no GPU, device=cpu works"
+
+
+@pytest.mark.skipif(any(find_spec(name.split(".")[0]) for name in RELEASES), reason="Gazebo is here")
+def test_a_missing_gazebo_gets_one_line(trained, tmp_path):
+    done = r2s("stage=transfer", f"policy={trained}", "simulator=gazebo", "arm=none", f"root={tmp_path / 'runs'}")
+    assert done.returncode == 2
+    assert re.fullmatch(
+        r"error: simulator=gazebo: gz-sim's Python bindings .* are not installed.*", done.stderr.strip()
+    )
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_same_policy_in_dart(trained, root):
+    """DART and MuJoCo agree on every measure, and the summary says how far apart the hands were."""
+    succeed("stage=transfer", f"policy={trained}", "simulator=dart", "arm=none", "name=dart", f"root={root}", *TOY)
+    rows = json.loads((root / "transfer" / "dart" / "summary.json").read_text())
+    assert set(rows) == {"mujoco", "dart"}
+    assert rows["dart"]["ee_path_rmse_mm"] < 3.0
+    assert rows["dart"]["return_paper"] == pytest.approx(rows["mujoco"]["return_paper"], abs=1.0)
 
 
 def test_help_does_not_import_torch():

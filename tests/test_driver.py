@@ -9,11 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.actuation import Actuation, SoftLimits
+from r2s.arm.deploy import reach
 from r2s.arm.driver import DEADLINE_S, Driver
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.simulated import SimulatedArm
 from r2s.env import Task
+from r2s.evaluate import fixed_episodes
 from r2s.parameters import nominal_dynamics
+from r2s.policy import make_policy
 from r2s.robot import SIM_DT, load_robot
 
 PANDA = load_robot(**conf("robot/panda"))
@@ -167,3 +170,17 @@ def test_limits_push_back_and_stop():
     driver(state_of(PANDA.q_home, 0.97 * PANDA.dq_max * np.eye(7)[4], tau), np.zeros(7))
     assert driver.stopping is not None
     assert "joint 5" in driver.stopping
+
+
+def test_timing_counts_every_cycle():
+    """Two episodes of 0.2 s: 10 policy steps, 200 commands and 199 periods each."""
+    task = replace(TASK, episode_s=0.2)
+    dynamics = nominal_dynamics(PANDA, **conf("friction/paper"))
+    arm = SimulatedArm(PANDA, dynamics, position_noise=0.0, velocity_noise=0.0)
+    starts, goals = fixed_episodes(PANDA, task, 2)
+    policy = make_policy(PANDA, task, (8,))
+    episodes, stops, timing = reach(policy, arm, task, starts, goals)
+    assert stops == []
+    assert episodes.q.shape == (2, 10, 7)
+    assert [row["count"] for row in timing.table()] == [20, 400, 398]
+    assert all(0 < row["median_ms"] <= row["p99_ms"] <= row["max_ms"] for row in timing.table())

@@ -1,6 +1,8 @@
 """A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz."""
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,6 +12,29 @@ from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.env import Task, observe
 from r2s.evaluate import Acts, Episodes, Kinematics
+
+
+@dataclass
+class Timing:
+    """How long things took on the clock of this computer, s; in lock-step only what we do ourselves has a meaning.
+
+    Attributes:
+        policy: observing and asking the policy, once per control step. driver: working out one command.
+        period: from one command to the next.
+    """
+
+    policy: list[float] = field(default_factory=list)
+    driver: list[float] = field(default_factory=list)
+    period: list[float] = field(default_factory=list)
+
+    def table(self) -> list[dict[str, float | str]]:
+        """Return one row each: count, median, 99 % and largest, ms."""
+        rows: list[dict[str, float | str]] = []
+        for name in ("policy", "driver", "period"):
+            x = 1e3 * np.array(getattr(self, name) or [np.nan])
+            row = {"median_ms": np.median(x), "p99_ms": np.percentile(x, 99), "max_ms": x.max()}
+            rows.append({"what": name, "count": len(x)} | {k: float(v) for k, v in row.items()})
+        return rows
 
 
 @torch.no_grad()
@@ -22,8 +47,8 @@ def reach(
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     soft_start_s: float = 0.0,
-) -> tuple[Episodes, list[str]]:
-    """Run one episode per goal; return them as measured by the arm, and why an arm stopped, where it did.
+) -> tuple[Episodes, list[str], Timing]:
+    """Run one episode per goal; return them as the arm measured them, why it stopped, where it did, and the timing.
 
     An episode that the arm stopped keeps its last state: it did not reach.
 
@@ -39,6 +64,7 @@ def reach(
     kinematics = Kinematics(robot)
     torque = task.torque(robot)
     driver = Driver(robot, torque, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
+    timing, clock = Timing(), time.perf_counter
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
@@ -52,9 +78,10 @@ def reach(
             stops.append(f"episode {e + 1}, on the way to its start: {stop}")
         place, jacobian = kinematics(state.q)
         distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
-        before = state.dq
+        before, sent = state.dq, 0.0
         for k in range(task.steps):
             if not stopped:
+                asked = clock()
                 seen = observe(
                     state.q[None],
                     state.dq[None],
@@ -64,9 +91,17 @@ def reach(
                     driver.effort[None] / torque,
                 )
                 action = policy.action(torch.from_numpy(seen))[0].numpy().astype(np.float64)
+                timing.policy.append(clock() - asked)
                 try:
                     for ms in range(task.substeps):
-                        arm.command(driver(state, action * torque if ms == 0 else None))
+                        began = clock()
+                        wanted = driver(state, action * torque if ms == 0 else None)
+                        now = clock()
+                        timing.driver.append(now - began)
+                        if sent:
+                            timing.period.append(now - sent)
+                        sent = now
+                        arm.command(wanted)
                         state = arm.read()
                         if driver.done:
                             raise ArmStopped(driver.stopping)
@@ -85,4 +120,5 @@ def reach(
         arm.stop()
         progress(e + 1, count)
     t = (1 + np.arange(task.steps)) / task.ctrl_hz
-    return Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward), stops
+    episodes = Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward)
+    return episodes, stops, timing

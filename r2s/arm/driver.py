@@ -13,11 +13,11 @@ from r2s.robot import SIM_DT, Robot
 
 DEADLINE_S = 0.05  # without a fresh finite target: then the arm is damped, and stopped when it rests
 DAMP_S = 0.5  # at most
-FREE = 0.75  # of the speed that is allowed: above, joints are braked and the policy loses authority
+FREE = 0.65  # of the speed that is allowed: above, joints are braked and the policy loses authority
 WALL_DDQ = 0.35  # of ddq_max, the deceleration that a way to a position limit is judged by
 WALL_Q = 0.05  # rad within the position limits, where the allowed speed has come down to nothing
 WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears
-AHEAD_S = 0.03  # that speeds are judged ahead, by accelerations below
+AHEAD_S = 0.035  # that speeds are judged ahead, by accelerations below
 AHEAD_HZ = 60.0
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # of the velocity limits

@@ -1,0 +1,132 @@
+"""Four algorithms at equal wall-clock: DDPG, TD3, SAC and TQC, five seeds each, one thread per training.
+
+`python benchmarks/algorithms.py trials` trains each algorithm with each of TRIALS on the tuning seed and prints what
+came out; the winners are in conf/algo. `python benchmarks/algorithms.py` trains 4 x 5 of the committed defaults and
+TQC under reward=paper beside them, as many at once as there are cores, and writes docs/algorithms.md with its figure.
+Both run only what is missing, so they can be stopped. Run folders: runs/train/{trial,algo}_*.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from common import MACHINE, ROOT
+
+from r2s.comparison import groups, improvement_table, read_runs, summary_table
+from r2s.report import scores_rows
+
+ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
+SEEDS = range(20, 25)
+TRIAL_MINUTES = 2.0
+TUNING_SEED = 50
+MINUTES = 3.5
+TRIALS = {"algo.lr": ("5e-4", "1e-3")}  # the same for each algorithm
+MARKS = {
+    "95 % < 2 cm": ("success_2cm", 0.95),
+    "98 % < 1 cm": ("success_1cm", 0.98),
+    "95 % < 5 mm": ("success_5mm", 0.95),
+}
+
+
+def sweep(name: str, *words: str, minutes: float = MINUTES) -> None:
+    """Train what is missing of a sweep, one thread and one process per job; `name` may use ${...}."""
+    shared = [f"name={name}", "only_missing=true", "threads=1", f"budget.minutes={minutes}", "hydra/launcher=joblib"]
+    subprocess.run([sys.executable, "run.py", "-m", *words, *shared], cwd=ROOT, check=True)
+
+
+def trials() -> None:
+    """Try every setting on every algorithm, on a seed that is not compared later."""
+    key, values = next(iter(TRIALS.items()))
+    words = [f"algo={','.join(ALGORITHMS)}", f"{key}={','.join(values)}", f"seed={TUNING_SEED}"]
+    sweep("trial_${algo.name}_${" + key + "}", *words, minutes=TRIAL_MINUTES)
+    for folder in sorted((ROOT / "runs" / "train").glob("trial_*")):
+        last = json.loads((folder / "summary.json").read_text())["last"]
+        print(f"{folder.name:24} {100 * last['success_1cm']:5.1f} % < 1 cm, return {last['return_paper']:.1f}")
+
+
+def reached(runs: list, measure: str, level: float) -> str:
+    """Return the median over seeds of the minutes until an evaluation first had `level`; "-": most seeds never."""
+    minutes = []
+    for run in runs:
+        there = run.curve[run.curve[measure] >= level]
+        minutes.append(there["wall_clock_s"].iloc[0] / 60 if len(there) else np.inf)
+    middle = float(np.median(minutes))
+    return f"{middle:.1f}" if np.isfinite(middle) else "-"
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table of strings as markdown, the index first."""
+    head = [str(table.index.name or ""), *map(str, table.columns)]
+    lines = [
+        head,
+        ["---"] * len(head),
+        *([str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)),
+    ]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def ranking(table: pd.DataFrame, measure: str) -> str:
+    """Return the algorithms from best to worst, and how sure each step is."""
+    p = {(r["better"], r["than"]): r for r in table.to_dict("records") if r["measure"] == measure}
+    names = sorted({a for a, _ in p})
+    score = {a: sum(p[a, b]["probability"] for b in names if b != a) for a in names}
+    order = sorted(names, key=lambda a: -score[a])
+    steps = []
+    for a, b in pairwise(order):
+        r = p[a, b]
+        steps.append(f"{a} over {b}: {r['probability']:.2f} [{r['low']:.2f}, {r['high']:.2f}]")
+    return f"**{' > '.join(order)}** ({'; '.join(steps)})"
+
+
+def main() -> None:
+    """Train, compare, write the page."""
+    seeds = ",".join(map(str, SEEDS))
+    sweep("algo_${algo.name}_${seed}", f"algo={','.join(ALGORITHMS)}", f"seed={seeds}")
+    sweep("algo_paper_${seed}", "algo=tqc", "reward=paper", f"seed={seeds.split(',')[0]},{seeds.split(',')[1]}")
+    train = ROOT / "runs" / "train"
+    folders = [str(train / f"algo_{a}_{s}") for a in ALGORITHMS for s in SEEDS]
+    paper = [str(p) for p in sorted(train.glob("algo_paper_*"))]
+    name = "name=algorithms"
+    shutil.rmtree(ROOT / "runs" / "compare" / "algorithms", ignore_errors=True)
+    subprocess.run([sys.executable, "run.py", "stage=compare", "runs=runs/train/algo_*", name], cwd=ROOT, check=True)
+    shutil.copy(ROOT / "runs/compare/algorithms/figures/learning.png", ROOT / "docs/algorithms.png")
+    by_algorithm = {g[0].algo: g for g in groups(read_runs(folders)).values()}
+    by_reward = {"tqc, reward=paper": read_runs(paper)}
+    times = {
+        label: {mark: reached(runs, *what) for mark, what in MARKS.items()}
+        for label, runs in (by_algorithm | by_reward).items()
+    }
+    better = improvement_table(by_algorithm)
+    updates = {a: {"updates": f"{np.median([r.last['updates'] for r in g]):,.0f}"} for a, g in by_algorithm.items()}
+    scores = scores_rows(summary_table(by_algorithm | by_reward)).join(
+        pd.DataFrame.from_dict(updates, orient="index")
+    )
+    key, values = next(iter(TRIALS.items()))
+    pages = [
+        "# Four algorithms at equal wall-clock",
+        f"`python benchmarks/algorithms.py` on {MACHINE}: {len(SEEDS)} seeds each, {MINUTES:g} minutes of wall clock "
+        "and one thread per training, two trainings at a time. dr=paper, 200 goals, success held for the last 0.5 s; "
+        "last evaluation, interquartile mean over seeds with a 95 % bootstrap interval. Networks, replay, curriculum "
+        "and evaluation are shared; each algorithm has the settings of conf/algo, the better of "
+        f"{len(values)} trials of "
+        f"{TRIAL_MINUTES:g} minutes ({key} in {', '.join(values)}; seed {TUNING_SEED}).",
+        markdown(scores.rename_axis("success within, %").fillna("")),
+        "Minutes until an evaluation first got there, median over seeds:",
+        markdown(pd.DataFrame.from_dict(times, orient="index").rename_axis("")),
+        "![learning curves](algorithms.png)",
+        "## Does the paper's ranking hold?",
+        "The paper finds TQC best. Here, by the probability that a run of the one is better than a run of the other, "
+        "with a 95 % interval:",
+        f"- by success within 1 cm: {ranking(better, 'success_1cm')}",
+        f"- by the return under eq. (2): {ranking(better, 'return_paper')}",
+    ]
+    (ROOT / "docs" / "algorithms.md").write_text("\n\n".join(pages).replace("eq. (2):\n\n-", "eq. (2):\n-") + "\n")
+    print("written: docs/algorithms.md")
+
+
+if __name__ == "__main__":
+    trials() if sys.argv[1:] == ["trials"] else main()
