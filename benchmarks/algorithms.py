@@ -95,7 +95,7 @@ def main() -> None:
     subprocess.run([sys.executable, "run.py", "stage=compare", "runs=runs/train/algo_*", name], cwd=ROOT, check=True)
     shutil.copy(ROOT / "runs/compare/algorithms/figures/learning.png", ROOT / "docs/algorithms.png")
     by_algorithm = {g[0].algo: g for g in groups(read_runs(folders)).values()}
-    by_reward = {"tqc, reward=paper": read_runs(paper)}
+    by_reward = {"tqc, reward=paper": read_runs(paper)} if paper else {}
     times = {
         label: {mark: reached(runs, *what) for mark, what in MARKS.items()}
         for label, runs in (by_algorithm | by_reward).items()

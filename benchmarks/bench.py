@@ -165,7 +165,9 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
 class Sb3:
     """sb3-contrib's TQC in its own virtual environment, runs/bench/sb3, made at the first use."""
 
-    def __init__(self) -> None:
+    @staticmethod
+    def python() -> Path:
+        """Return the interpreter of that environment; make it where it is missing."""
         folder = ROOT / "runs" / "bench" / "sb3"
         python = folder / "bin" / "python"
         if not (folder / ".ready").is_file():
@@ -174,7 +176,10 @@ class Sb3:
             pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
             subprocess.run([*pip, f"torch=={torch.__version__.split('+')[0]}", "sb3-contrib==2.9.2"], check=True)
             (folder / ".ready").touch()
-        worker = [str(python), str(ROOT / "benchmarks" / "sb3_worker.py")]
+        return python
+
+    def __init__(self) -> None:
+        worker = [str(self.python()), str(ROOT / "benchmarks" / "sb3_worker.py")]
         self._process = subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
         assert self._process.stdout is not None
         assert self._process.stdout.readline().strip() == "ready"

@@ -33,7 +33,7 @@ class SAC(EntropyLearner):
         n_critics: int = 2,
         gamma: float = 0.95,
         tau: float = 0.01,
-        lr: float = 1e-3,
+        lr: float = 5e-4,
         alpha_init: float = 0.01,
         target_entropy: float | None = None,
         action_l2: float = 0.0,
