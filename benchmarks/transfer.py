@@ -2,7 +2,9 @@
 
 Parts, each run by its name and each doing only what is missing; without a name docs/transfer.md is written from what
 is there:
-    python benchmarks/transfer.py twins [SEED ...]    identify, train, transfer (judging seeds 100-109 by default)
+    python benchmarks/transfer.py twins [SEED ...]    identify, train, transfer: identified + DR and nominal without,
+                                                      one training seed (judging seeds 100-109 by default)
+    python benchmarks/transfer.py ablation [SEED ...] the same for all five conditions and three training seeds
     python benchmarks/transfer.py engines POLICY      the policy in MuJoCo and in DART, 200 goals
     python benchmarks/transfer.py clients POLICY      20 episodes through panda-python and through pylibfranka,
                                                       lock-step twice and in real time, against our emulator
@@ -23,7 +25,7 @@ from common import MACHINE, ROOT
 
 RUNS = ROOT / "runs"
 SEEDS = range(100, 110)
-TRAININGS = (0,)  # training seeds
+TRAININGS = (0, 1, 2)  # training seeds of the ablation; the first alone otherwise
 MINUTES = 4.0
 NOMINAL = ("friction=gaz2019", "inertia=nominal")
 CONDITIONS = {  # label: (model, dr)
@@ -57,7 +59,8 @@ def side_by_side(jobs: Sequence[Sequence[str]]) -> None:
         while waiting and len(running) < (os.cpu_count() or 1):
             command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "only_missing=true"]
             running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
-        running.pop(0).wait()
+        if (first := running.pop(0)).wait():
+            sys.exit(f"failed: {' '.join(map(str, first.args))}")
 
 
 def trained(seed: int, label: str, k: int) -> str:
@@ -66,7 +69,7 @@ def trained(seed: int, label: str, k: int) -> str:
     return f"judge_nominal_{dr}_{k}" if model == "nominal" else f"judge_{seed}_{dr}_{k}"
 
 
-def twins(seeds: Sequence[int], labels: Sequence[str]) -> None:
+def twins(seeds: Sequence[int], labels: Sequence[str], trainings: Sequence[int]) -> None:
     """Identify each twin, train under each condition, take every policy to its twin."""
     for seed in seeds:
         run("stage=identify", f"arm.seed={seed}", f"name=judge_{seed}", "only_missing=true")
@@ -75,7 +78,7 @@ def twins(seeds: Sequence[int], labels: Sequence[str]) -> None:
         model, dr = CONDITIONS[label]
         for seed in seeds:
             found = NOMINAL if model == "nominal" else (f"calibration=runs/identify/judge_{seed}",)
-            for k in TRAININGS:
+            for k in trainings:
                 name = trained(seed, label, k)
                 budget = f"budget.minutes={MINUTES}"
                 jobs[name] = [f"name={name}", f"dr={dr}", f"seed={k}", budget, *found]
@@ -90,7 +93,7 @@ def twins(seeds: Sequence[int], labels: Sequence[str]) -> None:
             ]
             for label in labels
             for seed in seeds
-            for k in TRAININGS
+            for k in trainings
         ]
     )
 
@@ -213,9 +216,11 @@ def main() -> None:
 
 if __name__ == "__main__":
     part, *words = sys.argv[1:] or ["page"]
-    if part == "twins":
-        labels = ["identified, dr=identified", "nominal, no DR"]
-        twins([int(w) for w in words] or list(SEEDS), labels)
+    if part in ("twins", "ablation"):
+        seeds = [int(w) for w in words] or list(SEEDS)
+        whole = part == "ablation"
+        labels = list(CONDITIONS) if whole else ["identified, dr=identified", "nominal, no DR"]
+        twins(seeds, labels, TRAININGS if whole else TRAININGS[:1])
     elif part == "engines":
         engines(*words)
     elif part == "clients":

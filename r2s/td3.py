@@ -93,7 +93,7 @@ class TD3(Learner):
         due = self.updates % self.policy_delay == 0  # the first update is: every row of a log has a loss to show
         if due:
             actor = self._actor_loss(batch)
-            self.last_actor_loss = actor.detach()
+            self.last_actor_loss = actor.detach().clone()  # a captured graph writes over its outputs
             loss = critic + actor
         self.descend(loss)
         if due:
