@@ -68,7 +68,7 @@ def make_arm(cfg, robot):
     if name == "twin":
         from r2s.arm.twin import Twin
 
-        return Twin(robot, arm.seed)
+        return Twin(robot, arm.seed, arm.payload)
     if name == "none":
         raise UserError("arm: none cannot be commanded; allowed: twin, panda_emulated, fr3_emulated, panda, fr3")
     from r2s.arm.fr3 import FR3

@@ -1,8 +1,8 @@
 """How far TQC gets in 4, 8 and 12 minutes on all cores, dr=paper, five seeds one after the other.
 
-`python benchmarks/minutes.py` trains what is missing (five times twelve minutes with reward=long, five times four with
-the default) and writes docs/minutes.md: the last evaluation before each mark, and the median of the seeds. The run
-folders are runs/train/minutes_*.
+`python benchmarks/minutes.py` trains what is missing (five times twelve minutes with reward=long, five times four
+with the default) and writes docs/minutes.md: the last evaluation before each mark, and the median of the seeds. Run
+folders: runs/train/minutes_*.
 """
 
 import subprocess

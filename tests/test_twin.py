@@ -10,6 +10,7 @@ from r2s.arm.interface import Arm, ArmStopped
 from r2s.arm.record import record
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
+from r2s.evaluate import Kinematics
 from r2s.excitation import Excitation, check_limits, fourier
 from r2s.robot import load_robot
 
@@ -231,3 +232,22 @@ def test_excitation_refuses_what_cannot_be():
         fourier(panda(), duration=0.1, seed=0)
     with pytest.raises(UserError, match="above the base plane"):
         fourier(panda(), duration=5.0, seed=0, z_min=2.0)
+
+
+def test_a_payload_pulls_the_hand_down():
+    """Friction holds the bare arm; 1 kg that nobody told it of does not stay up."""
+    drop = {}
+    for payload in (0.0, 1.0):
+        twin = Twin(panda(), 0, payload)
+        begin = twin.move_to(panda().q_home)
+        for _ in range(200):
+            twin.command(np.zeros(7))
+        where = Kinematics(panda())
+        drop[payload] = where(begin.q)[0][2] - where(twin.read().q)[0][2]
+    assert abs(drop[0.0]) < 2e-3
+    assert drop[1.0] > 0.01
+
+
+def test_a_wrong_payload_is_said():
+    with pytest.raises(UserError, match=r"arm.payload: -1.0 is not allowed"):
+        Twin(panda(), 0, -1.0)

@@ -19,6 +19,8 @@ from numba import njit
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.engines.dart import DartEngine
+from r2s.engines.description import Links
+from r2s.errors import UserError
 from r2s.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
@@ -41,20 +43,29 @@ class Twin:
     stream of its own for each episode: the k-th episode of a twin has the same noise whatever the episodes
     before it did, so an evaluation on a fresh twin is reproducible. Time and bristles restart too; the robot
     drawn stays.
+
+    Args:
+        robot: what it is believed to be. seed: of the robot drawn around that.
+        payload: kg in the hand, a point mass that the gravity compensation does not know of.
+
+    Raises:
+        UserError: a payload that is negative or not finite.
     """
 
-    def __init__(self, robot: Robot, seed: int):
+    def __init__(self, robot: Robot, seed: int, payload: float = 0.0):
+        if not (np.isfinite(payload) and payload >= 0.0):
+            raise UserError(f"arm.payload: {payload!r} is not allowed; kg from 0 on are")
         self.robot = robot
         self._seed = int(seed)
         rng = np.random.default_rng([self._seed, 0])
-        masses, coms, inertias = _draw_links(robot, rng)
-        self._engine = DartEngine(
-            robot, gravity=True, masses=masses, coms=coms, inertias=inertias, stop_margin=STOP_MARGIN
-        )
+        links = _draw_links(robot, rng)
+        self._engine = _engine(robot, links)
         self._nominal = DartEngine(robot, gravity=True)
         at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
         inertia = 1 / np.diag(np.linalg.inv(self._nominal.mass_matrix(robot.q_home)))
         self._hidden = _draw_joints(robot, rng, inertia, at_home[0] - at_home[1])
+        if payload:
+            self._engine = _engine(robot, _carry(robot, payload, *links))
         delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles
         lag = rng.uniform(1e-3, 3e-3)  # s
         filter_hz = rng.uniform(60.0, 120.0)
@@ -152,6 +163,28 @@ def _draw_links(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.
     coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
     scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
     return masses, coms, robot.inertia * scale[:, None, None]
+
+
+def _engine(robot: Robot, links: tuple[np.ndarray, np.ndarray, np.ndarray]) -> DartEngine:
+    masses, coms, inertias = links
+    return DartEngine(robot, gravity=True, masses=masses, coms=coms, inertias=inertias, stop_margin=STOP_MARGIN)
+
+
+def _carry(
+    robot: Robot, payload: float, masses: np.ndarray, coms: np.ndarray, inertias: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the links with a point mass of `payload` kg at the end effector."""
+    model = robot.model(gravity=True)
+    site = model.site(robot.ee_site).id
+    _, pose = Links(model).moving_parent(model.site_bodyid[site])
+    hand = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
+    total = masses[-1] + payload
+    centre = (masses[-1] * coms[-1] + payload * hand) / total
+    arms = (masses[-1], coms[-1] - centre), (payload, hand - centre)
+    added = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
+    last = np.arange(robot.n) == robot.n - 1
+    inertias = inertias + np.where(last[:, None, None], added, 0.0)
+    return np.where(last, total, masses), np.where(last[:, None], centre, coms), inertias
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
