@@ -29,6 +29,7 @@ ROOT = Path(__file__).parent.parent
 QUICK = [
     "root=runs",
     "threads=1",
+    "compile=false",
     "budget.minutes=null",
     "evaluation.episodes=4",
     "algo.hidden=[32,32]",
