@@ -2,8 +2,8 @@
 
 Parts, each run by its name and each doing only what is missing; without a name docs/transfer.md is written from what
 is there:
-    python benchmarks/transfer.py twins [SEED ...]    identify, train, transfer: identified + DR and nominal without,
-                                                      one training seed (judging seeds 100-109 by default)
+    python benchmarks/transfer.py twins [SEED ...]    identify, train, transfer: identified + DR and nominal with and
+                                                      without, one training seed (100-109 by default)
     python benchmarks/transfer.py ablation [SEED ...] the same for all five conditions and three training seeds
     python benchmarks/transfer.py engines POLICY      the policy in MuJoCo and in DART, 200 goals
     python benchmarks/transfer.py clients POLICY      20 episodes through panda-python and through pylibfranka,
@@ -26,7 +26,7 @@ from common import MACHINE, ROOT
 RUNS = ROOT / "runs"
 SEEDS = range(100, 110)
 TRAININGS = (0, 1, 2)  # training seeds of the ablation; the first alone otherwise
-MINUTES = 4.0
+MINUTES = 5.0
 NOMINAL = ("friction=gaz2019", "inertia=nominal")
 CONDITIONS = {  # label: (model, dr)
     "nominal, no DR": ("nominal", "none"),
@@ -71,8 +71,7 @@ def trained(seed: int, label: str, k: int) -> str:
 
 def twins(seeds: Sequence[int], labels: Sequence[str], trainings: Sequence[int]) -> None:
     """Identify each twin, train under each condition, take every policy to its twin."""
-    for seed in seeds:
-        run("stage=identify", f"arm.seed={seed}", f"name=judge_{seed}", "only_missing=true")
+    side_by_side([["stage=identify", f"arm.seed={seed}", f"name=judge_{seed}"] for seed in seeds])
     jobs = {}
     for label in labels:
         model, dr = CONDITIONS[label]
@@ -219,7 +218,7 @@ if __name__ == "__main__":
     if part in ("twins", "ablation"):
         seeds = [int(w) for w in words] or list(SEEDS)
         whole = part == "ablation"
-        labels = list(CONDITIONS) if whole else ["identified, dr=identified", "nominal, no DR"]
+        labels = list(CONDITIONS) if whole else ["identified, dr=identified", "nominal, no DR", "nominal, dr=paper"]
         twins(seeds, labels, TRAININGS if whole else TRAININGS[:1])
     elif part == "engines":
         engines(*words)

@@ -7,6 +7,7 @@ minutes make the curriculum follow the clock.
 
 import copy
 import ctypes
+import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -107,6 +108,7 @@ def train(
         FloatingPointError: an action, observation, reward or loss is not finite.
     """
     keep_memory()
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every storage it makes
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
     device = algo.torque.device
     if compile:

@@ -8,15 +8,19 @@ function of states and targets, and the tests give it a million hostile ones.
 import numpy as np
 
 from r2s.actuation import Actuation, SoftLimits, low_pass_gain
-from r2s.arm.interface import ArmState, felt_inertia
+from r2s.arm.interface import ArmState, InverseInertia
 from r2s.robot import SIM_DT, Robot
 
 DEADLINE_S = 0.05  # without a fresh finite target: then the arm is damped, and stopped when it rests
 DAMP_S = 0.5  # at most
+ALLOWED = 0.92  # of the velocity limits: how fast joints may go at all
 FREE = 0.65  # of the speed that is allowed: above, joints are braked and the policy loses authority
 WALL_DDQ = 0.35  # of ddq_max, the deceleration that a way to a position limit is judged by
 WALL_Q = 0.05  # rad within the position limits, where the allowed speed has come down to nothing
-WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears
+WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears, for what the posture weighs
+PUSH_S = 0.04  # for which a target must not make a heavy joint faster than is allowed: a stretched arm is light
+HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here
+POSTURE = 8  # cycles between two looks at what the posture weighs
 AHEAD_S = 0.035  # that speeds are judged ahead, by accelerations below
 AHEAD_HZ = 60.0
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
@@ -43,7 +47,9 @@ class Driver:
         self._step = robot.dtau_max * SIM_DT
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
         self._fast = DQ_INSIDE * robot.dq_max
-        self._damping = WALL_RATE * felt_inertia(robot, robot.q_home)
+        self._inverse_inertia = InverseInertia(robot)
+        self._home = 1 / np.diag(self._inverse_inertia(robot.q_home))
+        self._heavy = self._home >= HEAVY * self._home.max()
         self.reset()
 
     def reset(self) -> None:
@@ -52,6 +58,7 @@ class Driver:
         self._target, self._ddq = np.zeros(self.robot.n), np.zeros(self.robot.n)
         self._dq: np.ndarray | None = None
         self._cycle, self._silent, self._damped = 0, 0, 0
+        self._weighed: int | None = None
         self.stopping: str | None = None
 
     @property
@@ -73,6 +80,9 @@ class Driver:
         """
         self._cycle += 1
         seen = bool(np.isfinite(state.q).all() and np.isfinite(state.dq).all())
+        if seen and (self._weighed is None or self._cycle - self._weighed >= POSTURE):
+            self._weighed, self._mobility = self._cycle, self._inverse_inertia(state.q)
+            self._damping = WALL_RATE * np.minimum(1 / np.diag(self._mobility), self._home)
         if target is not None and np.isfinite(target).all():
             self._target = np.clip(target, -self._torque, self._torque)
             self._silent = 0
@@ -88,6 +98,8 @@ class Driver:
         else:
             fade = self._cycle / self._fade if self._cycle < self._fade else 1.0
             wanted = wanted * (fade * self._authority(state.q, soon))
+            if seen:
+                wanted = wanted * self._room(state, wanted)
         wanted = self._actuation(wanted[None], 1)[0, 0]
         if seen:
             wanted = wanted + self._soft(state.q, state.dq) + self._wall(state.q, soon)
@@ -106,7 +118,8 @@ class Driver:
         r, brake = self.robot, 2 * WALL_DDQ * self.robot.ddq_max
         up = np.sqrt(brake * np.maximum(r.q_max - WALL_Q - q, 0.0))
         down = np.sqrt(brake * np.maximum(q - r.q_min - WALL_Q, 0.0))
-        return np.minimum(r.dq_max, up), np.minimum(r.dq_max, down)
+        most = ALLOWED * r.dq_max
+        return np.minimum(most, up), np.minimum(most, down)
 
     def _authority(self, q: np.ndarray, dq: np.ndarray) -> float:
         """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
@@ -116,6 +129,18 @@ class Driver:
         up, down = self._bounds(q)
         near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
         return float(np.clip((1.0 - near) / (1.0 - FREE), 0.0, 1.0)) if np.isfinite(near) else 0.0
+
+    def _room(self, state: ArmState, wanted: np.ndarray) -> float:
+        """Return the share of `wanted` (n,) Nm that in PUSH_S makes no heavy joint faster than is allowed.
+
+        Speeds tell too late where the arm is light: with joints 1 and 3 in line, 10 Nm turn the elbow from rest to
+        its limit within 10 ms, twice the delay of an arm.
+        """
+        up, down = self._bounds(state.q)
+        gain = PUSH_S * (self._mobility @ wanted)
+        left = np.where(gain > 0, up - state.dq, down + state.dq)
+        share = np.maximum(left, 0.0) / np.maximum(np.abs(gain), 1e-9)
+        return float(min(1.0, share[self._heavy].min()))
 
     def _wall(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
         """Return (n,) Nm that brakes what is too fast, for where it is; anything, when the motion is to end."""

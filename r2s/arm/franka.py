@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from r2s.arm import fci
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes, felt_inertia
+from r2s.arm.interface import ArmState, ArmStopped, InverseInertia, Reflexes
 from r2s.arm.record import Tracker
 from r2s.errors import UserError
 from r2s.excitation import Excitation
@@ -82,7 +82,7 @@ class Franka:
             raise UserError(f"a Franka arm has 7 joints; {robot.name} has {robot.n}")
         self.robot = robot
         self._client, self._clear = client, clear
-        self._reflexes = Reflexes(robot)
+        self._reflexes, self._inverse = Reflexes(robot), InverseInertia(robot)
         self._moving, self._closed = False, False
         self._stopped: str | None = "no motion was started; call move_to first"
         self._rest()
@@ -219,7 +219,7 @@ class Franka:
 
     def _damp(self) -> None:
         """Take speed out, and torque back, before the arm's own controller takes over."""
-        gain = REST_RATE * felt_inertia(self.robot, self._state.q)
+        gain = REST_RATE / np.diag(self._inverse(self._state.q))
         most, step = REST_SHARE * self.robot.tau_max, RATE_SHARE * self.robot.dtau_max * SIM_DT
         for _ in range(round(REST_S / SIM_DT)):
             s = self._state

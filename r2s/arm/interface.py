@@ -107,12 +107,22 @@ class Reflexes:
         raise ArmStopped(f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, allowed +-{r.dq_max[i]:g} rad/s")
 
 
-def felt_inertia(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return (n,) kg m^2, what each joint feels with the others free, by the nominal model."""
-    model = robot.model(gravity=False)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
-    mujoco.mj_forward(model, data)
-    mass = np.empty((robot.n, robot.n))
-    mujoco.mj_fullM(model, data, mass)
-    return 1 / np.diag(np.linalg.inv(mass))
+class InverseInertia:
+    """How torques accelerate the joints of an arm at rest, by the nominal model.
+
+    1 over its diagonal is the inertia that each joint feels with the others free.
+    """
+
+    def __init__(self, robot: Robot):
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._mass = np.empty((robot.n, robot.n))
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        """Return M^-1 (n, n), 1/(kg m^2), at q (n,) rad."""
+        self._data.qpos[:] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_crb(self._model, self._data)
+        mujoco.mj_fullM(self._model, self._data, self._mass)
+        return np.linalg.inv(self._mass)
