@@ -5,6 +5,8 @@ limits -> clip -> rate limit, last, against what the arm applied last. No clock 
 function of states and targets, and the tests give it a million hostile ones.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from r2s.actuation import Actuation, SoftLimits, low_pass_gain
@@ -21,7 +23,7 @@ WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears, f
 PUSH_S = 0.04  # for which a target must not make a heavy joint faster than is allowed: a stretched arm is light
 HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here
 POSTURE = 8  # cycles between two looks at what the posture weighs
-AHEAD_S = 0.035  # that speeds are judged ahead, by accelerations below
+AHEAD_S = 0.035  # at home, that speeds are judged ahead, by accelerations below
 AHEAD_HZ = 60.0
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # of the velocity limits
@@ -47,6 +49,7 @@ class Driver:
         self._step = robot.dtau_max * SIM_DT
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
         self._fast = DQ_INSIDE * robot.dq_max
+        self._dq_gain, self._weight = self._soft.dq_gain, np.ones(robot.n)
         self._inverse_inertia = InverseInertia(robot)
         self._home = 1 / np.diag(self._inverse_inertia(robot.q_home))
         self._heavy = self._home >= HEAVY * self._home.max()
@@ -81,8 +84,7 @@ class Driver:
         self._cycle += 1
         seen = bool(np.isfinite(state.q).all() and np.isfinite(state.dq).all())
         if seen and (self._weighed is None or self._cycle - self._weighed >= POSTURE):
-            self._weighed, self._mobility = self._cycle, self._inverse_inertia(state.q)
-            self._damping = WALL_RATE * np.minimum(1 / np.diag(self._mobility), self._home)
+            self._weigh(state.q)
         if target is not None and np.isfinite(target).all():
             self._target = np.clip(target, -self._torque, self._torque)
             self._silent = 0
@@ -106,12 +108,22 @@ class Driver:
         wanted = np.clip(wanted, -self.robot.tau_max, self.robot.tau_max)
         return state.tau_J_d + np.clip(wanted - state.tau_J_d, -self._step, self._step)
 
+    def _weigh(self, q: np.ndarray) -> None:
+        """Let braking be as strong as the posture bears: what holds the arm at home shakes it where it is lighter."""
+        self._weighed, self._mobility = self._cycle, self._inverse_inertia(q)
+        felt = np.minimum(1 / np.diag(self._mobility), self._home)
+        self._weight, self._damping = felt / self._home, WALL_RATE * felt
+        self._soft = replace(self._soft, dq_gain=np.minimum(self._dq_gain, self._damping))
+
     def _ahead(self, dq: np.ndarray) -> np.ndarray:
-        """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms."""
+        """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms.
+
+        Less far ahead where a joint is lighter than at home: fed back late, its acceleration would shake it.
+        """
         before = dq if self._dq is None else self._dq
         self._ddq += low_pass_gain(AHEAD_HZ) * ((dq - before) / SIM_DT - self._ddq)
         self._dq = dq
-        return dq + AHEAD_S * self._ddq
+        return dq + AHEAD_S * self._weight * self._ddq
 
     def _bounds(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
