@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -38,7 +39,17 @@ def front_door(words: tuple[str, ...], out: str, err: str) -> None:
     os.environ["COLUMNS"] = "110"
     os.chdir(ROOT)
     sys.argv = ["run.py", *words]
-    runpy.run_path(str(ROOT / "run.py"), run_name="__main__")
+    try:
+        runpy.run_path(str(ROOT / "run.py"), run_name="__main__")
+        status = 0
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)  # a process of multiprocessing would wait for the workers of a sweep
 
 
 def r2s(*words: str) -> subprocess.CompletedProcess[str]:
