@@ -63,6 +63,11 @@ def side_by_side(jobs: Sequence[Sequence[str]]) -> None:
             sys.exit(f"failed: {' '.join(map(str, first.args))}")
 
 
+def short(label: str) -> str:
+    """Return a condition as it stands in the names of run folders."""
+    return label.replace(", ", "_").replace(" ", "").replace("=", "")
+
+
 def trained(seed: int, label: str, k: int) -> str:
     """Return the name of a training: the nominal model is the same for every twin."""
     model, dr = CONDITIONS[label]
@@ -88,7 +93,7 @@ def twins(seeds: Sequence[int], labels: Sequence[str], trainings: Sequence[int])
                 "stage=transfer",
                 f"policy=runs/train/{trained(seed, label, k)}",
                 f"arm.seed={seed}",
-                f"name=judge_{seed}_{label.replace(', ', '_').replace(' ', '').replace('=', '')}_{k}",
+                f"name=judge_{seed}_{short(label)}_{k}",
             ]
             for label in labels
             for seed in seeds
@@ -120,8 +125,7 @@ def twins_tables() -> list[str]:
     """Return the tables over conditions and over twins."""
     rows = []
     for label in CONDITIONS:
-        short = label.replace(", ", "_").replace(" ", "").replace("=", "")
-        for folder in (RUNS / "transfer").glob(f"judge_1??_{short}_*"):
+        for folder in (RUNS / "transfer").glob(f"judge_1??_{short(label)}_*"):
             if twin := summary(folder).get("twin"):
                 rows.append({"condition": label, "twin": int(folder.name.split("_")[1]), **twin})
     if not rows:

@@ -1,8 +1,8 @@
 """Between a policy and an arm, once a millisecond: whatever the policy says, what is sent is within the arm's rules.
 
-In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> push away from position and velocity
-limits -> clip -> rate limit, last, against what the arm applied last. No clock and no arm in here: `Driver` is a
-function of states and targets, and the tests give it a million hostile ones.
+In this order: finite -> fresh (watchdog) -> soft start -> less where joints are or would get too fast -> low-pass ->
+push away from position and velocity limits -> clip -> rate limit, last, against what the arm applied last. No clock
+and no arm in here: `Driver` is a function of states and targets, and the tests give it a million hostile ones.
 """
 
 from dataclasses import replace
@@ -91,20 +91,18 @@ class Driver:
         else:
             self._silent += 1
         self._watch(state, seen)
-        soon = self._ahead(state.dq) if seen else state.dq
         self._rests = seen and bool((np.abs(state.dq) < STILL).all())
-        wanted = self._target
+        wanted, push = np.zeros(self.robot.n), np.zeros(self.robot.n)
+        if seen:
+            bounds, soon = self._bounds(state.q), self._ahead(state.dq)
+            push = self._soft(state.q, state.dq) + self._wall(bounds, soon)
         if self.stopping is not None:
             self._damped += 1
-            wanted = np.zeros(self.robot.n)
-        else:
+        else:  # the state is seen, or the motion would be stopping
             fade = self._cycle / self._fade if self._cycle < self._fade else 1.0
-            wanted = wanted * (fade * self._authority(state.q, soon))
-            if seen:
-                wanted = wanted * self._room(state, wanted)
-        wanted = self._actuation(wanted[None], 1)[0, 0]
-        if seen:
-            wanted = wanted + self._soft(state.q, state.dq) + self._wall(state.q, soon)
+            wanted = self._target * (fade * self._authority(bounds, soon))
+            wanted = wanted * self._room(bounds, state.dq, wanted)
+        wanted = self._actuation(wanted[None], 1)[0, 0] + push
         wanted = np.clip(wanted, -self.robot.tau_max, self.robot.tau_max)
         return state.tau_J_d + np.clip(wanted - state.tau_J_d, -self._step, self._step)
 
@@ -133,32 +131,32 @@ class Driver:
         most = ALLOWED * r.dq_max
         return np.minimum(most, up), np.minimum(most, down)
 
-    def _authority(self, q: np.ndarray, dq: np.ndarray) -> float:
+    def _authority(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray) -> float:
         """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
 
         A light joint between heavy ones is thrown about by torques that are not its own.
         """
-        up, down = self._bounds(q)
+        up, down = bounds
         near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
-        return float(np.clip((1.0 - near) / (1.0 - FREE), 0.0, 1.0)) if np.isfinite(near) else 0.0
+        return float(np.clip((1.0 - near) / (1.0 - FREE), 0.0, 1.0))
 
-    def _room(self, state: ArmState, wanted: np.ndarray) -> float:
+    def _room(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray, wanted: np.ndarray) -> float:
         """Return the share of `wanted` (n,) Nm that in PUSH_S makes no heavy joint faster than is allowed.
 
         Speeds tell too late where the arm is light: with joints 1 and 3 in line, 10 Nm turn the elbow from rest to
         its limit within 10 ms, twice the delay of an arm.
         """
-        up, down = self._bounds(state.q)
+        up, down = bounds
         gain = PUSH_S * (self._mobility @ wanted)
-        left = np.where(gain > 0, up - state.dq, down + state.dq)
+        left = np.where(gain > 0, up - dq, down + dq)
         share = np.maximum(left, 0.0) / np.maximum(np.abs(gain), 1e-9)
         return float(min(1.0, share[self._heavy].min()))
 
-    def _wall(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    def _wall(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray) -> np.ndarray:
         """Return (n,) Nm that brakes what is too fast, for where it is; anything, when the motion is to end."""
         if self.stopping is not None:
             return -self._damping * dq
-        up, down = self._bounds(q)
+        up, down = bounds
         return -self._damping * (np.maximum(dq - FREE * up, 0.0) - np.maximum(-dq - FREE * down, 0.0))
 
     def _watch(self, state: ArmState, seen: bool) -> None:
