@@ -488,6 +488,7 @@ def transfer(cfg, overrides):
 
     from r2s import report, tell
     from r2s.arm.deploy import reach
+    from r2s.arm.simulated import SimulatedArm
     from r2s.engines.episodes import reach as engine_reach
     from r2s.errors import UserError, nearest
     from r2s.evaluate import fixed_episodes, gap, make_evaluation, measures
@@ -509,34 +510,41 @@ def transfer(cfg, overrides):
     engine = make_engine(cfg, robot) if cfg.simulator.name in ("dart", "gazebo") else None
     rows, episodes, timing = {}, {}, []
     stops: list[str] = []
+
+    def counted(what):
+        progress = Progress(what)
+        return progress, lambda k, n: progress(k / n, f"{k} goals")
+
     with open_run(cfg, overrides, parents=[str(source)]) as run:
+        dynamics = make_dynamics(trained, robot)
         if cfg.simulator.name != "none":
-            draw = make_draw(trained, robot, make_dynamics(trained, robot))
+            draw = make_draw(trained, robot, dynamics)
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
-            dynamics = make_dynamics(trained, robot)
-            alike = make_evaluation(robot, task, lambda rng, m: dynamics, episodes=len(goals), nthread=cfg.threads)
-            centre = alike(policy)
         if engine is not None:
-            progress = Progress(f"reach in {cfg.simulator.name}")
-            shown = lambda k, n: progress(k / n, f"{k} goals")  # noqa: E731
+            progress, shown = counted(f"reach in {cfg.simulator.name}")
             done = engine_reach(policy, engine, robot, task, draw, starts, goals, shown)
             progress.close()
-            rows[cfg.simulator.name], episodes[cfg.simulator.name] = measures(done), done
+            rows[cfg.simulator.name] = measures(done) | gap(done, episodes["mujoco"])
+            episodes[cfg.simulator.name] = done
         if cfg.arm.name != "none":
-            progress = Progress(f"reach on {cfg.arm.name}")
             arm, fade = make_arm(cfg, robot), cfg.arm.soft_start_s
-            shown = lambda k, n: progress(k / n, f"{k} goals")  # noqa: E731
+            if cfg.simulator.name != "none":  # what the model says of this arm, behind the same driver
+                progress, shown = counted("predict from the model")
+                model = SimulatedArm(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
+                done, *_ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
+                progress.close()
+                rows["predicted"], episodes["predicted"] = measures(done), done
+            progress, shown = counted(f"reach on {cfg.arm.name}")
             done, stops, cycles = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
             progress.close()
             rows[cfg.arm.name], episodes[cfg.arm.name] = measures(done) | {"stops": len(stops)}, done
+            if "predicted" in rows:
+                rows[cfg.arm.name] |= gap(done, episodes["predicted"])
             timing = cycles.table()
             for row in timing:
                 run.log("timing", row)
             (run.folder / "stops.txt").write_text("\n".join(stops) + "\n" if stops else "none\n")
-        for name in rows.keys() - {"mujoco"} if "mujoco" in rows else ():
-            # an engine meets the same drawn arms; an arm is none of them, and is held against their centre
-            rows[name] |= gap(episodes[name], episodes["mujoco"] if engine and name == cfg.simulator.name else centre)
         run.summary(rows)
         tell.transfer(run, robot, episodes, rows, timing, stops)
         report.reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
@@ -599,65 +607,6 @@ STAGES = {
 # --- the front door -------------------------------------------------------------------------------------------
 
 
-def check_overrides(words):
-    """Raise UserError for an option that the config does not have, with the nearest one that it has.
-
-    Hydra would stop too, with several lines; a sweep is checked value by value before its first job starts.
-    """
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-    from omegaconf import DictConfig, OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    from r2s.errors import UserError, choices, nearest
-
-    def keys(node, prefix=""):
-        for k in node:
-            yield prefix + str(k)
-            if not OmegaConf.is_missing(node, k) and isinstance(node[k], DictConfig):
-                yield from keys(node[k], f"{prefix}{k}.")
-
-    groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in CONF.iterdir() if p.is_dir()}
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        cfg = compose("config")
-        known = [*keys(cfg), *groups]
-        base: list[str] = []
-        for word in words:
-            if word.lstrip("+~").startswith(("hydra.", "hydra/")):
-                continue  # Hydra's own
-            try:
-                parsed = OverridesParser.create().parse_override(word)
-                name = parsed.key_or_group
-                if parsed.is_add() and name not in groups:  # Hydra would take it, and nothing would read it
-                    raise UserError(f"unknown option '{name}'{nearest(name, known)}")
-                values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
-                trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
-                for trial in trials:
-                    before, cfg = cfg, compose("config", [*base, trial])
-                    check_number(name, before, cfg)
-                if not parsed.is_sweep_override() and name in ("data", "arm", "simulator"):
-                    known = [*keys(cfg), *groups]
-                base.append(trials[0])
-            except (HydraException, OmegaConfBaseException) as error:
-                if "=" not in word:
-                    raise UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}") from None
-                key, value = word.split("=", 1)
-                bare = key.lstrip("+~")
-                if bare in groups:
-                    options = groups[bare]
-                    raise UserError(
-                        f"{bare}: no option '{value}'; allowed: {choices(options)}{nearest(value, options)}"
-                    ) from None
-                if bare not in known:
-                    raise UserError(
-                        f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}"
-                    ) from None
-                raise UserError(f"{word}: {' '.join(str(error).split())}") from None
-    GlobalHydra.instance().clear()
-
-
 def resumed(cfg, overrides):
     """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
     import json
@@ -681,25 +630,12 @@ def resumed(cfg, overrides):
     return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
 
 
-def check_number(key, before, after):
-    """Raise UserError where a number of the config was replaced by a word."""
-    from omegaconf import OmegaConf
-
-    from r2s.errors import UserError
-
-    def number(value):
-        return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-    old, new = OmegaConf.select(before, key, throw_on_missing=False), OmegaConf.select(after, key)
-    if number(old) and isinstance(new, str):
-        raise UserError(f"{key}: '{new}' is not a number, such as {old:g}")
-
-
 def main():
     """Compose and run; a user's mistake is one line and exit status 2."""
     import hydra
 
     from r2s.errors import UserError
+    from r2s.overrides import check_overrides
 
     words = [w for w in sys.argv[1:] if not w.startswith("-")]
     asked_for_help = any(
@@ -729,7 +665,7 @@ def main():
 
     try:
         if not asked_for_help:
-            check_overrides(words)
+            check_overrides(words, CONF)
         with tempfile.TemporaryDirectory() as folder:
             if {"-m", "--multirun"} & set(sys.argv[1:]):  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")

@@ -1,7 +1,7 @@
 """Four algorithms at equal wall-clock: DDPG, TD3, SAC and TQC, five seeds each, one thread per training.
 
-`python benchmarks/algorithms.py trials` trains each algorithm with each of TRIALS on the tuning seed and prints what
-came out; the winners are in conf/algo. `python benchmarks/algorithms.py` trains 4 x 5 of the committed defaults and
+`python benchmarks/algorithms.py trials` trains each algorithm with its TRIALS on the tuning seed and prints what came
+out; the winners are in conf/algo. `python benchmarks/algorithms.py` trains 4 x 5 of the committed defaults and
 TQC under reward=paper beside them, as many at once as there are cores, and writes docs/algorithms.md with its figure.
 Both run only what is missing, so they can be stopped. Run folders: runs/train/{trial,algo}_*.
 """
@@ -14,17 +14,42 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROOT
+from common import MACHINE, ROOT, markdown, side_by_side
 
 from r2s.comparison import groups, improvement_table, read_runs, summary_table
 from r2s.report import scores_rows
 
 ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
 SEEDS = range(20, 25)
-TRIAL_MINUTES = 2.0
-TUNING_SEED = 50
 MINUTES = 3.5
-TRIALS = {"algo.lr": ("5e-4", "1e-3")}  # the same for each algorithm
+TUNING_SEED = 50
+TRIAL_MINUTES = 1.5
+TRIALS = {  # as many for each; everything that differs is named, so that it stays what it was
+    "tqc": [
+        "algo.lr=5e-4 algo.target_entropy=-10",
+        "algo.lr=1e-3 algo.target_entropy=-10",
+        "algo.lr=2e-3 algo.target_entropy=-10",
+        "algo.lr=1e-3 algo.target_entropy=-7",
+    ],
+    "sac": [
+        "algo.lr=5e-4 algo.tau=0.01 algo.target_entropy=-10",
+        "algo.lr=1e-3 algo.tau=0.01 algo.target_entropy=-10",
+        "algo.lr=1e-3 algo.tau=0.02 algo.target_entropy=-10",
+        "algo.lr=1e-3 algo.tau=0.01 algo.target_entropy=-7",
+    ],
+    "td3": [  # 0.1, the paper's noise, hardly ever moves a joint out of its dead zone
+        "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01 algo.policy_delay=2",
+        "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.01 algo.policy_delay=2",
+        "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.02 algo.policy_delay=2",
+        "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01 algo.policy_delay=1",
+    ],
+    "ddpg": [
+        "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01",
+        "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.01",
+        "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.02",
+        "algo.lr=5e-4 algo.explore_std=0.3 algo.tau=0.01",
+    ],
+}
 MARKS = {
     "95 % < 2 cm": ("success_2cm", 0.95),
     "98 % < 1 cm": ("success_1cm", 0.98),
@@ -32,20 +57,19 @@ MARKS = {
 }
 
 
-def sweep(name: str, *words: str, minutes: float = MINUTES) -> None:
-    """Train what is missing of a sweep, one thread and one process per job; `name` may use ${...}."""
-    shared = [f"name={name}", "only_missing=true", "threads=1", f"budget.minutes={minutes}", "hydra/launcher=joblib"]
-    subprocess.run([sys.executable, "run.py", "-m", *words, *shared], cwd=ROOT, check=True)
-
-
 def trials() -> None:
-    """Try every setting on every algorithm, on a seed that is not compared later."""
-    key, values = next(iter(TRIALS.items()))
-    words = [f"algo={','.join(ALGORITHMS)}", f"{key}={','.join(values)}", f"seed={TUNING_SEED}"]
-    sweep("trial_${algo.name}_${" + key + "}", *words, minutes=TRIAL_MINUTES)
-    for folder in sorted((ROOT / "runs" / "train").glob("trial_*")):
-        last = json.loads((folder / "summary.json").read_text())["last"]
-        print(f"{folder.name:24} {100 * last['success_1cm']:5.1f} % < 1 cm, return {last['return_paper']:.1f}")
+    """Try every setting on its algorithm, on a seed that is not compared later."""
+    jobs = {
+        f"trial_{algo}_{k}": [f"algo={algo}", *words.split()]
+        for algo, settings in TRIALS.items()
+        for k, words in enumerate(settings)
+    }
+    shared = (f"seed={TUNING_SEED}", f"budget.minutes={TRIAL_MINUTES}")
+    side_by_side([[f"name={name}", *words, *shared] for name, words in jobs.items()])
+    for name, words in jobs.items():
+        last = json.loads((ROOT / "runs" / "train" / name / "summary.json").read_text())["last"]
+        seen = f"{100 * last['success_2cm']:5.1f} % < 2 cm, {100 * last['success_1cm']:5.1f} % < 1 cm"
+        print(f"{' '.join(words):80} {seen}, return {last['return_paper']:.1f}")
 
 
 def reached(runs: list, measure: str, level: float) -> str:
@@ -56,17 +80,6 @@ def reached(runs: list, measure: str, level: float) -> str:
         minutes.append(there["wall_clock_s"].iloc[0] / 60 if len(there) else np.inf)
     middle = float(np.median(minutes))
     return f"{middle:.1f}" if np.isfinite(middle) else "-"
-
-
-def markdown(table: pd.DataFrame) -> str:
-    """Return a table of strings as markdown, the index first."""
-    head = [str(table.index.name or ""), *map(str, table.columns)]
-    lines = [
-        head,
-        ["---"] * len(head),
-        *([str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)),
-    ]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def ranking(table: pd.DataFrame, measure: str) -> str:
@@ -84,9 +97,9 @@ def ranking(table: pd.DataFrame, measure: str) -> str:
 
 def main() -> None:
     """Train, compare, write the page."""
-    seeds = ",".join(map(str, SEEDS))
-    sweep("algo_${algo.name}_${seed}", f"algo={','.join(ALGORITHMS)}", f"seed={seeds}")
-    sweep("algo_paper_${seed}", "algo=tqc", "reward=paper", f"seed={seeds.split(',')[0]},{seeds.split(',')[1]}")
+    jobs = {f"algo_{algo}_{seed}": [f"algo={algo}", f"seed={seed}"] for seed in SEEDS for algo in ALGORITHMS}
+    jobs |= {f"algo_paper_{seed}": ["algo=tqc", "reward=paper", f"seed={seed}"] for seed in SEEDS[:2]}
+    side_by_side([[f"name={name}", *words, f"budget.minutes={MINUTES}"] for name, words in jobs.items()])
     train = ROOT / "runs" / "train"
     folders = [str(train / f"algo_{a}_{s}") for a in ALGORITHMS for s in SEEDS]
     paper = [str(p) for p in sorted(train.glob("algo_paper_*"))]
@@ -105,15 +118,13 @@ def main() -> None:
     scores = scores_rows(summary_table(by_algorithm | by_reward)).join(
         pd.DataFrame.from_dict(updates, orient="index")
     )
-    key, values = next(iter(TRIALS.items()))
     pages = [
         "# Four algorithms at equal wall-clock",
         f"`python benchmarks/algorithms.py` on {MACHINE}: {len(SEEDS)} seeds each, {MINUTES:g} minutes of wall clock "
         "and one thread per training, two trainings at a time. dr=paper, 200 goals, success held for the last 0.5 s; "
         "last evaluation, interquartile mean over seeds with a 95 % bootstrap interval. Networks, replay, curriculum "
-        "and evaluation are shared; each algorithm has the settings of conf/algo, the better of "
-        f"{len(values)} trials of "
-        f"{TRIAL_MINUTES:g} minutes ({key} in {', '.join(values)}; seed {TUNING_SEED}).",
+        "and evaluation are shared; each algorithm has the settings of conf/algo, the best of "
+        f"{len(TRIALS['tqc'])} trials of {TRIAL_MINUTES:g} minutes (TRIALS of the script; seed {TUNING_SEED}).",
         markdown(scores.rename_axis("success within, %").fillna("")),
         "Minutes until an evaluation first got there, median over seeds:",
         markdown(pd.DataFrame.from_dict(times, orient="index").rename_axis("")),

@@ -1,10 +1,13 @@
-"""What the identification benchmarks share: the Panda, its published and its true values, settings from conf/."""
+"""What the benchmarks share: the Panda, its published and its true values, settings from conf/, runs, tables."""
 
 import os
+import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import yaml
 
 ROOT = Path(__file__).parent.parent
@@ -46,5 +49,27 @@ def how(torque: str = "commanded", **change) -> dict:
     return out | {"breakaway_max": s["breakaway"]} | change
 
 
+def side_by_side(jobs: Sequence[Sequence[str]]) -> None:
+    """Run commands of one thread each, as many at once as there are cores."""
+    waiting, running = list(jobs), []
+    while waiting or running:
+        while waiting and len(running) < (os.cpu_count() or 1):
+            command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "only_missing=true"]
+            running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
+        if (first := running.pop(0)).wait():
+            sys.exit(f"failed: {' '.join(map(str, first.args))}")
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table of strings as markdown, the index first."""
+    head = [str(table.index.name or ""), *map(str, table.columns)]
+    lines = [
+        head,
+        ["---"] * len(head),
+        *([str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)),
+    ]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
 __all__ = ["MACHINE", "NEW", "OLD", "ROBOT", "ROOT", "SETTINGS", "conf", "fourier", "how", "poses_about", "ramp"]
-__all__ += ["record", "replace", "searches"]
+__all__ += ["markdown", "record", "replace", "searches", "side_by_side"]

@@ -15,7 +15,8 @@ from known_truth import NOISE, TERMS, TRUTH
 from r2s.arm.simulated import SimulatedArm
 from r2s.identify import CLEAR
 from r2s.problem import Problem, searched
-from r2s.residual import ReplayResidual, TorqueResidual
+from r2s.replay_residual import ReplayResidual
+from r2s.torque_residual import TorqueResidual
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from numba import njit
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -102,6 +103,7 @@ def sample_goals(robot: Robot, task: Task, rng: np.random.Generator, count: int)
     )
 
 
+@njit(cache=True)
 def observe(
     q: np.ndarray, dq: np.ndarray, ee: np.ndarray, goal: np.ndarray, jacobian: np.ndarray, effort: np.ndarray
 ) -> np.ndarray:
@@ -117,10 +119,20 @@ def observe(
         jacobian: (m, 3, n) m/rad.
         effort: (m, n) the last command (tau_J_d) over what an action of 1 asks for.
     """
-    error = goal - ee
-    pull = np.einsum("mij,mi->mj", jacobian, error)
-    parts = [q, dq, ee, goal, error, effort, np.tanh(error / FINE_M), pull, np.tanh(pull / FINE_RAD)]
-    return np.concatenate(parts, -1).astype(np.float32)
+    m, n = q.shape
+    out = np.empty((m, 5 * n + 12), np.float32)
+    for i in range(m):
+        for j in range(n):
+            pull = 0.0
+            for k in range(3):
+                pull += jacobian[i, k, j] * (goal[i, k] - ee[i, k])
+            out[i, j], out[i, n + j], out[i, 2 * n + 9 + j] = q[i, j], dq[i, j], effort[i, j]
+            out[i, 3 * n + 12 + j], out[i, 4 * n + 12 + j] = pull, np.tanh(pull / FINE_RAD)
+        for k in range(3):
+            error = goal[i, k] - ee[i, k]
+            out[i, 2 * n + k], out[i, 2 * n + 3 + k], out[i, 2 * n + 6 + k] = ee[i, k], goal[i, k], error
+            out[i, 3 * n + 9 + k] = np.tanh(error / FINE_M)
+    return out
 
 
 def observation_scale(robot: Robot, task: Task) -> tuple[np.ndarray, np.ndarray]:

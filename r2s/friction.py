@@ -25,6 +25,7 @@ WIDTH_DQ = 0.01  # rad/s, over which the sign of Coulomb friction turns: inside 
 GRAVITY = 9.81  # m/s^2, of an upright base
 PHI = 6  # most parameters of a family
 MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
+PRESLIDING = 1e-3  # rad, over which friction turns, where it is not searched
 
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
 MARK, FAMILY, P1 = range(3)

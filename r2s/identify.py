@@ -22,10 +22,12 @@ from r2s.identified import Identified, conclude, posterior
 from r2s.parameters import check_parameters, of_family, parameter_space
 from r2s.problem import NONE, Problem, Report, Search, check_choices, check_prior, searched
 from r2s.recording import Recording
-from r2s.residual import MOVED, ReplayResidual, TorqueResidual
+from r2s.replay_residual import ReplayResidual
 from r2s.robot import Robot
 from r2s.simulator import Dynamics
+from r2s.torque_residual import TorqueResidual
 from r2s.validation import compare_families, joints_kept
+from r2s.windows import MOVED
 
 REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
 MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
@@ -61,7 +63,7 @@ def identify(
     Args:
         robot: the arm.
         nominal: where to start, and what blocks without bounds keep.
-        recording: what the arm did; its torque decides the residual (r2s/residual.py).
+        recording: what the arm did; its torque decides the residual (r2s/replay_residual.py or torque_residual.py).
         searches: at least one.
         bounds: {"phi1": [low, high], ...}, of whatever may be searched.
         prior: {"inertia_scale": sigma, ...}, see `Problem`.

@@ -13,9 +13,10 @@ from r2s.friction import FAMILIES
 from r2s.least_squares import minimise
 from r2s.parameters import LINK, ParameterSpace, check_parameters, parameter_space
 from r2s.recording import Recording
-from r2s.residual import ReplayResidual, TorqueResidual
+from r2s.replay_residual import ReplayResidual
 from r2s.robot import Robot
 from r2s.simulator import Dynamics
+from r2s.torque_residual import TorqueResidual
 
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature

@@ -23,9 +23,9 @@ from r2s.report import (
     per_joint,
     values,
 )
-from r2s.residual import FRICTION_CUTOFF
 from r2s.robot import Robot
 from r2s.simulator import Dynamics
+from r2s.torque_residual import FRICTION_CUTOFF
 
 MOST_LINES = 10  # of null directions in words
 FORMULAS = {

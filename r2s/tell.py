@@ -23,11 +23,12 @@ from r2s.report_figures import (
     whiteness_table,
 )
 from r2s.report_identification import identification_sections
-from r2s.residual import BLOCK_S, TorqueResidual, cut_windows, replay
 from r2s.robot import Robot
 from r2s.runs import Run
 from r2s.simulator import Dynamics
+from r2s.torque_residual import BLOCK_S, TorqueResidual
 from r2s.viewer import Episode, Overlay, write_recording
+from r2s.windows import cut_windows, replay
 
 SHOWN = 4  # episodes, as in the paper's figures
 
@@ -170,7 +171,7 @@ def pipeline(
     for label, folder in transferred.items():
         for path in sorted(folder.glob("episodes_*.npz")):
             where = path.stem.removeprefix("episodes_")
-            if where != "mujoco" or label == "identified":
+            if where != "mujoco":
                 episodes[f"{where}, {label} model"] = unstack(path)
     curves = {label: pd.read_csv(folder / "evaluations.csv") for label, folder in trained.items()}
     with np.load(identified / "torque.npz") as saved:

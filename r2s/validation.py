@@ -14,9 +14,10 @@ from r2s.friction import FAMILIES
 from r2s.parameters import ParameterSpace, of_family, parameter_space
 from r2s.problem import Problem, Report, fit_torque, searched
 from r2s.recording import Recording
-from r2s.residual import TorqueResidual, cut_windows, replay
 from r2s.robot import Robot
 from r2s.simulator import Dynamics, Simulator
+from r2s.torque_residual import TorqueResidual
+from r2s.windows import cut_windows, replay
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
 FAMILY_HZ = 50.0  # rows per second that families are compared on

@@ -22,12 +22,14 @@ from r2s.problem import searched
 from r2s.randomization import draw_identified, physical
 from r2s.readers import read
 from r2s.recording import Recording
-from r2s.residual import ReplayResidual, TorqueResidual, cut_windows, replay
+from r2s.replay_residual import ReplayResidual
 from r2s.robot import load_robot
 from r2s.search_cmaes import CovarianceAdaptation
 from r2s.search_ga import Genetic
 from r2s.search_least_squares import LeastSquares
+from r2s.torque_residual import TorqueResidual
 from r2s.validation import left_out, prediction_errors
+from r2s.windows import cut_windows, replay
 
 ARM = """
 <mujoco model="threelink">

@@ -10,8 +10,8 @@ from r2s.errors import UserError
 from r2s.excitation import check_limits, fourier
 from r2s.parameters import LINK, nominal_dynamics, parameter_space
 from r2s.recording import Recording
-from r2s.residual import TorqueResidual
 from r2s.robot import load_robot
+from r2s.torque_residual import TorqueResidual
 
 ARM = """
 <mujoco model="threelink">

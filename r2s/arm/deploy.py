@@ -68,6 +68,19 @@ def reach(
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
+
+    def ask(q: np.ndarray, dq: np.ndarray, place: np.ndarray, jacobian: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        effort = driver.effort[None] / torque
+        seen = observe(q[None], dq[None], place[None], goal[None], jacobian[None], effort)
+        return policy.action(torch.from_numpy(seen))[0].numpy().astype(np.float64)
+
+    def worth(distance: float, distance0: float, dq: np.ndarray, ddq: np.ndarray) -> float:
+        terms = rewards.terms(np.array([distance]), np.array([distance0]), dq[None], ddq[None])
+        return float(terms[0] @ rewards.PAPER)
+
+    # what is compiled or loaded at its first call must not be so while an arm waits
+    ask(starts[0], np.zeros(robot.n), *kinematics(starts[0]), goals[0])
+    worth(1.0, 1.0, np.zeros(robot.n), np.zeros(robot.n))
     for e in range(count):
         driver.reset()
         stopped = False
@@ -82,15 +95,7 @@ def reach(
         for k in range(task.steps):
             if not stopped:
                 asked = clock()
-                seen = observe(
-                    state.q[None],
-                    state.dq[None],
-                    place[None],
-                    goals[e][None],
-                    jacobian[None],
-                    driver.effort[None] / torque,
-                )
-                action = policy.action(torch.from_numpy(seen))[0].numpy().astype(np.float64)
+                action = ask(state.q, state.dq, place, jacobian, goals[e])
                 timing.policy.append(clock() - asked)
                 try:
                     for ms in range(task.substeps):
@@ -113,8 +118,7 @@ def reach(
             distance[e, k] = np.linalg.norm(goals[e] - place)
             ddq = (state.dq - before) * task.ctrl_hz
             before = state.dq
-            d = distance[e, k : k + 1]
-            reward[e, k] = rewards.terms(d, np.array([distance0]), state.dq[None], ddq[None])[0] @ rewards.PAPER
+            reward[e, k] = worth(distance[e, k], distance0, state.dq, ddq)
         if stopped:
             distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs
         arm.stop()

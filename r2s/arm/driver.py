@@ -3,13 +3,16 @@
 In this order: finite -> fresh (watchdog) -> soft start -> less where joints are or would get too fast -> low-pass ->
 push away from position and velocity limits -> clip -> rate limit, last, against what the arm applied last. No clock
 and no arm in here: `Driver` is a function of states and targets, and the tests give it a million hostile ones.
+
+`Driver` keeps what has been and decides whether a motion goes on; below it are the rules, one compiled function each.
 """
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from r2s.actuation import Actuation, SoftLimits, low_pass_gain
+from r2s.actuation import Actuation, SoftLimits, low_pass_gain, soft_push
 from r2s.arm.interface import ArmState, InverseInertia
 from r2s.robot import SIM_DT, Robot
 
@@ -24,10 +27,44 @@ PUSH_S = 0.04  # for which a target must not make a heavy joint faster than is a
 HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here
 POSTURE = 8  # cycles between two looks at what the posture weighs
 AHEAD_S = 0.035  # at home, that speeds are judged ahead, by accelerations below
-AHEAD_HZ = 60.0
+AHEAD_GAIN = low_pass_gain(60.0)  # of the low-pass on those, per cycle
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # of the velocity limits
 STILL = 0.02  # rad/s
+
+
+class Rules(NamedTuple):
+    """What holds for an arm wherever it is; arrays (n,).
+
+    Attributes:
+        q_min, q_max: rad. most: rad/s, how fast joints may go. brake: rad/s^2, twice the deceleration that a way to a
+            position limit is judged by. heavy: whose speed a target must not carry over what is allowed.
+        soft_low, soft_high, soft_gain, soft_dq: as of r2s.actuation.SoftLimits.
+    """
+
+    q_min: np.ndarray
+    q_max: np.ndarray
+    most: np.ndarray
+    brake: np.ndarray
+    heavy: np.ndarray
+    soft_low: np.ndarray
+    soft_high: np.ndarray
+    soft_gain: np.ndarray
+    soft_dq: np.ndarray
+
+
+class Posture(NamedTuple):
+    """What the arm weighs where it is.
+
+    Attributes:
+        mobility: (n, n) 1/(kg m^2), M^-1. weight: (n,), the inertia that a joint feels over that at home, at most 1.
+        damping: (n,) Nm s/rad, of the braking. dq_gain: (n,) Nm s/rad, of the soft velocity limits.
+    """
+
+    mobility: np.ndarray
+    weight: np.ndarray
+    damping: np.ndarray
+    dq_gain: np.ndarray
 
 
 class Driver:
@@ -45,14 +82,20 @@ class Driver:
     def __init__(self, robot: Robot, torque: np.ndarray, *, cutoff_hz: float = 100.0, soft_start_s: float = 0.0):
         self.robot, self._torque, self._fade = robot, torque, round(soft_start_s / SIM_DT)
         self._actuation = Actuation(robot, 1, cutoff_hz=cutoff_hz)
-        self._soft = SoftLimits.of(robot, torque)
         self._step = robot.dtau_max * SIM_DT
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
         self._fast = DQ_INSIDE * robot.dq_max
-        self._dq_gain, self._weight = self._soft.dq_gain, np.ones(robot.n)
         self._inverse_inertia = InverseInertia(robot)
         self._home = 1 / np.diag(self._inverse_inertia(robot.q_home))
-        self._heavy = self._home >= HEAVY * self._home.max()
+        soft = SoftLimits.of(robot, torque)
+        self._dq_gain = soft.dq_gain
+        self._rules = Rules(
+            robot.q_min, robot.q_max, ALLOWED * robot.dq_max, 2 * WALL_DDQ * robot.ddq_max,
+            self._home >= HEAVY * self._home.max(), soft.q_low, soft.q_high, soft.q_gain, soft.dq_soft,
+        )  # fmt: skip
+        self.reset()
+        still = ArmState(0.0, robot.q_home, *np.zeros((3, robot.n)))
+        self(still, None)  # what is compiled or loaded at the first call must not be so while an arm waits
         self.reset()
 
     def reset(self) -> None:
@@ -82,7 +125,7 @@ class Driver:
             target: (n,) Nm that the policy wants; None where it has said nothing.
         """
         self._cycle += 1
-        seen = bool(np.isfinite(state.q).all() and np.isfinite(state.dq).all())
+        seen = _finite(state.q) and _finite(state.dq)
         if seen and (self._weighed is None or self._cycle - self._weighed >= POSTURE):
             self._weigh(state.q)
         if target is not None and np.isfinite(target).all():
@@ -91,73 +134,27 @@ class Driver:
         else:
             self._silent += 1
         self._watch(state, seen)
-        self._rests = seen and bool((np.abs(state.dq) < STILL).all())
-        wanted, push = np.zeros(self.robot.n), np.zeros(self.robot.n)
+        self._rests = seen and _rests(state.dq)
+        stopping = self.stopping is not None
+        self._damped += stopping
         if seen:
-            bounds, soon = self._bounds(state.q), self._ahead(state.dq)
-            push = self._soft(state.q, state.dq) + self._wall(bounds, soon)
-        if self.stopping is not None:
-            self._damped += 1
-        else:  # the state is seen, or the motion would be stopping
+            before = state.dq if self._dq is None else self._dq
+            soon = _ahead(state.dq, before, self._ddq, self._posture.weight)
+            self._dq = state.dq
             fade = self._cycle / self._fade if self._cycle < self._fade else 1.0
-            wanted = self._target * (fade * self._authority(bounds, soon))
-            wanted = wanted * self._room(bounds, state.dq, wanted)
+            wanted, push = _shape(state.q, state.dq, soon, self._target, fade, stopping, self._rules, self._posture)
+        else:
+            wanted, push = np.zeros(self.robot.n), np.zeros(self.robot.n)
         wanted = self._actuation(wanted[None], 1)[0, 0] + push
-        wanted = np.clip(wanted, -self.robot.tau_max, self.robot.tau_max)
-        return state.tau_J_d + np.clip(wanted - state.tau_J_d, -self._step, self._step)
+        return _within(wanted, state.tau_J_d, self.robot.tau_max, self._step)
 
     def _weigh(self, q: np.ndarray) -> None:
         """Let braking be as strong as the posture bears: what holds the arm at home shakes it where it is lighter."""
-        self._weighed, self._mobility = self._cycle, self._inverse_inertia(q)
-        felt = np.minimum(1 / np.diag(self._mobility), self._home)
-        self._weight, self._damping = felt / self._home, WALL_RATE * felt
-        self._soft = replace(self._soft, dq_gain=np.minimum(self._dq_gain, self._damping))
-
-    def _ahead(self, dq: np.ndarray) -> np.ndarray:
-        """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms.
-
-        Less far ahead where a joint is lighter than at home: fed back late, its acceleration would shake it.
-        """
-        before = dq if self._dq is None else self._dq
-        self._ddq += low_pass_gain(AHEAD_HZ) * ((dq - before) / SIM_DT - self._ddq)
-        self._dq = dq
-        return dq + AHEAD_S * self._weight * self._ddq
-
-    def _bounds(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
-        r, brake = self.robot, 2 * WALL_DDQ * self.robot.ddq_max
-        up = np.sqrt(brake * np.maximum(r.q_max - WALL_Q - q, 0.0))
-        down = np.sqrt(brake * np.maximum(q - r.q_min - WALL_Q, 0.0))
-        most = ALLOWED * r.dq_max
-        return np.minimum(most, up), np.minimum(most, down)
-
-    def _authority(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray) -> float:
-        """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
-
-        A light joint between heavy ones is thrown about by torques that are not its own.
-        """
-        up, down = bounds
-        near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
-        return float(np.clip((1.0 - near) / (1.0 - FREE), 0.0, 1.0))
-
-    def _room(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray, wanted: np.ndarray) -> float:
-        """Return the share of `wanted` (n,) Nm that in PUSH_S makes no heavy joint faster than is allowed.
-
-        Speeds tell too late where the arm is light: with joints 1 and 3 in line, 10 Nm turn the elbow from rest to
-        its limit within 10 ms, twice the delay of an arm.
-        """
-        up, down = bounds
-        gain = PUSH_S * (self._mobility @ wanted)
-        left = np.where(gain > 0, up - dq, down + dq)
-        share = np.maximum(left, 0.0) / np.maximum(np.abs(gain), 1e-9)
-        return float(min(1.0, share[self._heavy].min()))
-
-    def _wall(self, bounds: tuple[np.ndarray, np.ndarray], dq: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that brakes what is too fast, for where it is; anything, when the motion is to end."""
-        if self.stopping is not None:
-            return -self._damping * dq
-        up, down = bounds
-        return -self._damping * (np.maximum(dq - FREE * up, 0.0) - np.maximum(-dq - FREE * down, 0.0))
+        mobility = self._inverse_inertia(q)
+        felt = np.minimum(1 / np.diag(mobility), self._home)
+        damping = WALL_RATE * felt
+        self._weighed = self._cycle
+        self._posture = Posture(mobility, felt / self._home, damping, np.minimum(self._dq_gain, damping))
 
     def _watch(self, state: ArmState, seen: bool) -> None:
         """Decide whether the motion goes on."""
@@ -167,9 +164,93 @@ class Driver:
             self.stopping = f"no finite action for {1e3 * DEADLINE_S:g} ms"
         elif not seen:
             self.stopping = "the arm's state is not finite"
-        elif (state.q < self._low).any() or (state.q > self._high).any():
-            j = int(np.maximum(self._low - state.q, state.q - self._high).argmax())
-            self.stopping = f"joint {j + 1} is at {state.q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
-        elif (np.abs(state.dq) > self._fast).any():
-            j = int((np.abs(state.dq) / self._fast).argmax())
-            self.stopping = f"joint {j + 1} is at {state.dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"
+        elif not _inside(state.q, state.dq, self._low, self._high, self._fast):
+            out = np.maximum(self._low - state.q, state.q - self._high)
+            if (out > 0).any():
+                j = int(out.argmax())
+                self.stopping = f"joint {j + 1} is at {state.q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
+            else:
+                j = int((np.abs(state.dq) / self._fast).argmax())
+                self.stopping = f"joint {j + 1} is at {state.dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"
+
+
+@njit(cache=True)
+def _finite(x):
+    return np.isfinite(x).all()
+
+
+@njit(cache=True)
+def _rests(dq):
+    return (np.abs(dq) < STILL).all()
+
+
+@njit(cache=True)
+def _inside(q, dq, low, high, fast):
+    return (q >= low).all() and (q <= high).all() and (np.abs(dq) <= fast).all()
+
+
+@njit(cache=True)
+def _ahead(dq, before, ddq, weight):
+    """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms.
+
+    Less far ahead where a joint is lighter than at home: fed back late, its acceleration would shake it. `ddq` (n,)
+    is kept from cycle to cycle.
+    """
+    ddq += AHEAD_GAIN * ((dq - before) / SIM_DT - ddq)
+    return dq + AHEAD_S * weight * ddq
+
+
+@njit(cache=True)
+def _shape(q, dq, soon, target, fade, stopping, rules, posture):
+    """Return the part of `target` (n,) Nm that is let through, and the push (n,) Nm that limits add."""
+    up, down = _bounds(q, rules)
+    push = soft_push(q, dq, rules.soft_low, rules.soft_high, rules.soft_gain, rules.soft_dq, posture.dq_gain)
+    if stopping:
+        return np.zeros_like(q), push - posture.damping * soon
+    wanted = target * (fade * _authority(up, down, soon))
+    wanted = wanted * _room(up, down, dq, wanted, rules.heavy, posture.mobility)
+    return wanted, push + _wall(up, down, soon, posture.damping)
+
+
+@njit(cache=True)
+def _bounds(q, rules):
+    """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
+    up = np.sqrt(rules.brake * np.maximum(rules.q_max - WALL_Q - q, 0.0))
+    down = np.sqrt(rules.brake * np.maximum(q - rules.q_min - WALL_Q, 0.0))
+    return np.minimum(rules.most, up), np.minimum(rules.most, down)
+
+
+@njit(cache=True)
+def _authority(up, down, dq):
+    """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
+
+    A light joint between heavy ones is thrown about by torques that are not its own.
+    """
+    near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
+    return min(max((1.0 - near) / (1.0 - FREE), 0.0), 1.0)
+
+
+@njit(cache=True)
+def _room(up, down, dq, wanted, heavy, mobility):
+    """Return the share of `wanted` (n,) Nm that in PUSH_S makes no heavy joint faster than is allowed.
+
+    Speeds tell too late where the arm is light: with joints 1 and 3 in line, 10 Nm turn the elbow from rest to its
+    limit within 10 ms, twice the delay of an arm.
+    """
+    gain = PUSH_S * (mobility @ wanted)
+    left = np.where(gain > 0, up - dq, down + dq)
+    share = np.maximum(left, 0.0) / np.maximum(np.abs(gain), 1e-9)
+    return min(1.0, share[heavy].min())
+
+
+@njit(cache=True)
+def _wall(up, down, dq, damping):
+    """Return (n,) Nm that brakes what is too fast, for where it is."""
+    return -damping * (np.maximum(dq - FREE * up, 0.0) - np.maximum(-dq - FREE * down, 0.0))
+
+
+@njit(cache=True)
+def _within(wanted, last, tau_max, step):
+    """Return (n,) Nm: clipped, then no further than `step` (n,) from what the arm applied last."""
+    clipped = np.minimum(np.maximum(wanted, -tau_max), tau_max)
+    return last + np.minimum(np.maximum(clipped - last, -step), step)
