@@ -133,15 +133,25 @@ def twins_tables() -> list[str]:
         cells["worst twin < 2 cm, %"] = f"{100 * each['success_2cm'].min():.1f}"
         out[label] = cells
     pages = [markdown(pd.DataFrame.from_dict(out, orient="index").rename_axis("trained on"))]
-    ours = table[table["condition"].str.startswith("identified, dr")].set_index("twin")
-    bare = table[table["condition"] == "nominal, no DR"].set_index("twin")
-    if len(ours) and len(bare):
-        gaps = [rows["ee_path_rmse_mm"].groupby("twin").mean() for rows in (bare, ours)]
-        ratio = (gaps[0] / gaps[1]).dropna()
-        pages.append(
-            f"Path gap of the nominal model without DR over that of the identified one, per twin: median "
-            f"{ratio.median():.1f}, smallest {ratio.min():.1f} (asked: 3)."
-        )
+    ours = table[table["condition"] == "identified, dr=identified"].groupby("twin")[list(MEASURES)].mean()
+    bare = table[table["condition"] == "nominal, no DR"].groupby("twin")[list(MEASURES)].mean()
+    both = ours.index.intersection(bare.index)
+    if len(both):
+        ours, bare = ours.loc[both], bare.loc[both]
+        ratio = bare["ee_path_rmse_mm"] / ours["ee_path_rmse_mm"]
+        points = 100 * (ours["success_1cm"] - bare["success_1cm"]).mean()
+        hardly = "hardly needs it" if abs(points) < 2 else "needs it"
+        gained = (ours - bare).mean()
+        known, guessed = ours["ee_path_rmse_mm"].median(), bare["ee_path_rmse_mm"].median()
+        pages += [
+            "Path gap of the nominal model without DR over that of the identified one, per twin: "
+            f"{', '.join(f'{r:.1f}' for r in ratio)}; median {ratio.median():.1f}, smallest {ratio.min():.1f} "
+            "(asked: 3).",
+            f"What identification and DR buy on these twins: reaching {hardly} ({points:+.1f} points within 1 cm); "
+            f"the return changes by {gained['return_paper']:+.1f}, the time to reach by "
+            f"{gained['time_to_reach_s']:+.2f} s, and the model says where the hand will be to {known:.1f} mm "
+            f"instead of {guessed:.0f} mm (medians).",
+        ]
     return pages
 
 

@@ -339,6 +339,23 @@ def test_the_same_policy_in_dart(trained, root):
     assert rows["dart"]["return_paper"] == pytest.approx(rows["mujoco"]["return_paper"], abs=1.0)
 
 
+@pytest.mark.parametrize(("arm", "package"), [("panda_emulated", "panda_py"), ("fr3_emulated", "pylibfranka")])
+def test_a_policy_through_the_client_that_drives_hardware(arm, package, trained, root):
+    """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit."""
+    pytest.importorskip(package)
+    runs = []
+    for k in range(2):
+        words = [f"arm={arm}", "simulator=none", "evaluation.episodes=1", f"name={arm}_{k}"]
+        succeed("stage=transfer", f"policy={trained}", f"root={root}", *TOY, *words)
+        folder = root / "transfer" / f"{arm}_{k}"
+        assert (folder / "stops.txt").read_text() == "none\n"
+        with np.load(folder / f"episodes_{arm}.npz") as saved:
+            runs.append({key: saved[key] for key in saved.files})
+    assert np.ptp(runs[0]["q"], axis=1).max() > 1e-3  # it moved
+    for key, values in runs[0].items():
+        np.testing.assert_array_equal(runs[1][key], values)
+
+
 def test_help_does_not_import_torch():
     """--help answers without the heavy libraries."""
     code = "import sys, runpy; sys.argv = ['run.py', '--help']\ntry: runpy.run_path('run.py', run_name='__main__')\n"

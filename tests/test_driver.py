@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -77,17 +76,10 @@ def hostile(cycles, seed):
 
 def test_a_hostile_policy_never_breaks_a_rule():
     """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
-    _, reflexes, stops = hostile(40_000, seed=0)
-    assert not reflexes
-    assert any("no finite action" in s for s in stops)
-
-
-@pytest.mark.slow
-def test_a_hostile_policy_never_breaks_a_rule_in_a_million_cycles():
-    """The same for 1e6 cycles."""
-    cycles, reflexes, _ = hostile(1_000_000, seed=1)
+    cycles, reflexes, stops = hostile(1_000_000, seed=1)
     assert cycles >= 1_000_000
     assert not reflexes
+    assert any("no finite action" in s for s in stops)
 
 
 def state_of(q, dq, tau):

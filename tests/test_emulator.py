@@ -4,6 +4,7 @@ The clients are the real packages (panda-python, pylibfranka): a test of one tha
 """
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,17 +19,22 @@ import mujoco
 import numpy as np
 import psutil
 import pytest
+import torch
 from conftest import ROOT, conf
 
 from r2s.arm import fci
 from r2s.arm.control import Control, Fault
+from r2s.arm.deploy import reach
 from r2s.arm.emulator import Emulator, main
 from r2s.arm.fr3 import FR3
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.panda import Panda
 from r2s.arm.server import listen
 from r2s.arm.twin import Twin
+from r2s.env import Task
 from r2s.errors import UserError
+from r2s.evaluate import fixed_episodes
+from r2s.policy import make_policy
 from r2s.robot import SIM_DT, load_robot
 
 CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3, 10)}
@@ -44,9 +50,6 @@ FAULTS = (  # of the second server; motion 0 is undisturbed
     Fault("joint_limit", 10, motion=5),
     Fault("estop", 10, motion=6),
 )
-
-# the clients keep real time: on a loaded machine they give up, and say so
-pytestmark = pytest.mark.slow
 
 
 class Bare:
@@ -170,6 +173,34 @@ def test_every_fault_is_a_stop_with_a_name(client, servers, panda):
     arm.close()
 
 
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (Fault("late", 40, cycles=20), "communication_constraints_violation"),
+        (Fault("drop", 40, cycles=20), "communication_constraints_violation"),
+        (Fault("discontinuity", 40), "controller_torque_discontinuity"),
+        (Fault("joint_limit", 40), "joint_position_limits_violation"),
+    ],
+    ids=lambda x: x.kind if isinstance(x, Fault) else "",
+)
+def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
+    """The episode ends with libfranka's reason and keeps what it saw; the next one, when it is cleared, runs."""
+    _, make, version = client
+    task = Task(episode_s=0.2)
+    torch.manual_seed(0)
+    with Emulator(partial(Twin, panda, SEED), version=version, faults=[fault]) as address:
+        arm = make(panda, address, clear=lambda reason: True)
+        starts = np.stack([panda.q_home, panda.q_home])
+        goals = fixed_episodes(panda, task, 2)[1]
+        episodes, stops, _ = reach(make_policy(panda, task, (8,)), arm, task, starts, goals)
+        arm.close()
+    assert len(stops) == 1, stops
+    assert re.match(rf"episode 1, 0\.0[4-6]\d* s: .*{reason}", stops[0])
+    assert np.isinf(episodes.distance[0, -1])
+    assert np.isfinite(episodes.distance[1]).all()
+    assert np.isfinite(episodes.q).all()
+
+
 def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
     """Without consent `move_to` refuses; what the arm would not take is refused before it is sent."""
     _, make, version = client
@@ -195,6 +226,7 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
         arm.close()
 
 
+@pytest.mark.slow  # on a loaded machine the clients give up, and say so
 def test_real_time_does_not_wait(client, panda):
     """At 1 kHz a client that stalls loses its motion; a machine that stalls a little does not."""
     _, make, version = client

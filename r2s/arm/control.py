@@ -34,8 +34,8 @@ class Fault:
 
     Attributes:
         kind: 'late': the answers of these cycles come too late, the arm reuses its last torque. 'drop': the states
-            of these cycles never reach the client. 'discontinuity': the first joint's torque arrives off by twice
-            the step that is allowed. 'joint_limit': the arm finds itself at a position limit. 'estop': somebody
+            of these cycles never reach the client. 'discontinuity': the first joint's torque arrives as a step of
+            twice what is allowed. 'joint_limit': the arm finds itself at a position limit. 'estop': somebody
             presses the stop button, and keeps it pressed.
         cycle: the first control cycle concerned, from 0.
         motion: of the server, from 0; a `move_to` of our clients is one unless the arm is there already.
@@ -121,9 +121,10 @@ class Control:
         if self._missed >= self._patience:
             self._abort(fci.COMMUNICATION_CONSTRAINTS, f"no answer in {self._missed} cycles in a row")
             return
-        tau = self._arm.read().tau_J_d if tau is None else tau
+        last = self._arm.read().tau_J_d
+        tau = last if tau is None else tau
         if self._has("discontinuity"):
-            tau = tau + np.eye(7)[0] * 2 * self._arm.robot.dtau_max * SIM_DT
+            tau = np.where(np.arange(7) == 0, last + 2 * self._arm.robot.dtau_max * SIM_DT, tau)
         try:
             self._arm.command(tau)
         except ArmStopped as reason:
