@@ -607,6 +607,65 @@ STAGES = {
 # --- the front door -------------------------------------------------------------------------------------------
 
 
+def check_overrides(words):
+    """Raise UserError for an option that the config does not have, with the nearest one that it has.
+
+    Hydra would stop too, with several lines; a sweep is checked value by value before its first job starts.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from r2s.errors import UserError, choices, nearest
+
+    def keys(node, prefix=""):
+        for k in node:
+            yield prefix + str(k)
+            if not OmegaConf.is_missing(node, k) and isinstance(node[k], DictConfig):
+                yield from keys(node[k], f"{prefix}{k}.")
+
+    groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in CONF.iterdir() if p.is_dir()}
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        cfg = compose("config")
+        known = [*keys(cfg), *groups]
+        base: list[str] = []
+        for word in words:
+            if word.lstrip("+~").startswith(("hydra.", "hydra/")):
+                continue  # Hydra's own
+            try:
+                parsed = OverridesParser.create().parse_override(word)
+                name = parsed.key_or_group
+                if parsed.is_add() and name not in groups:  # Hydra would take it, and nothing would read it
+                    raise UserError(f"unknown option '{name}'{nearest(name, known)}")
+                values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
+                trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
+                for trial in trials:
+                    before, cfg = cfg, compose("config", [*base, trial])
+                    check_number(name, before, cfg)
+                if not parsed.is_sweep_override() and name in ("data", "arm", "simulator"):
+                    known = [*keys(cfg), *groups]
+                base.append(trials[0])
+            except (HydraException, OmegaConfBaseException) as error:
+                if "=" not in word:
+                    raise UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}") from None
+                key, value = word.split("=", 1)
+                bare = key.lstrip("+~")
+                if bare in groups:
+                    options = groups[bare]
+                    raise UserError(
+                        f"{bare}: no option '{value}'; allowed: {choices(options)}{nearest(value, options)}"
+                    ) from None
+                if bare not in known:
+                    raise UserError(
+                        f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}"
+                    ) from None
+                raise UserError(f"{word}: {' '.join(str(error).split())}") from None
+    GlobalHydra.instance().clear()
+
+
 def resumed(cfg, overrides):
     """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
     import json
@@ -630,12 +689,25 @@ def resumed(cfg, overrides):
     return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
 
 
+def check_number(key, before, after):
+    """Raise UserError where a number of the config was replaced by a word."""
+    from omegaconf import OmegaConf
+
+    from r2s.errors import UserError
+
+    def number(value):
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+    old, new = OmegaConf.select(before, key, throw_on_missing=False), OmegaConf.select(after, key)
+    if number(old) and isinstance(new, str):
+        raise UserError(f"{key}: '{new}' is not a number, such as {old:g}")
+
+
 def main():
     """Compose and run; a user's mistake is one line and exit status 2."""
     import hydra
 
     from r2s.errors import UserError
-    from r2s.overrides import check_overrides
 
     words = [w for w in sys.argv[1:] if not w.startswith("-")]
     asked_for_help = any(
@@ -665,7 +737,7 @@ def main():
 
     try:
         if not asked_for_help:
-            check_overrides(words, CONF)
+            check_overrides(words)
         with tempfile.TemporaryDirectory() as folder:
             if {"-m", "--multirun"} & set(sys.argv[1:]):  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")

@@ -16,7 +16,16 @@ FLOORS = [
         *("parameters", "simulator", "excitation", "motion_checks"),
     ],
     [
-        *("randomization", "breakaway", "residual", "least_squares", "problem", "validation"),
+        *(
+            "randomization",
+            "breakaway",
+            "windows",
+            "replay_residual",
+            "torque_residual",
+            "least_squares",
+            "problem",
+            "validation",
+        ),
         *("identified", "identify", "search_*", "rewards", "env"),
     ],
     ["networks", "ddpg", "td3", "sac", "tqc", "checkpoint", "policy", "oracle", "train", "evaluate"],
