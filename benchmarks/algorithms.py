@@ -21,7 +21,7 @@ from r2s.report import scores_rows
 
 ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
 SEEDS = range(20, 25)
-MINUTES = 3.0
+MINUTES = 2.5
 TUNING_SEED = 50
 TRIAL_MINUTES = 1.5
 TRIALS = {  # as many for each; everything that differs is named, so that it stays what it was

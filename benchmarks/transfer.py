@@ -179,7 +179,8 @@ def clients_table() -> list[str]:
         rows = {n: summary(f).get(arm) for n, f in folders.items()}
         if not all(rows.values()):
             continue
-        same = rows["lockstep_1"] == rows["lockstep_2"]
+        one, two = (np.load(folders[f"lockstep_{k}"] / f"episodes_{arm}.npz") for k in (1, 2))
+        same = rows["lockstep_1"] == rows["lockstep_2"] and all(np.array_equal(one[k], two[k]) for k in one.files)
         for name in ("lockstep_1", "realtime"):
             r = rows[name]
             out[f"{arm}, {name.removesuffix('_1')}"] = {
@@ -187,7 +188,7 @@ def clients_table() -> list[str]:
                 "stops": f"{r['stops']:.0f}",
                 "< 1 cm, %": f"{100 * r['success_1cm']:.0f}",
                 "return": f"{r['return_paper']:.1f}",
-                "twice the same": ("yes" if same else "no") if name == "lockstep_1" else "",
+                "twice the same, to the bit": ("yes" if same else "no") if name == "lockstep_1" else "",
             }
     return [markdown(pd.DataFrame.from_dict(out, orient="index").rename_axis("client"))] if out else ["Not run."]
 
