@@ -26,28 +26,36 @@ TUNING_SEED = 50
 TRIAL_MINUTES = 1.5
 TRIALS = {  # as many for each; everything that differs is named, so that it stays what it was
     "tqc": [
-        "algo.lr=5e-4 algo.target_entropy=-10",
-        "algo.lr=1e-3 algo.target_entropy=-10",
-        "algo.lr=2e-3 algo.target_entropy=-10",
-        "algo.lr=1e-3 algo.target_entropy=-7",
+        "algo.lr=5e-4 algo.target_entropy=-10 algo.tau=0.01",
+        "algo.lr=1e-3 algo.target_entropy=-10 algo.tau=0.01",
+        "algo.lr=2e-3 algo.target_entropy=-10 algo.tau=0.01",
+        "algo.lr=1e-3 algo.target_entropy=-7 algo.tau=0.01",
+        "algo.lr=1e-3 algo.target_entropy=-10 algo.tau=0.02",
+        "algo.lr=2e-3 algo.target_entropy=-10 algo.tau=0.02",
     ],
     "sac": [
         "algo.lr=5e-4 algo.tau=0.01 algo.target_entropy=-10",
         "algo.lr=1e-3 algo.tau=0.01 algo.target_entropy=-10",
         "algo.lr=1e-3 algo.tau=0.02 algo.target_entropy=-10",
         "algo.lr=1e-3 algo.tau=0.01 algo.target_entropy=-7",
+        "algo.lr=1e-3 algo.tau=0.02 algo.target_entropy=-7",
+        "algo.lr=2e-3 algo.tau=0.02 algo.target_entropy=-10",
     ],
     "td3": [  # 0.1, the paper's noise, hardly ever moves a joint out of its dead zone
         "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01 algo.policy_delay=2",
         "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.01 algo.policy_delay=2",
         "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.02 algo.policy_delay=2",
         "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01 algo.policy_delay=1",
+        "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.02 algo.policy_delay=2",
+        "algo.lr=2e-3 algo.explore_std=0.5 algo.tau=0.02 algo.policy_delay=2",
     ],
     "ddpg": [
         "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.01",
         "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.01",
         "algo.lr=1e-3 algo.explore_std=0.3 algo.tau=0.02",
         "algo.lr=5e-4 algo.explore_std=0.3 algo.tau=0.01",
+        "algo.lr=1e-3 algo.explore_std=0.5 algo.tau=0.02",
+        "algo.lr=2e-3 algo.explore_std=0.3 algo.tau=0.02",
     ],
 }
 MARKS = {
