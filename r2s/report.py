@@ -30,6 +30,7 @@ from r2s.robot import Robot
 from r2s.viewer import Episode, colours
 
 DPI = 120
+LEGEND_WIDTH = 160  # letters, of a figure
 MOST_POINTS = 4000  # of a line or a cloud in a figure
 LONGEST = 30.0  # s of torque in a figure: more is a solid band
 PAUSE = 0.1  # s on a figure's axis, for a pause of any length
@@ -61,9 +62,9 @@ def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3
     figure.suptitle(title, fontsize=13, fontweight="bold")
     named = {name: line for axis in axes for line, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     if named:
-        figure.legend(
-            named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), 6), frameon=False
-        )
+        fit = max(1, LEGEND_WIDTH // (max(map(len, named)) + 6))
+        columns = min(len(named), 6, fit)
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
