@@ -516,8 +516,8 @@ def transfer(cfg, overrides):
         return progress, lambda k, n: progress(k / n, f"{k} goals")
 
     with open_run(cfg, overrides, parents=[str(source)]) as run:
-        dynamics = make_dynamics(trained, robot)
         if cfg.simulator.name != "none":
+            dynamics = make_dynamics(trained, robot)
             draw = make_draw(trained, robot, dynamics)
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
@@ -531,7 +531,7 @@ def transfer(cfg, overrides):
             arm, fade = make_arm(cfg, robot), cfg.arm.soft_start_s
             if cfg.simulator.name != "none":  # what the model says of this arm, behind the same driver
                 progress, shown = counted("predict from the model")
-                model = SimulatedArm(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
+                model = SimulatedArm(arm.robot, dynamics, position_noise=0.0, velocity_noise=0.0)
                 done, *_ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
                 progress.close()
                 rows["predicted"], episodes["predicted"] = measures(done), done

@@ -29,6 +29,8 @@ class Robot:
         ee_site: the site that reaches for goals.
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
+        slowing: where an arm allows less speed the closer a joint is to a position limit: deceleration (n,) rad/s^2
+            and offset (n,) rad/s, of sqrt(2 deceleration way + offset^2) - offset. None: it does not.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Robot:
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
+    slowing: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def n(self) -> int:

@@ -340,20 +340,14 @@ def test_the_same_policy_in_dart(trained, root):
 
 
 @pytest.mark.parametrize(("arm", "package"), [("panda_emulated", "panda_py"), ("fr3_emulated", "pylibfranka")])
-def test_a_policy_through_the_client_that_drives_hardware(arm, package, tmp_path):
-    """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit.
-
-    By the oracle: a toy policy may well swing an arm into an FR3's velocity bounds near a position limit, which the
-    driver of a Panda does not know.
-    """
+def test_a_policy_through_the_client_that_drives_hardware(trained, arm, package, tmp_path):
+    """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit."""
     pytest.importorskip(package)
     root = tmp_path / "runs"
-    succeed("algo=oracle", "name=oracle", "evaluation.episodes=2", f"root={root}")
-    trained = root / "train" / "oracle"
     runs = []
     for k in range(2):
         words = [f"arm={arm}", "simulator=none", "evaluation.episodes=1", f"name={arm}_{k}"]
-        succeed("stage=transfer", f"policy={trained}", f"root={root}", *words)
+        succeed("stage=transfer", f"policy={trained}", f"root={root}", *words, *TOY)
         folder = root / "transfer" / f"{arm}_{k}"
         assert (folder / "stops.txt").read_text() == "none\n"
         with np.load(folder / f"episodes_{arm}.npz") as saved:

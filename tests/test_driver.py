@@ -8,8 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.actuation import Actuation, SoftLimits
+from r2s.arm.control import VELOCITY_NOISE
 from r2s.arm.deploy import reach
 from r2s.arm.driver import DEADLINE_S, Driver
+from r2s.arm.fci import fr3_velocity_bounds
+from r2s.arm.fr3 import slowing
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.simulated import SimulatedArm
 from r2s.env import Task
@@ -43,16 +46,28 @@ def target(kind, k, rng):
     return TORQUE * rng.normal(size=7) if k % 37 == 0 else None
 
 
-def hostile(cycles, seed):
+class FR3Reflexes(Reflexes):
+    """As those of the emulator: an FR3 allows less speed near position limits."""
+
+    def state(self, q, dq):
+        """Raise ArmStopped if an FR3 would."""
+        super().state(q, dq)
+        low, high = fr3_velocity_bounds(PANDA, q)
+        over = np.maximum(low - dq, dq - high)
+        if (over > VELOCITY_NOISE).any():
+            raise ArmStopped(f"joint {over.argmax() + 1}: too fast near its position limit")
+
+
+def hostile(cycles, seed, robot=PANDA, check=None):
     """Drive a simulated arm by one bad policy after the other; return cycles, reflexes that fired and orderly stops.
 
     The reflexes of the arm are those of libfranka: torque range, torque rate, position and velocity limits.
     """
-    rng = np.random.default_rng(seed)
+    rng, check = np.random.default_rng(seed), check or Reflexes(PANDA)
     dynamics = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     dynamics = replace(dynamics, delay=4e-3, lag=1e-3)
     arm = SimulatedArm(PANDA, dynamics, position_noise=2e-5, velocity_noise=3e-3, seed=seed)
-    driver, check = Driver(PANDA, TORQUE, cutoff_hz=TASK.cutoff_hz), Reflexes(PANDA)
+    driver = Driver(robot, TORQUE, cutoff_hz=TASK.cutoff_hz)
     reflexes, stops, k = [], [], 0
     while k < cycles:
         kind = KINDS[rng.integers(len(KINDS))]
@@ -64,10 +79,11 @@ def hostile(cycles, seed):
             check.command(tau, state.tau_J_d)  # torque and rate, to the letter
             try:
                 arm.command(tau)
+                state = arm.read()
+                check.state(state.q, state.dq)
             except ArmStopped as reflex:
                 reflexes.append(f"{kind}: {reflex}")
                 break
-            state = arm.read()
             if driver.done:
                 stops.append(f"{kind}: {driver.stopping}")
                 break
@@ -80,6 +96,12 @@ def test_a_hostile_policy_never_breaks_a_rule():
     assert cycles >= 1_000_000
     assert not reflexes
     assert any("no finite action" in s for s in stops)
+
+
+def test_nor_those_of_an_fr3():
+    """Which allows less speed the closer a joint is to a position limit, and none just before it."""
+    _, reflexes, _ = hostile(200_000, seed=1, robot=slowing(PANDA), check=FR3Reflexes(PANDA))
+    assert not reflexes
 
 
 def state_of(q, dq, tau):

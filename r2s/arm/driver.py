@@ -19,12 +19,14 @@ from r2s.robot import SIM_DT, Robot
 DEADLINE_S = 0.05  # without a fresh finite target: then the arm is damped, and stopped when it rests
 DAMP_S = 0.5  # at most
 ALLOWED = 0.92  # of the velocity limits: how fast joints may go at all
+SLOWER = 0.8  # of what an arm allows near its position limits, where it allows less there
 FREE = 0.65  # of the speed that is allowed: above, joints are braked and the policy loses authority
 WALL_DDQ = 0.35  # of ddq_max, the deceleration that a way to a position limit is judged by
 WALL_Q = 0.05  # rad within the position limits, where the allowed speed has come down to nothing
 WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears, for what the posture weighs
 PUSH_S = 0.04  # for which a target must not make a heavy joint faster than is allowed: a stretched arm is light
-HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here
+HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here; but all
+# count on an arm that allows less speed near position limits, or heavy joints throw the wrist over what is allowed
 POSTURE = 8  # cycles between two looks at what the posture weighs
 AHEAD_S = 0.035  # at home, that speeds are judged ahead, by accelerations below
 AHEAD_GAIN = low_pass_gain(60.0)  # of the low-pass on those, per cycle
@@ -39,6 +41,7 @@ class Rules(NamedTuple):
     Attributes:
         q_min, q_max: rad. most: rad/s, how fast joints may go. brake: rad/s^2, twice the deceleration that a way to a
             position limit is judged by. heavy: whose speed a target must not carry over what is allowed.
+        slowing, offset: as of Robot.slowing, doubled; harmless where there is none.
         soft_low, soft_high, soft_gain, soft_dq: as of r2s.actuation.SoftLimits.
     """
 
@@ -47,6 +50,8 @@ class Rules(NamedTuple):
     most: np.ndarray
     brake: np.ndarray
     heavy: np.ndarray
+    slowing: np.ndarray
+    offset: np.ndarray
     soft_low: np.ndarray
     soft_high: np.ndarray
     soft_gain: np.ndarray
@@ -89,9 +94,12 @@ class Driver:
         self._home = 1 / np.diag(self._inverse_inertia(robot.q_home))
         soft = SoftLimits.of(robot, torque)
         self._dq_gain = soft.dq_gain
+        slowing, offset = robot.slowing or (np.full(robot.n, 1e9), np.zeros(robot.n))
+        heavy = HEAVY if robot.slowing is None else 0.0
         self._rules = Rules(
             robot.q_min, robot.q_max, ALLOWED * robot.dq_max, 2 * WALL_DDQ * robot.ddq_max,
-            self._home >= HEAVY * self._home.max(), soft.q_low, soft.q_high, soft.q_gain, soft.dq_soft,
+            self._home >= heavy * self._home.max(), 2 * slowing, offset,
+            soft.q_low, soft.q_high, soft.q_gain, soft.dq_soft,
         )  # fmt: skip
         self.reset()
         still = ArmState(0.0, robot.q_home, *np.zeros((3, robot.n)))
@@ -215,9 +223,15 @@ def _shape(q, dq, soon, target, fade, stopping, rules, posture):
 @njit(cache=True)
 def _bounds(q, rules):
     """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
-    up = np.sqrt(rules.brake * np.maximum(rules.q_max - WALL_Q - q, 0.0))
-    down = np.sqrt(rules.brake * np.maximum(q - rules.q_min - WALL_Q, 0.0))
-    return np.minimum(rules.most, up), np.minimum(rules.most, down)
+    return _bound(rules.q_max - WALL_Q - q, rules), _bound(q - rules.q_min - WALL_Q, rules)
+
+
+@njit(cache=True)
+def _bound(way, rules):
+    """Return (n,) rad/s for joints that have `way` (n,) rad left to WALL_Q from a position limit."""
+    ours = np.sqrt(rules.brake * np.maximum(way, 0.0))
+    arms = np.sqrt(rules.slowing * np.maximum(way + WALL_Q, 0.0) + rules.offset**2) - rules.offset
+    return np.minimum(np.minimum(rules.most, ours), SLOWER * arms)
 
 
 @njit(cache=True)

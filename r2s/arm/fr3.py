@@ -4,20 +4,30 @@ pylibfranka has neither rate limiter nor low-pass in this loop: what is commande
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from r2s.arm import fci
 from r2s.arm.franka import Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
 from r2s.robot import Robot
+
+
+def slowing(robot: Robot) -> Robot:
+    """Return a robot that knows where an FR3 allows no speed, which is cut off, and how much it allows before."""
+    still = fci.FR3_VELOCITY_OFFSET**2 / (2 * fci.FR3_DECELERATION)
+    speeds = fci.FR3_DECELERATION, fci.FR3_VELOCITY_OFFSET
+    return replace(robot, q_min=robot.q_min + still, q_max=robot.q_max - still, slowing=speeds)
 
 
 class FR3(Franka):
     """A Franka Research 3.
 
     Args:
-        robot: its limits and nominal model.
+        robot: its limits and nominal model. Before its position limits an FR3 has some hundredths of a radian where
+            it allows no speed: they are cut off here.
         address: host name or IP of the arm, or of an emulator.
         clear: asked before a reflex is cleared, see `Franka`.
         realtime: demand a real-time kernel and priority, as hardware deserves; the emulator does not need them.
@@ -29,7 +39,7 @@ class FR3(Franka):
     def __init__(
         self, robot: Robot, address: str, *, clear: Callable[[str], bool] | None = None, realtime: bool = False
     ):
-        super().__init__(robot, _FR3Client(address, realtime), clear)
+        super().__init__(slowing(robot), _FR3Client(address, realtime), clear)
 
 
 class _FR3Client:
