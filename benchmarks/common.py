@@ -33,6 +33,7 @@ ROBOT = load_robot(**conf("robot/panda"))
 OLD = nominal_dynamics(ROBOT, **conf("friction/gaz2019"))
 NEW = nominal_dynamics(ROBOT, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
 SETTINGS = conf("config")["identify"]
+STEADY = ("algo.lr=1e-3", "algo.tau=0.01")  # of trainings of 5 minutes and more; conf/algo/tqc.yaml is for 2 to 5
 
 
 def searches(name: str, **change) -> list:
@@ -50,10 +51,11 @@ def how(torque: str = "commanded", **change) -> dict:
 
 
 def side_by_side(jobs: Sequence[Sequence[str]]) -> None:
-    """Run commands of one thread each, as many at once as there are cores."""
+    """Run commands of one thread each, as many at once as this process may use cores."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     waiting, running = list(jobs), []
     while waiting or running:
-        while waiting and len(running) < (os.cpu_count() or 1):
+        while waiting and len(running) < cores:
             command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "only_missing=true"]
             running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
         if (first := running.pop(0)).wait():
@@ -71,5 +73,18 @@ def markdown(table: pd.DataFrame) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-__all__ = ["MACHINE", "NEW", "OLD", "ROBOT", "ROOT", "SETTINGS", "conf", "fourier", "how", "poses_about", "ramp"]
+__all__ = [
+    "MACHINE",
+    "NEW",
+    "OLD",
+    "ROBOT",
+    "ROOT",
+    "SETTINGS",
+    "STEADY",
+    "conf",
+    "fourier",
+    "how",
+    "poses_about",
+    "ramp",
+]
 __all__ += ["markdown", "record", "replace", "searches", "side_by_side"]

@@ -9,7 +9,7 @@ import json
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROOT, markdown, side_by_side
+from common import MACHINE, ROOT, STEADY, markdown, side_by_side
 
 SEEDS = range(30, 35)
 ASKED = (  # measure, minutes, what is asked, how it is written
@@ -18,7 +18,6 @@ ASKED = (  # measure, minutes, what is asked, how it is written
     ("return_paper", 12, -80.0, "return", 1),
 )
 MINUTES = 12
-STEADY = ("algo.lr=1e-3", "algo.tau=0.01")  # conf/algo/tqc.yaml is for 2 to 5 minutes
 
 
 def main() -> None:
