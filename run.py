@@ -205,6 +205,7 @@ def record_motion(cfg, robot, motion, seed, label):
     arm = make_source(cfg, robot, seed)
     out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
+    OPEN.close()  # an arm has one client at a time, and the next recording is another
     return motion, out
 
 
@@ -222,6 +223,7 @@ def record_ramps(cfg, robot):
         progress=lambda k, n: progress(k / n, f"{k} ramps"),
     )
     progress.close(f"{out.recording.duration:.1f} s of ramps")
+    OPEN.close()
     return out
 
 
@@ -376,20 +378,20 @@ def train(cfg, overrides):
     from r2s.policy import export_onnx, load_policy, save_policy
     from r2s.rewards import curriculum
     from r2s.runs import Progress
-    from r2s.train import Budget
+    from r2s.train import Budget, check_loop
     from r2s.train import train as run_train
 
     if cfg.algo.name == "oracle":
         return reference(cfg, overrides)
     if cfg.matmul not in ("medium", "high", "highest"):
         raise UserError(f"matmul: '{cfg.matmul}' is not allowed; medium, high and highest are")
-    if not cfg.budget.minutes and not cfg.budget.env_steps:
-        raise UserError("budget: set budget.minutes or budget.env_steps; a training needs an end")
+    budget = Budget(cfg.budget.minutes, cfg.budget.env_steps)
     robot, task, settings = make_robot(cfg), make_task(cfg), plain(cfg.algo)
     center = make_dynamics(cfg, robot)
     draw = make_draw(cfg, robot, center)
     set_threads(cfg)
     loop = {k: settings.pop(k) for k in LOOP}
+    check_loop(**loop)
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
     env = ReachEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
@@ -426,7 +428,6 @@ def train(cfg, overrides):
                 text += f", {100 * row['success_1cm']:.0f} % < 1 cm, return {row['return_paper']:.0f}"
             progress(share, text)
 
-        budget = Budget(cfg.budget.minutes, cfg.budget.env_steps)
         run_train(
             env,
             algo,
@@ -488,6 +489,7 @@ def transfer(cfg, overrides):
 
     from r2s import report, tell
     from r2s.arm.deploy import reach
+    from r2s.arm.interface import ArmStopped
     from r2s.arm.simulated import SimulatedArm
     from r2s.engines.episodes import reach as engine_reach
     from r2s.errors import UserError, nearest
@@ -507,9 +509,15 @@ def transfer(cfg, overrides):
     set_threads(cfg)
     policy = oracle(trained, robot, task) if trained.algo.name == "oracle" else load_policy(source, robot, task)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
+    if cfg.simulator.name == cfg.arm.name == "none":
+        raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
     engine = make_engine(cfg, robot) if cfg.simulator.name in ("dart", "gazebo") else None
+    try:
+        arm = None if cfg.arm.name == "none" else make_arm(cfg, robot)
+    except ArmStopped as stop:
+        raise UserError(f"arm={cfg.arm.name}: {stop}") from None
     rows, episodes, timing = {}, {}, []
-    stops: list[str] = []
+    stops: list = []
 
     def counted(what):
         progress = Progress(what)
@@ -527,14 +535,14 @@ def transfer(cfg, overrides):
             progress.close()
             rows[cfg.simulator.name] = measures(done) | gap(done, episodes["mujoco"])
             episodes[cfg.simulator.name] = done
-        if cfg.arm.name != "none":
-            arm, fade = make_arm(cfg, robot), cfg.arm.soft_start_s
+        if arm is not None:
+            fade = cfg.arm.soft_start_s
             if cfg.simulator.name != "none":  # what the model says of this arm, behind the same driver
                 progress, shown = counted("predict from the model")
                 model = SimulatedArm(arm.robot, dynamics, position_noise=0.0, velocity_noise=0.0)
-                done, *_ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
+                done, ends, _ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
                 progress.close()
-                rows["predicted"], episodes["predicted"] = measures(done), done
+                rows["predicted"], episodes["predicted"] = measures(done) | {"stops": len(ends)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")
             done, stops, cycles = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
             progress.close()
@@ -544,7 +552,7 @@ def transfer(cfg, overrides):
             timing = cycles.table()
             for row in timing:
                 run.log("timing", row)
-            (run.folder / "stops.txt").write_text("\n".join(stops) + "\n" if stops else "none\n")
+            (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in stops) or "none\n")
         run.summary(rows)
         tell.transfer(run, robot, episodes, rows, timing, stops)
         report.reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
@@ -574,11 +582,13 @@ def compare(cfg, overrides):
 def pipeline(cfg, overrides):
     """Every stage on the embedded default, each a process of its own; one table, one recording, one report."""
     from r2s import tell
-    from r2s.pipeline import run_chain
+    from r2s.pipeline import check_free, run_chain
     from r2s.report import reach_table
     from r2s.runs import read_summary
 
     robot = make_robot(cfg)
+    if cfg.name and not (Path(cfg.root) / "pipeline" / cfg.name).exists():
+        check_free(Path(cfg.root), cfg.name)
     with open_run(cfg, overrides) as run:
         program = [sys.executable, str(ROOT / "run.py")]
         name, minutes = run.folder.name, cfg.pipeline.train_minutes
@@ -644,7 +654,7 @@ def check_overrides(words):
                 trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
                 for trial in trials:
                     before, cfg = cfg, compose("config", [*base, trial])
-                    check_number(name, before, cfg)
+                    check_type(name, before, cfg)
                 if not parsed.is_sweep_override() and name in ("data", "arm", "simulator"):
                     known = [*keys(cfg), *groups]
                 base.append(trials[0])
@@ -673,6 +683,7 @@ def resumed(cfg, overrides):
     from omegaconf import OmegaConf
 
     from r2s.errors import UserError, nearest
+    from r2s.runs import check_not_running
 
     folder = Path(cfg.resume)
     if not (folder / "config.yaml").is_file():
@@ -685,11 +696,24 @@ def resumed(cfg, overrides):
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
     if json.loads((folder / "meta.json").read_text())["status"] == "done":
         raise UserError(f"resume: {folder} is finished")
+    check_not_running(folder)
     before.resume = str(folder)
     return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
 
 
-def check_number(key, before, after):
+def check_counts(cfg):
+    """Raise UserError where what counts something is no such number."""
+    from omegaconf import OmegaConf
+
+    from r2s.errors import check_number
+
+    least = {"seed": 0, "threads": 0, "arm.seed": 0, "evaluation.episodes": 1, "evaluation.env_steps": 1}
+    for key, low in (least | {"algo.n_envs": 1}).items():
+        if (value := OmegaConf.select(cfg, key)) is not None:
+            check_number(key, value, f"[{low}, inf)", whole=True)
+
+
+def check_type(key, before, after):
     """Raise UserError where a number of the config was replaced by a word."""
     from omegaconf import OmegaConf
 
@@ -721,9 +745,10 @@ def main():
 
         overrides = list(HydraConfig.get().overrides.task)
         try:
+            check_counts(cfg)
             if cfg.resume:
                 cfg, overrides = resumed(cfg, overrides)
-            elif cfg.only_missing and is_there(cfg):
+            elif cfg.only_missing and is_there(cfg, overrides):
                 return
             with OPEN:
                 STAGES[cfg.stage](cfg, overrides)
@@ -750,20 +775,32 @@ def main():
         sys.exit(stop(error))
 
 
-def is_there(cfg):
+def is_there(cfg, overrides):
     """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
     import json
 
+    from omegaconf import OmegaConf
+
     from r2s.errors import UserError
+    from r2s.runs import check_not_running
 
     if not cfg.name:
         raise UserError("only_missing: give the run folder a name=, such as name='${algo.name}_${seed}'")
     folder = Path(cfg.root) / cfg.stage / cfg.name
     if not (folder / "meta.json").is_file():
         return False
+
+    def typed(words):
+        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
+        return {w for w in words if not w.startswith(beside)}
+
+    before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
+    if other := sorted(before ^ typed(overrides)):
+        raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
     if json.loads((folder / "meta.json").read_text())["status"] == "done":
         print(f"already there: {folder}")
         return True
+    check_not_running(folder)
     cfg.resume = str(folder)
     return False
 

@@ -109,11 +109,11 @@ def clients(policy: str) -> None:
 def driver(seeds: Sequence[int]) -> None:
     """Drive a simulated arm by the hostile policies of the tests."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from test_driver import PANDA, FR3Reflexes, hostile, slowing
+    from test_driver import PANDA, FR3Reflexes, hostile, within_fr3
 
     rows = []
     for seed in seeds:
-        for arm, rules in {"panda": (), "fr3": (slowing(PANDA), FR3Reflexes(PANDA))}.items():
+        for arm, rules in {"panda": (), "fr3": (within_fr3(PANDA), FR3Reflexes(PANDA))}.items():
             cycles, reflexes, stops = hostile(1_000_000, seed, *rules)
             row = {"arm": arm, "seed": seed, "cycles": cycles, "over a rule": len(reflexes)}
             rows.append(row | {"orderly stops": len(stops)})

@@ -19,7 +19,8 @@ from r2s.errors import UserError
 DRAWS = 2000
 MEASURES = ("success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_paper")
 LOWER_IS_BETTER = ("distance_median_m",)
-BESIDE = ("seed", "name", "root", "resume", "threads", "runs", "policy")  # of a config: no setting of a training
+# of a config: no setting of a training
+BESIDE = ("seed", "name", "root", "resume", "threads", "runs", "policy", "only_missing", "grid")
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Trained:
     Attributes:
         folder: its run folder. seed: its seed. algo: its algorithm.
         settings: {"algo.lr": 5e-4, ...}, everything else of its config, flat.
-        curve: its evaluations.csv. minutes: wall clock.
+        curve: its evaluations.csv.
     """
 
     folder: Path

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from r2s.networks import Learner, check_number, polyak
+from r2s.errors import check_number
+from r2s.networks import Learner, polyak
 
 
 class DDPG(Learner):

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from r2s import rewards
 from r2s.actuation import Actuation, Motors, SoftLimits
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 from r2s.robot import SIM_DT, Robot
 from r2s.simulator import Dynamics, Simulator
 
@@ -49,6 +49,14 @@ class Task:
     reach: tuple[float, float] = (0.3, 0.75)
     height: float = 0.1
     azimuth: float = 1.57
+
+    def __post_init__(self):
+        cycles = round(1 / SIM_DT)
+        if not isinstance(self.ctrl_hz, int) or self.ctrl_hz < 1 or cycles % self.ctrl_hz:
+            raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; what divides {cycles} is, such as 50")
+        check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, inf)")
+        check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
+        check_number("task.start_spread", self.start_spread, "[0, inf)")
 
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm that an action of 1 asks for."""

@@ -5,14 +5,13 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from numbers import Integral, Real
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 
 
 class Normalizer(nn.Module):
@@ -330,26 +329,6 @@ class EntropyLearner(Learner):
 def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move every parameter of `target` by the share tau towards that of `source`."""
     torch._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
-
-
-def check_number(name: str, value: object, interval: str, whole: bool = False) -> None:
-    """Check one setting.
-
-    Args:
-        name, value: of the setting.
-        interval: where it may lie, written as in "(0, 1]".
-        whole: it must be an integer.
-
-    Raises:
-        UserError: it is no such number.
-    """
-    low, high = (float(end) for end in interval[1:-1].split(","))
-    if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):
-        x = float(value)  # type: ignore[arg-type]
-        if (low < x or (x == low and interval[0] == "[")) and (x < high or (x == high and interval[-1] == "]")):
-            return
-    kind = "whole number" if whole else "number"
-    raise UserError(f"{name}: {value!r} is not allowed; a {kind} in {interval} is")
 
 
 def check_hidden(hidden: object) -> None:

@@ -9,14 +9,8 @@ from threading import Thread
 
 from r2s.errors import UserError
 
-OWN = (
-    "stage=",
-    "name=",
-    "pipeline.",
-    "budget.",
-    "threads=",
-    "root=",
-)  # what the chain sets for its steps itself
+OWN = ("stage=", "name=", "pipeline.", "budget.", "threads=", "root=")  # what the chain sets for its steps itself
+MODELS = ("identified", "nominal")
 
 
 def run_step(commands: dict[str, Sequence[str]]) -> None:
@@ -58,6 +52,16 @@ def run_step(commands: dict[str, Sequence[str]]) -> None:
             thread.join(timeout=5)
 
 
+def check_free(root: Path, name: str) -> None:
+    """Raise UserError if a folder that a step of the chain `name` would write is there already."""
+    steps = [
+        root / "identify" / name,
+        *(root / stage / f"{name}_{m}" for stage in ("train", "transfer") for m in MODELS),
+    ]
+    if taken := [str(folder) for folder in steps if folder.exists()]:
+        raise UserError(f"name: {name} is taken, {taken[0]} is there already; give another name=")
+
+
 def run_chain(
     program: Sequence[str], root: Path, name: str, overrides: Sequence[str], train_minutes: float | None
 ) -> tuple[Path, dict[str, Path], dict[str, Path]]:
@@ -72,7 +76,11 @@ def run_chain(
 
     Returns:
         The run folders: identification, {label: training}, {label: transfer}.
+
+    Raises:
+        UserError: a step failed, or one of these folders is there already.
     """
+    check_free(root, name)
     theirs = [o for o in overrides if not o.startswith(OWN)]
     half = f"threads={max(1, (os.cpu_count() or 2) // 2)}"
     budget = (
@@ -82,7 +90,8 @@ def run_chain(
     identified = root / "identify" / name
     print("1/3 record the arm and identify it", file=sys.stderr)
     run_step({"identify": [*common, "stage=identify", f"name={name}"]})
-    models = {"identified": [f"calibration={identified}"], "nominal": ["friction=gaz2019", "inertia=nominal"]}
+    changes = [f"calibration={identified}"], ["friction=gaz2019", "inertia=nominal"]
+    models = dict(zip(MODELS, changes, strict=True))
     print("2/3 train on both models, side by side", file=sys.stderr)
     run_step({k: [*common, "stage=train", f"name={name}_{k}", half, *budget, *m] for k, m in models.items()})
     trained = {k: root / "train" / f"{name}_{k}" for k in models}

@@ -73,6 +73,7 @@ class Run:
             "wall_clock_s": 0.0,
             "seed": seed,
             "threads": threads or os.cpu_count(),
+            "process": {"host": platform.node(), "pid": os.getpid()},
             "git": _git(),
             "packages": {p: _version(p) for p in PACKAGES} | {"python": platform.python_version()},
             "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "system": platform.platform(terse=True)},
@@ -176,6 +177,21 @@ def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
     if not path.is_file():
         raise UserError(f"{what}: {folder} is no finished run folder (it has no summary.json)")
     return json.loads(path.read_text())
+
+
+def check_not_running(folder: Path) -> None:
+    """Raise UserError if a process of this computer still writes into a run folder."""
+    meta = json.loads((folder / "meta.json").read_text())
+    process = meta.get("process", {})
+    if meta["status"] != "running" or process.get("host") != platform.node() or process["pid"] == os.getpid():
+        return
+    try:
+        os.kill(process["pid"], 0)
+    except ProcessLookupError:
+        return
+    except PermissionError:
+        pass  # another user's
+    raise UserError(f"{folder}: process {process['pid']} is still at it; wait for it, or stop it")
 
 
 def default_name(overrides: Iterable[str]) -> str:

@@ -1,13 +1,14 @@
 """What a stage leaves to look at: figures/*.png, recording.rrd and report.md of its run folder."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from r2s import report
+from r2s.arm.deploy import Stop
 from r2s.comparison import Trained, groups, improvement_table, sensitivity_table, summary_table
 from r2s.evaluate import Episodes
 from r2s.friction import SIGMOID
@@ -99,17 +100,20 @@ def transfer(
     episodes: Mapping[str, Episodes],
     rows: Mapping[str, Mapping],
     timing: Sequence[Mapping] = (),
-    stops: Sequence[str] = (),
+    stops: Sequence[Stop] = (),
 ) -> None:
-    """Draw distance, reward and torque for four goals, record the arms side by side, and say it all on one page.
+    """Save all episodes and what came before a stop, show four goals in figures and recording, say it on one page.
 
     Args:
         run, robot: whose. episodes: per simulator and arm.
         rows: the same with what was measured. timing: of the arm's cycle. stops: why the arm stopped.
     """
     shown = {label: first(e) for label, e in episodes.items()}
-    for label, e in shown.items():
-        np.savez_compressed(run.folder / f"episodes_{label}.npz", **stack(e))  # type: ignore[arg-type]
+    for label in episodes:
+        np.savez_compressed(run.folder / f"episodes_{label}.npz", **asdict(episodes[label]))
+    if stops:
+        logs = {f"episode_{stop.episode + 1}": stop.log for stop in stops}
+        np.savez_compressed(run.folder / "stops.npz", **logs)  # type: ignore[arg-type]
     reach = report.reach_figure(run.figure("reach"), shown)
     traces = traces_figure(run.figure("traces"), episodes)
     write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures={"traces": traces})
@@ -118,7 +122,7 @@ def transfer(
         cycle = pd.DataFrame(timing).set_index("what").map(lambda x: f"{x:.3g}")
         sections["On the clock of this computer"] = [cycle]
     if "stops" in str(rows):
-        sections["Why the arm stopped"] = [list(stops) or "It did not."]
+        sections["Why the arm stopped"] = [list(map(str, stops)) or "It did not."]
     report.report_markdown(run.folder / "report.md", sections | {"Figures": [reach, traces]})
 
 
@@ -204,13 +208,7 @@ def first(episodes: Episodes) -> list[Episode]:
     return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i]) for i in range(min(SHOWN, len(e.goal)))]
 
 
-def stack(episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
-    """Return arrays to save: t (T,) and the rest with a leading episode axis."""
-    rest = {k: np.stack([getattr(e, k) for e in episodes]) for k in ("q", "ee", "goal", "tau")}
-    return {"t": episodes[0].t, **rest}
-
-
 def unstack(path: Path) -> list[Episode]:
-    """Return the episodes that `stack` saved."""
-    with np.load(path) as s:
-        return [Episode(s["t"], *(s[k][i] for k in ("q", "ee", "goal", "tau"))) for i in range(len(s["goal"]))]
+    """Return the first few of the episodes that `transfer` saved."""
+    with np.load(path) as saved:
+        return first(Episodes(**saved))

@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from r2s.networks import EntropyLearner, check_number, sample_tanh
+from r2s.errors import check_number
+from r2s.networks import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):

@@ -22,23 +22,53 @@ from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.checkpoint import Checkpoint
 from r2s.env import ReachEnv
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 from r2s.evaluate import Episodes, measures
 from r2s.networks import Learner, Policy
 
 
 @dataclass(frozen=True)
 class Budget:
-    """When training ends: minutes of wall clock, env_steps, or whichever of both comes first."""
+    """When training ends: minutes of wall clock, env_steps, or whichever of both comes first.
+
+    Raises:
+        UserError: it never ends, or before it began.
+    """
 
     minutes: float | None
     env_steps: int | None
+
+    def __post_init__(self):
+        if self.minutes is None and self.env_steps is None:
+            raise UserError("budget: set budget.minutes or budget.env_steps; a training needs an end")
+        for name in ("minutes", "env_steps"):
+            value = getattr(self, name)
+            if value is not None:
+                check_number(f"budget.{name}", value, "(0, inf)")
 
     def spent(self, seconds: float, env_steps: int) -> float:
         """Return the fraction spent; 1 and above is the end."""
         time_share = seconds / (60.0 * self.minutes) if self.minutes else 0.0
         step_share = env_steps / self.env_steps if self.env_steps else 0.0
         return max(time_share, step_share)
+
+
+def check_loop(
+    *,
+    batch_size: int,
+    learning_starts: int,
+    updates_per_step: int,
+    replay_size: int,
+    lr_decay: float,
+    lr_end: float,
+) -> None:
+    """Check the settings of `train` that no learner checks; raises UserError."""
+    check_number("algo.batch_size", batch_size, "[1, inf)", whole=True)
+    check_number("algo.learning_starts", learning_starts, "[0, inf)", whole=True)
+    check_number("algo.updates_per_step", updates_per_step, "[1, inf)", whole=True)
+    check_number("algo.replay_size", replay_size, f"[{batch_size}, inf)", whole=True)
+    check_number("algo.lr_decay", lr_decay, "[0, 1]")
+    check_number("algo.lr_end", lr_end, "[0, 1]")
 
 
 def keep_memory() -> None:
@@ -128,12 +158,16 @@ def train(
         torch.set_rng_state(saved["torch"])
 
     def evaluation() -> dict:
-        out = measures(evaluate(copy.deepcopy(algo.policy).cpu()))
+        try:
+            out = measures(evaluate(copy.deepcopy(algo.policy).cpu()))
+        except FloatingPointError as error:
+            when = f"{env_steps} env steps, in an evaluation"
+            raise _dumped(error, dump, {"algo": algo.state_dict()}, when) from None
         return {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began} | out
 
     while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
         env.weights = weights(spent)
-        algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / (1.0 - lr_decay))
+        algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / max(1.0 - lr_decay, 1e-9))
         warm = env_steps >= learning_starts
         seen = state["observation"].to(device)
         state["action"] = algo.explore(seen).cpu() if warm else env.action_spec.rand()
@@ -157,7 +191,7 @@ def train(
                 with products(matmul):
                     row = algo.update(batch)
             except FloatingPointError as error:
-                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random}
+                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": matmul}
                 raise _dumped(error, dump, where, f"{env_steps} env steps") from None
             updates += 1
         if updates % 1000 < updates_per_step or updates == updates_per_step:
@@ -185,11 +219,11 @@ def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any],
     return FloatingPointError(f"{error}, after {when}; replay it with r2s.train.replay on {path}")
 
 
-def replay(path: Path, env: ReachEnv, algo: Learner) -> None:
+def replay(path: Path, env: ReachEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
     """Do again what led to a number that is not finite.
 
     Args:
-        path: the dump. env, algo: made as they were for the training.
+        path: the dump. env, algo, evaluate: made as they were for the training.
 
     Raises:
         FloatingPointError: the same as then.
@@ -198,10 +232,14 @@ def replay(path: Path, env: ReachEnv, algo: Learner) -> None:
     if not path.is_file():
         raise UserError(f"{path} is no dump of a training")
     where = torch.load(path, weights_only=True)
-    if "batch" in where:
+    if "algo" in where:
         algo.load_state_dict(where["algo"])
+        if "batch" not in where:
+            evaluate(algo.policy)
+            return
         torch.set_rng_state(where["torch"])
-        algo.update(where["batch"])
+        with products(where["matmul"]):
+            algo.update(where["batch"])
         return
     env.reset()
     env.set_state(_arrays(where["env"]))

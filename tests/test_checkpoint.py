@@ -146,6 +146,10 @@ def train_until_it_breaks(env, algo, dump):
     return str(caught.value)
 
 
+def never(policy):
+    raise AssertionError("no evaluation was asked for")
+
+
 def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
     """NaN in the physics: the line names what, which arm and when, and the dump leads to it again."""
     env = make_env(panda)
@@ -167,7 +171,7 @@ def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
     saved["env"]["goal"][2, 1] = float("nan")  # the injection came after the state was kept
     torch.save(saved, tmp_path / "dump.pt")
     with pytest.raises(FloatingPointError, match="observation of arm 2 is nan"):
-        replay(tmp_path / "dump.pt", make_env(panda, seed=3), algo)
+        replay(tmp_path / "dump.pt", make_env(panda, seed=3), algo, never)
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
@@ -185,6 +189,29 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
     said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
     assert said.startswith("the loss of update 41 is nan, after ")
     with pytest.raises(FloatingPointError, match=r"^the loss of update 41 is nan$"):
-        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env))
+        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env), never)
     with pytest.raises(UserError, match="is no dump"):
-        replay(tmp_path / "nothing.pt", make_env(panda), algo)
+        replay(tmp_path / "nothing.pt", make_env(panda), algo, never)
+
+
+def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
+    """The line says when, and the dump leads to it again."""
+    env = make_env(panda)
+    algo = make_algo(env)
+
+    def evaluate(policy):
+        raise FloatingPointError("action of arm 0 is nan at step 0 of its episode")
+
+    with pytest.raises(FloatingPointError, match=r"after 4000 env steps, in an evaluation; replay it with"):
+        train(
+            env,
+            algo,
+            evaluate,
+            lambda spent: rewards.PAPER,
+            budget=Budget(None, 4000),
+            batch_size=16,
+            learning_starts=4000,
+            dump=tmp_path / "dump.pt",
+        )
+    with pytest.raises(FloatingPointError, match=r"^action of arm 0 is nan at step 0 of its episode$"):
+        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env), evaluate)

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import os
+import platform
 import re
 import runpy
 import shlex
@@ -265,6 +266,13 @@ MISTAKES = {
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
     "stage=compare runs=nowhere/*": r"nothing matches 'nowhere/\*'",
     "budget.minutes=null": r"budget",
+    "budget.minutes=-1": r"budget.minutes: -1 is not allowed; a number in \(0, inf\) is",
+    "algo.lr_decay=2": r"algo.lr_decay: 2 is not allowed",
+    "algo.batch_size=0": r"algo.batch_size: 0 is not allowed",
+    "algo.n_envs=0": r"algo.n_envs: 0 is not allowed",
+    "evaluation.episodes=0": r"evaluation.episodes: 0 is not allowed; a whole number in \[1, inf\) is",
+    "task.ctrl_hz=60": r"task.ctrl_hz: 60 is not allowed; what divides 1000 is",
+    "seed=-1": r"seed: -1 is not allowed",
     "device=tpu": r"device: 'tpu' is not allowed; cpu and cuda are",
     "matmul=low": r"matmul: 'low' is not allowed; medium, high and highest are",
     "friction.phi1=[1,2]": r"friction.phi1: 2 values for the 7 joints",
@@ -328,6 +336,47 @@ def test_a_missing_gazebo_gets_one_line(trained, tmp_path):
         r"error: simulator=gazebo: gz-sim's Python bindings .* are not installed.*", done.stderr.strip()
     )
     assert not (tmp_path / "runs").exists()
+
+
+IN_TRANSFER = {
+    "simulator=none arm=none": r"simulator=none and arm=none leave nothing to do",
+    "arm=panda": r"arm.address must be given",
+    "arm.payload=-1": r"arm.payload: -1 is not allowed",
+    "arm=panda arm.address=127.0.0.1": r"arm=panda: no connection to 127.0.0.1",
+}
+
+
+@pytest.mark.parametrize("mistake", IN_TRANSFER)
+def test_mistake_in_a_transfer_gets_one_line(mistake, trained, tmp_path):
+    """Before the first goal and the run folder."""
+    if "address" in mistake:
+        pytest.importorskip("panda_py")
+    done = r2s("stage=transfer", f"policy={trained}", *mistake.split(), f"root={tmp_path / 'runs'}")
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert re.search(IN_TRANSFER[mistake], lines[0])
+    assert not (tmp_path / "runs").exists()
+
+
+def test_names_that_are_taken_get_one_line(tmp_path):
+    """What is there was made otherwise, or by somebody else: it is neither used nor overwritten."""
+    words = [*TOY, f"root={tmp_path}", "name=a", "compile=false"]
+    succeed(*words)
+    done = r2s(*words, "only_missing=true", "algo.gamma=0.9")
+    assert done.returncode == 2
+    assert re.search(r"train/a was made otherwise \(algo.gamma=0.9\); give another name=", done.stderr)
+    (tmp_path / "identify" / "a").mkdir(parents=True)
+    done = r2s("stage=pipeline", f"root={tmp_path}", "name=a")
+    assert done.returncode == 2
+    assert re.search(r"name: a is taken, .*identify/a is there already", done.stderr)
+    assert not (tmp_path / "pipeline").exists()
+    meta = tmp_path / "train" / "a" / "meta.json"
+    process = {"host": platform.node(), "pid": os.getpid()}
+    meta.write_text(json.dumps(json.loads(meta.read_text()) | {"status": "running", "process": process}))
+    done = r2s(f"resume={tmp_path / 'train' / 'a'}")
+    assert done.returncode == 2
+    assert re.search(rf"process {os.getpid()} is still at it", done.stderr)
 
 
 def test_the_same_policy_in_dart(trained, root):

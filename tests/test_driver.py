@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,8 +12,8 @@ from r2s.actuation import Actuation, SoftLimits
 from r2s.arm.control import VELOCITY_NOISE
 from r2s.arm.deploy import reach
 from r2s.arm.driver import DEADLINE_S, Driver
-from r2s.arm.fci import fr3_velocity_bounds
-from r2s.arm.fr3 import slowing
+from r2s.arm.fci import FR3_Q_MAX, FR3_Q_MIN, fr3_velocity_bounds
+from r2s.arm.fr3 import within_fr3
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.simulated import SimulatedArm
 from r2s.env import Task
@@ -52,7 +53,9 @@ class FR3Reflexes(Reflexes):
     def state(self, q, dq):
         """Raise ArmStopped if an FR3 would."""
         super().state(q, dq)
-        low, high = fr3_velocity_bounds(PANDA, q)
+        if (q < FR3_Q_MIN).any() or (q > FR3_Q_MAX).any():
+            raise ArmStopped("beyond a position limit")
+        low, high = fr3_velocity_bounds(q)
         over = np.maximum(low - dq, dq - high)
         if (over > VELOCITY_NOISE).any():
             raise ArmStopped(f"joint {over.argmax() + 1}: too fast near its position limit")
@@ -71,7 +74,7 @@ def hostile(cycles, seed, robot=PANDA, check=None):
     reflexes, stops, k = [], [], 0
     while k < cycles:
         kind = KINDS[rng.integers(len(KINDS))]
-        state = arm.move_to(rng.uniform(PANDA.q_min + 0.15, PANDA.q_max - 0.15))
+        state = arm.move_to(rng.uniform(robot.q_min + 0.15, robot.q_max - 0.15))
         driver.reset()
         for _ in range(2000):
             k += 1
@@ -100,7 +103,7 @@ def test_a_hostile_policy_never_breaks_a_rule():
 
 def test_nor_those_of_an_fr3():
     """Which allows less speed the closer a joint is to a position limit, and none just before it."""
-    _, reflexes, _ = hostile(200_000, seed=1, robot=slowing(PANDA), check=FR3Reflexes(PANDA))
+    _, reflexes, _ = hostile(200_000, seed=1, robot=within_fr3(PANDA), check=FR3Reflexes(PANDA))
     assert not reflexes
 
 
@@ -198,3 +201,34 @@ def test_timing_counts_every_cycle():
     assert episodes.q.shape == (2, 10, 7)
     assert [row["count"] for row in timing.table()] == [20, 400, 398]
     assert all(0 < row["median_ms"] <= row["p99_ms"] <= row["max_ms"] for row in timing.table())
+
+
+def test_a_slow_policy_is_not_taken_for_a_silent_one():
+    """At 10 Hz a target holds for 100 ms: no stop."""
+    task = replace(TASK, ctrl_hz=10, episode_s=1.0)
+    arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0)
+    _, stops, _ = reach(make_policy(PANDA, task, (8,)), arm, task, *fixed_episodes(PANDA, task, 1))
+    assert stops == []
+
+
+def test_a_stop_that_has_just_begun_counts():
+    """An episode that ends while the driver brings the arm to rest was stopped, and did not reach."""
+
+    class Silent:
+        def action(self, observation):
+            return torch.full((len(observation), 7), torch.nan)
+
+    task = replace(TASK, episode_s=0.08)  # the watchdog acts after 50 ms, the arm would rest later
+    arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0.1)
+    episodes, stops, _ = reach(Silent(), arm, task, *fixed_episodes(PANDA, task, 1))
+    assert [str(stop) for stop in stops] == ["episode 1, 0.08 s: no finite action for 50 ms"]
+    assert np.isinf(episodes.distance[0, -1])
+    assert stops[0].log.shape == (80, 29)
+
+
+def test_a_torque_that_is_not_finite_is_not_built_upon():
+    """Where the arm does not say what it applied, the driver goes on from what it sent."""
+    driver = Driver(PANDA, TORQUE)
+    one = driver(state_of(PANDA.q_home, np.zeros(7), np.zeros(7)), 0.5 * TORQUE)
+    two = driver(state_of(PANDA.q_home, np.zeros(7), np.full(7, np.nan)), 0.5 * TORQUE)
+    Reflexes(PANDA).command(two, one)

@@ -195,10 +195,27 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
         episodes, stops, _ = reach(make_policy(panda, task, (8,)), arm, task, starts, goals)
         arm.close()
     assert len(stops) == 1, stops
-    assert re.match(rf"episode 1, 0\.0[4-6]\d* s: .*{reason}", stops[0])
+    assert re.match(rf"episode 1, 0\.0[4-6]\d* s: .*{reason}", str(stops[0]))
+    np.testing.assert_allclose(np.diff(stops[0].log[:, 0]), 1e-3, atol=1e-9)  # every cycle up to it
+    np.testing.assert_allclose(stops[0].log[0, 1:8], panda.q_home, atol=1e-2)
     assert np.isinf(episodes.distance[0, -1])
     assert np.isfinite(episodes.distance[1]).all()
     assert np.isfinite(episodes.q).all()
+
+
+def test_a_stop_button_ends_a_deployment(client, panda):
+    """A reflex can be cleared, a pressed button cannot: the episode ends, and the next one does not begin."""
+    _, make, version = client
+    task = Task(episode_s=0.2)
+    torch.manual_seed(0)
+    with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
+        arm = make(panda, address, clear=lambda reason: True)
+        starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
+        episodes, stops, _ = reach(make_policy(panda, task, (8,)), arm, task, starts, goals)
+        arm.close()
+    assert [stop.episode for stop in stops] == [0, 1]
+    assert "on the way to its start: the arm is not ready to move: it is user stopped" in str(stops[1])
+    assert np.isinf(episodes.distance[:, -1]).all()
 
 
 def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
@@ -403,14 +420,28 @@ def test_reflexes_have_libfrankas_names(place, torque, panda):
 
 
 def test_an_fr3_brakes_before_its_limits(panda):
-    """Version 10 refuses a speed near a position limit that version 5 takes."""
+    """Version 10 refuses a speed near a position limit of an FR3 that version 5 takes."""
+    wide = replace(panda, q_max=panda.q_max + 0.2)
     for version, goes_on in ((5, True), (10, False)):
-        control, _ = begun(near_limit(panda, 0.02), version)
+        control, _ = begun(near_limit(wide, wide.q_max[6] - fci.FR3_Q_MAX[6] + 0.02), version)
         for _ in range(50):
             if control.running:
                 control.cycle(0.05 * np.eye(7)[6])
         assert control.running == goes_on
     assert np.flatnonzero(control.state["errors"]).tolist() == [fci.JOINT_VELOCITY]
+
+
+def test_an_fr3_has_limits_of_its_own(panda):
+    """Where a Panda's sixth joint may go, at 0.2 rad, version 10 stops; cleared, the arm is back inside."""
+    low = replace(panda, q_home=np.array([0, 0, 0, -2, 0, 0.2, 0]))
+    for version, goes_on in ((5, True), (10, False)):
+        control, arm = begun(low, version)
+        control.cycle(np.zeros(7))
+        assert control.running == goes_on
+    assert np.flatnonzero(control.state["errors"]).tolist() == [fci.JOINT_POSITION_LIMITS]
+    assert "an FR3 allows 0.4398 to 4.6216" in control.stopped_by
+    assert control.recover()
+    assert arm.read().q[5] > fci.FR3_Q_MIN[5]
 
 
 def test_a_missed_answer_repeats_the_last_torque(panda):

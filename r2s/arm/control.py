@@ -131,8 +131,8 @@ class Control:
             error = next((place for word, place in _ERRORS if word in str(reason)), fci.JOINT_REFLEX)
             self._abort(error, str(reason))
             return
-        if self._version == 10 and (too_fast := self._beyond_fr3_bounds()) is not None:
-            self._abort(fci.JOINT_VELOCITY, too_fast)
+        if self._version == 10 and (outside := self._outside_fr3()) is not None:
+            self._abort(*outside)
         elif self._has("joint_limit"):
             self._abort(fci.JOINT_POSITION_LIMITS, "a joint limit was injected")
         elif self._has("estop"):
@@ -156,20 +156,29 @@ class Control:
         if self._mode == fci.USER_STOPPED:
             return False
         if self._mode == fci.REFLEX:
-            robot = self._arm.robot
+            low, high = self._arm.robot.q_min, self._arm.robot.q_max
+            if self._version == 10:
+                low, high = np.maximum(low, fci.FR3_Q_MIN), np.minimum(high, fci.FR3_Q_MAX)
             self._mode = fci.IDLE
             self.state["errors"] = 0
-            self._hold(np.clip(self._arm.read().q, robot.q_min + INSIDE, robot.q_max - INSIDE))
+            self._hold(np.clip(self._arm.read().q, low + INSIDE, high - INSIDE))
         return True
 
-    def _beyond_fr3_bounds(self) -> str | None:
+    def _outside_fr3(self) -> tuple[int, str] | None:
+        """Return the error and the words for a joint beyond an FR3's limits."""
         seen = self._arm.read()
-        low, high = fci.fr3_velocity_bounds(self._arm.robot, seen.q)
+        out = np.maximum(fci.FR3_Q_MIN - seen.q, seen.q - fci.FR3_Q_MAX)
+        if out.max() > 0:
+            i = int(out.argmax())
+            allowed = f"{fci.FR3_Q_MIN[i]:g} to {fci.FR3_Q_MAX[i]:g}"
+            words = f"joint {i + 1}: position {seen.q[i]:.4f} rad, an FR3 allows {allowed}"
+            return fci.JOINT_POSITION_LIMITS, words
+        low, high = fci.fr3_velocity_bounds(seen.q)
         over = np.maximum(low - seen.dq, seen.dq - high)
         i = int(over.argmax())
         if over[i] <= VELOCITY_NOISE:
             return None
-        return (
+        return fci.JOINT_VELOCITY, (
             f"joint {i + 1}: velocity {seen.dq[i]:.3f} rad/s, at {seen.q[i]:.4f} rad an FR3 allows "
             f"{low[i]:.3f} to {high[i]:.3f}"
         )

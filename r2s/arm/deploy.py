@@ -1,6 +1,10 @@
-"""A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz."""
+"""A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz.
+
+The policy is asked within the cycle. One that hangs leaves the arm without commands, and the arm stops itself.
+"""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -9,9 +13,12 @@ import torch
 
 from r2s import rewards
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmStopped
+from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.env import Task, observe
 from r2s.evaluate import Acts, Episodes, Kinematics
+from r2s.robot import SIM_DT
+
+LOGGED_S = 1.0  # before a stop, of every cycle
 
 
 @dataclass
@@ -37,6 +44,23 @@ class Timing:
         return rows
 
 
+@dataclass(frozen=True)
+class Stop:
+    """Why an episode ended early.
+
+    Attributes:
+        episode: from 0. reason: in the words of the arm or of the driver.
+        log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, and the command Nm thereupon.
+    """
+
+    episode: int
+    reason: str
+    log: np.ndarray
+
+    def __str__(self) -> str:
+        return f"episode {self.episode + 1}{self.reason}"
+
+
 @torch.no_grad()
 def reach(
     policy: Acts,
@@ -47,7 +71,7 @@ def reach(
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     soft_start_s: float = 0.0,
-) -> tuple[Episodes, list[str], Timing]:
+) -> tuple[Episodes, list[Stop], Timing]:
     """Run one episode per goal; return them as the arm measured them, why it stopped, where it did, and the timing.
 
     An episode that the arm stopped keeps its last state: it did not reach.
@@ -63,16 +87,22 @@ def reach(
     robot, count = arm.robot, len(goals)
     kinematics = Kinematics(robot)
     torque = task.torque(robot)
-    driver = Driver(robot, torque, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
+    driver = Driver(robot, torque, cutoff_hz=task.cutoff_hz, period_s=1 / task.ctrl_hz, soft_start_s=soft_start_s)
     timing, clock = Timing(), time.perf_counter
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
-    ee, distance, reward, stops = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), []
+    ee, distance, reward = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    stops: list[Stop] = []
+    seen: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
+
+    def stop(reason: str) -> None:
+        rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in seen]
+        stops.append(Stop(e, reason, np.array(rows).reshape(-1, 1 + 4 * robot.n)))
 
     def ask(q: np.ndarray, dq: np.ndarray, place: np.ndarray, jacobian: np.ndarray, goal: np.ndarray) -> np.ndarray:
         effort = driver.effort[None] / torque
-        seen = observe(q[None], dq[None], place[None], goal[None], jacobian[None], effort)
-        return policy.action(torch.from_numpy(seen))[0].numpy().astype(np.float64)
+        observation = observe(q[None], dq[None], place[None], goal[None], jacobian[None], effort)
+        return policy.action(torch.from_numpy(observation))[0].numpy().astype(np.float64)
 
     def worth(distance: float, distance0: float, dq: np.ndarray, ddq: np.ndarray) -> float:
         terms = rewards.terms(np.array([distance]), np.array([distance0]), dq[None], ddq[None])
@@ -83,12 +113,13 @@ def reach(
     worth(1.0, 1.0, np.zeros(robot.n), np.zeros(robot.n))
     for e in range(count):
         driver.reset()
+        seen.clear()
         stopped = False
         try:
             state = arm.move_to(starts[e])
-        except ArmStopped as stop:
+        except ArmStopped as reason:
             state, stopped = arm.read(), True
-            stops.append(f"episode {e + 1}, on the way to its start: {stop}")
+            stop(f", on the way to its start: {reason}")
         place, jacobian = kinematics(state.q)
         distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
         before, sent = state.dq, 0.0
@@ -106,12 +137,13 @@ def reach(
                         if sent:
                             timing.period.append(now - sent)
                         sent = now
+                        seen.append((state, wanted))
                         arm.command(wanted)
                         state = arm.read()
                         if driver.done:
                             raise ArmStopped(driver.stopping)
-                except ArmStopped as stop:
-                    stops.append(f"episode {e + 1}, {state.t:.2f} s: {stop}")
+                except ArmStopped as reason:
+                    stop(f", {state.t:.2f} s: {reason}")
                     stopped = True
                 place, jacobian = kinematics(state.q)
             q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, state.tau_J_d
@@ -119,6 +151,9 @@ def reach(
             ddq = (state.dq - before) * task.ctrl_hz
             before = state.dq
             reward[e, k] = worth(distance[e, k], distance0, state.dq, ddq)
+        if not stopped and driver.stopping is not None:  # the end came before the arm was at rest
+            stop(f", {state.t:.2f} s: {driver.stopping}")
+            stopped = True
         if stopped:
             distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs
         arm.stop()

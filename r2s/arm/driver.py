@@ -16,7 +16,8 @@ from r2s.actuation import Actuation, SoftLimits, low_pass_gain, soft_push
 from r2s.arm.interface import ArmState, InverseInertia
 from r2s.robot import SIM_DT, Robot
 
-DEADLINE_S = 0.05  # without a fresh finite target: then the arm is damped, and stopped when it rests
+DEADLINE_S = 0.05  # without a fresh finite target, or PERIODS of a slow policy: then the arm is damped, and stopped
+PERIODS = 2.5
 DAMP_S = 0.5  # at most
 ALLOWED = 0.92  # of the velocity limits: how fast joints may go at all
 SLOWER = 0.8  # of what an arm allows near its position limits, where it allows less there
@@ -80,12 +81,21 @@ class Driver:
 
     Args:
         robot: its limits. torque: (n,) Nm, the most that a target may ask for.
-        cutoff_hz: low-pass on the target.
+        cutoff_hz: low-pass on the target. period_s: s between the targets of a policy.
         soft_start_s: s, over which the targets of a motion fade in; 0: not at all.
     """
 
-    def __init__(self, robot: Robot, torque: np.ndarray, *, cutoff_hz: float = 100.0, soft_start_s: float = 0.0):
+    def __init__(
+        self,
+        robot: Robot,
+        torque: np.ndarray,
+        *,
+        cutoff_hz: float = 100.0,
+        period_s: float = 0.02,
+        soft_start_s: float = 0.0,
+    ):
         self.robot, self._torque, self._fade = robot, torque, round(soft_start_s / SIM_DT)
+        self._deadline = max(DEADLINE_S, PERIODS * period_s)
         self._actuation = Actuation(robot, 1, cutoff_hz=cutoff_hz)
         self._step = robot.dtau_max * SIM_DT
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
@@ -111,6 +121,7 @@ class Driver:
         self._actuation.reset()
         self._target, self._ddq = np.zeros(self.robot.n), np.zeros(self.robot.n)
         self._dq: np.ndarray | None = None
+        self._sent = np.zeros(self.robot.n)
         self._cycle, self._silent, self._damped = 0, 0, 0
         self._weighed: int | None = None
         self.stopping: str | None = None
@@ -154,7 +165,9 @@ class Driver:
         else:
             wanted, push = np.zeros(self.robot.n), np.zeros(self.robot.n)
         wanted = self._actuation(wanted[None], 1)[0, 0] + push
-        return _within(wanted, state.tau_J_d, self.robot.tau_max, self._step)
+        last = state.tau_J_d if _finite(state.tau_J_d) else self._sent
+        self._sent = _within(wanted, last, self.robot.tau_max, self._step)
+        return self._sent.copy()
 
     def _weigh(self, q: np.ndarray) -> None:
         """Let braking be as strong as the posture bears: what holds the arm at home shakes it where it is lighter."""
@@ -168,8 +181,8 @@ class Driver:
         """Decide whether the motion goes on."""
         if self.stopping is not None:
             return
-        if self._silent * SIM_DT > DEADLINE_S:
-            self.stopping = f"no finite action for {1e3 * DEADLINE_S:g} ms"
+        if self._silent * SIM_DT > self._deadline:
+            self.stopping = f"no finite action for {1e3 * self._deadline:g} ms"
         elif not seen:
             self.stopping = "the arm's state is not finite"
         elif not _inside(state.q, state.dq, self._low, self._high, self._fast):

@@ -51,7 +51,11 @@ N_ERRORS = 41
 JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX = 0, 3, 6
 COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34
 
-# the FR3 allows less speed the closer a joint is to its position limit; rad/s and rad/s^2, Franka's documentation
+# an FR3's own limits, which are not a Panda's: rad, rad/s, and, because it allows less speed the closer a joint is to
+# its position limit, rad/s and rad/s^2; Franka's documentation
+FR3_Q_MIN = np.array([-2.9007, -1.8361, -2.9007, -3.0770, -2.8763, 0.4398, -3.0508])
+FR3_Q_MAX = np.array([2.9007, 1.8361, 2.9007, -0.1169, 2.8763, 4.6216, 3.0508])
+FR3_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
 FR3_VELOCITY_OFFSET = np.array([0.6599, 0.2517, 0.2, 0.3533, 0.5757, 0.4878, 0.4628])
 FR3_DECELERATION = np.array([6, 2.585, 3.5, 4, 17, 5.5, 17])
 
@@ -88,14 +92,14 @@ COMMAND = {5: np.dtype(list(_MOTION)), 10: np.dtype([*_MOTION, ("torque_command_
 FINISHED = {5: "motion_generation_finished", 10: "torque_command_finished"}
 
 
-def fr3_velocity_bounds(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fr3_velocity_bounds(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the largest dq (7,) rad/s that an FR3 takes at q (7,) rad."""
 
     def bound(room: np.ndarray) -> np.ndarray:
         free = np.sqrt(2 * FR3_DECELERATION * np.maximum(room, 0)) - FR3_VELOCITY_OFFSET
-        return np.minimum(robot.dq_max, np.maximum(0, free))
+        return np.minimum(FR3_DQ_MAX, np.maximum(0, free))
 
-    return -bound(q - robot.q_min), bound(robot.q_max - q)
+    return -bound(q - FR3_Q_MIN), bound(FR3_Q_MAX - q)
 
 
 def urdf(robot: Robot) -> str:
@@ -122,8 +126,8 @@ def urdf(robot: Robot) -> str:
         if at >= 0:
             x, y, z = model.jnt_axis[at]
             parts.append(
-                f'<axis xyz="{x} {y} {z}"/><limit lower="{robot.q_min[at]}" upper="{robot.q_max[at]}" '
-                f'velocity="{robot.dq_max[at]}" effort="{robot.tau_max[at]}"/>'
+                f'<axis xyz="{x} {y} {z}"/><limit lower="{FR3_Q_MIN[at]}" upper="{FR3_Q_MAX[at]}" '
+                f'velocity="{FR3_DQ_MAX[at]}" effort="{robot.tau_max[at]}"/>'
                 # not URDF, but libfranka does not connect without it
                 f'<position_based_velocity_limits velocity_offset="{FR3_VELOCITY_OFFSET[at]}" '
                 f'deceleration_limit="{FR3_DECELERATION[at]}"/>'

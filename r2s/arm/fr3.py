@@ -15,19 +15,26 @@ from r2s.arm.interface import ArmStopped
 from r2s.robot import Robot
 
 
-def slowing(robot: Robot) -> Robot:
-    """Return a robot that knows where an FR3 allows no speed, which is cut off, and how much it allows before."""
+def within_fr3(robot: Robot) -> Robot:
+    """Return a robot that stays within an FR3's limits as well as its own, and slows down before them as an FR3 does.
+
+    An FR3 allows no speed in the last hundredths of a radian: they are cut off.
+    """
     still = fci.FR3_VELOCITY_OFFSET**2 / (2 * fci.FR3_DECELERATION)
-    speeds = fci.FR3_DECELERATION, fci.FR3_VELOCITY_OFFSET
-    return replace(robot, q_min=robot.q_min + still, q_max=robot.q_max - still, slowing=speeds)
+    return replace(
+        robot,
+        q_min=np.maximum(robot.q_min, fci.FR3_Q_MIN + still),
+        q_max=np.minimum(robot.q_max, fci.FR3_Q_MAX - still),
+        dq_max=np.minimum(robot.dq_max, fci.FR3_DQ_MAX),
+        slowing=(fci.FR3_DECELERATION, fci.FR3_VELOCITY_OFFSET),
+    )
 
 
 class FR3(Franka):
     """A Franka Research 3.
 
     Args:
-        robot: its limits and nominal model. Before its position limits an FR3 has some hundredths of a radian where
-            it allows no speed: they are cut off here.
+        robot: the arm that the policy knows; what an FR3 allows less is cut off here (`within_fr3`).
         address: host name or IP of the arm, or of an emulator.
         clear: asked before a reflex is cleared, see `Franka`.
         realtime: demand a real-time kernel and priority, as hardware deserves; the emulator does not need them.
@@ -39,7 +46,7 @@ class FR3(Franka):
     def __init__(
         self, robot: Robot, address: str, *, clear: Callable[[str], bool] | None = None, realtime: bool = False
     ):
-        super().__init__(slowing(robot), _FR3Client(address, realtime), clear)
+        super().__init__(within_fr3(robot), _FR3Client(address, realtime), clear)
 
 
 class _FR3Client:
