@@ -68,7 +68,7 @@ def make_arm(cfg, robot):
     if name == "twin":
         from r2s.arm.twin import Twin
 
-        return Twin(robot, arm.seed, arm.payload)
+        return Twin(robot, arm.seed, arm.payload, arm.stiffness)
     if name == "none":
         raise UserError("arm: none cannot be commanded; allowed: twin, panda_emulated, fr3_emulated, panda, fr3")
     from r2s.arm.fr3 import FR3
@@ -471,7 +471,7 @@ def reference(cfg, overrides):
         row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
-        tell.transfer(run, robot, {"oracle": done}, {"oracle": row})
+        tell.transfer(run, robot, {"oracle": done}, {"oracle": row}, task.torque(robot))
         report.reach_table(console(), {"oracle": row}, f"oracle in MuJoCo, dr: {plain(cfg.dr)}")
     print(f"written: {run.folder}")
 
@@ -511,12 +511,16 @@ def transfer(cfg, overrides):
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
+    dynamics = draw = None
+    if cfg.simulator.name != "none":
+        dynamics = make_dynamics(trained, robot)
+        draw = make_draw(trained, robot, dynamics)
     engine = make_engine(cfg, robot) if cfg.simulator.name in ("dart", "gazebo") else None
     try:
         arm = None if cfg.arm.name == "none" else make_arm(cfg, robot)
     except ArmStopped as stop:
         raise UserError(f"arm={cfg.arm.name}: {stop}") from None
-    rows, episodes, timing = {}, {}, []
+    rows, episodes, timing = {}, {}, None
     stops: list = []
 
     def counted(what):
@@ -524,12 +528,10 @@ def transfer(cfg, overrides):
         return progress, lambda k, n: progress(k / n, f"{k} goals")
 
     with open_run(cfg, overrides, parents=[str(source)]) as run:
-        if cfg.simulator.name != "none":
-            dynamics = make_dynamics(trained, robot)
-            draw = make_draw(trained, robot, dynamics)
+        if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
-        if engine is not None:
+        if engine is not None and draw is not None:
             progress, shown = counted(f"reach in {cfg.simulator.name}")
             done = engine_reach(policy, engine, robot, task, draw, starts, goals, shown)
             progress.close()
@@ -537,24 +539,23 @@ def transfer(cfg, overrides):
             episodes[cfg.simulator.name] = done
         if arm is not None:
             fade = cfg.arm.soft_start_s
-            if cfg.simulator.name != "none":  # what the model says of this arm, behind the same driver
+            if dynamics is not None:  # what the model says of this arm, behind the same driver
                 progress, shown = counted("predict from the model")
                 model = SimulatedArm(arm.robot, dynamics, position_noise=0.0, velocity_noise=0.0)
                 done, ends, _ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
                 progress.close()
                 rows["predicted"], episodes["predicted"] = measures(done) | {"stops": len(ends)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")
-            done, stops, cycles = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
+            done, stops, timing = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
             progress.close()
             rows[cfg.arm.name], episodes[cfg.arm.name] = measures(done) | {"stops": len(stops)}, done
             if "predicted" in rows:
                 rows[cfg.arm.name] |= gap(done, episodes["predicted"])
-            timing = cycles.table()
-            for row in timing:
+            for row in timing.table():
                 run.log("timing", row)
             (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in stops) or "none\n")
         run.summary(rows)
-        tell.transfer(run, robot, episodes, rows, timing, stops)
+        tell.transfer(run, robot, episodes, rows, task.torque(robot), timing, stops)
         report.reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
     print(f"written: {run.folder}")
 

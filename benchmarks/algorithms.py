@@ -191,7 +191,7 @@ def main() -> None:
         "explore with, 0.1, which asks for 1 Nm and hardly ever moves a joint out of its dead zone.",
         trials_table(),
     ]
-    (ROOT / "docs" / "algorithms.md").write_text("\n\n".join(pages).replace("eq. (2):\n\n-", "eq. (2):\n-") + "\n")
+    (ROOT / "docs" / "algorithms.md").write_text("\n\n".join(pages) + "\n")
     print("written: docs/algorithms.md")
 
 

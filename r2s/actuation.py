@@ -2,7 +2,7 @@
 
 Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. The soft
 limits need feedback every millisecond: in simulation they act inside the physics step (r2s/friction.py), on an arm
-its loop adds them, clips the sum and limits its rate once more (r2s/arm/deploy.py).
+the driver adds them, clips the sum and limits its rate once more (r2s/arm/driver.py).
 """
 
 import math

@@ -68,11 +68,15 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
             verbose=False,
         )
     model = onnx.load(path)
+    arm = robot.model(gravity=False)
     facts = {
         "robot": robot.name,
-        "joints": " ".join(f"joint{j + 1}" for j in range(robot.n)),
+        "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
         "observation": "q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015); rad, rad/s, m",
         "policy_hz": str(task.ctrl_hz),
+        "q_min_rad": " ".join(f"{q:g}" for q in robot.q_min),
+        "q_max_rad": " ".join(f"{q:g}" for q in robot.q_max),
+        "dq_max_rad_per_s": " ".join(f"{v:g}" for v in robot.dq_max),
         "torque_max_Nm": " ".join(f"{t:g}" for t in robot.tau_max),
         "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),
         "torque_scale_Nm": " ".join(f"{t:g}" for t in policy.torque_scale.tolist()),

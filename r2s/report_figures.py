@@ -1,6 +1,6 @@
-"""Figures of an identification: open-loop errors, friction over speed, convergence, whiteness of the residual."""
+"""Figures of an identification (open-loop errors, friction, convergence, whiteness) and of a transfer."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from r2s.friction import BRISTLE
 from r2s.report import clock_of, joint_panels, log_axis, number, panels, thin
 from r2s.robot import SIM_DT
 from r2s.simulator import Dynamics
-from r2s.viewer import colours
+from r2s.viewer import OTHERS, colours
 
 LAGS_S = 1.0  # of the residual's autocorrelation
 SCANS = ("family", "breakaway")  # steps of the history whose cost, where they have one, is of another kind
@@ -34,6 +34,19 @@ def traces_figure(path: Path, episodes: Mapping[str, Episodes], goals: int = 4) 
                 axis.set(xlabel="time, s" if i == len(rows) - 1 else "", ylabel=name if k == 0 else "")
                 if i == 0:
                     axis.set_title(f"goal {k + 1}", loc="left")
+    return path
+
+
+def latency_figure(path: Path, seconds: Mapping[str, Sequence[float]]) -> Path:
+    """Draw how often what took how long, {what: s}, each over its own milliseconds; the count is logarithmic."""
+    there = {what: 1e3 * np.array(values) for what, values in seconds.items() if len(values)}
+    with panels(path, len(there), len(there), "on the clock of this computer", height=2.4) as axes:
+        for axis, (what, ms) in zip(axes, there.items(), strict=True):
+            axis.hist(
+                ms, bins=np.geomspace(max(ms.min(), 1e-4), 1.01 * ms.max() + 1e-4, 60).tolist(), color=OTHERS[0]
+            )
+            axis.set(xscale="log", yscale="log", xlabel="ms", ylabel="count")
+            axis.set_title(f"{what}: median {np.median(ms):.2g}, 99 % {np.percentile(ms, 99):.2g} ms", loc="left")
     return path
 
 

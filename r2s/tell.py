@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from r2s import report
-from r2s.arm.deploy import Stop
+from r2s.arm.deploy import Stop, Timing
 from r2s.comparison import Trained, groups, improvement_table, sensitivity_table, summary_table
 from r2s.evaluate import Episodes
 from r2s.friction import SIGMOID
@@ -18,6 +18,7 @@ from r2s.recording import Recording
 from r2s.report_figures import (
     convergence_figure,
     friction_figure,
+    latency_figure,
     position_figure,
     traces_figure,
     whiteness_figure,
@@ -99,14 +100,16 @@ def transfer(
     robot: Robot,
     episodes: Mapping[str, Episodes],
     rows: Mapping[str, Mapping],
-    timing: Sequence[Mapping] = (),
+    torque: np.ndarray,
+    timing: Timing | None = None,
     stops: Sequence[Stop] = (),
 ) -> None:
     """Save all episodes and what came before a stop, show four goals in figures and recording, say it on one page.
 
     Args:
         run, robot: whose. episodes: per simulator and arm.
-        rows: the same with what was measured. timing: of the arm's cycle. stops: why the arm stopped.
+        rows: the same with what was measured. torque: (n,) Nm, the most that a policy may ask for.
+        timing: of the arm's cycle. stops: why the arm stopped.
     """
     shown = {label: first(e) for label, e in episodes.items()}
     for label in episodes:
@@ -116,14 +119,16 @@ def transfer(
         np.savez_compressed(run.folder / "stops.npz", **logs)  # type: ignore[arg-type]
     reach = report.reach_figure(run.figure("reach"), shown)
     traces = traces_figure(run.figure("traces"), episodes)
-    write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures={"traces": traces})
+    pictures = {"traces": traces}
     sections: dict[str, Sequence] = {"The same policy and goals": [report.reach_rows(rows), report.gap_rows(rows)]}
     if timing:
-        cycle = pd.DataFrame(timing).set_index("what").map(lambda x: f"{x:.3g}")
+        pictures["latency"] = latency_figure(run.figure("latency"), asdict(timing))
+        cycle = pd.DataFrame(timing.table()).set_index("what").map(lambda x: f"{x:.3g}")
         sections["On the clock of this computer"] = [cycle]
+    write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures=pictures, torque=torque)
     if "stops" in str(rows):
         sections["Why the arm stopped"] = [list(map(str, stops)) or "It did not."]
-    report.report_markdown(run.folder / "report.md", sections | {"Figures": [reach, traces]})
+    report.report_markdown(run.folder / "report.md", sections | {"Figures": [reach, *pictures.values()]})
 
 
 def compare(run: Run, robot: Robot, runs: Sequence[Trained]) -> dict[str, pd.DataFrame]:

@@ -99,12 +99,14 @@ def write_recording(
     overlays: Mapping[str, Overlay] | None = None,
     curves: Mapping[str, pd.DataFrame] | None = None,
     figures: Mapping[str, Path] | None = None,
+    torque: np.ndarray | None = None,
 ) -> Path:
     """Write `path` (.rrd, there once it is whole) and return it; what is not given is left out of the layout.
 
     `episodes` {label: episodes} become one arm per label, all k-th episodes starting together. `overlays` are
     a tab of torque plots each. `curves` {run: evaluations.csv} share a tab. `figures` {name: PNG} are a tab
     each: what has no time axis, such as friction over speed. One named "learning" joins the curves' tab.
+    `torque` (n,) Nm are limits, drawn beside the commands of the episodes.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.part.rrd")
@@ -115,6 +117,8 @@ def write_recording(
     try:
         stream.save(part, default_blueprint=_blueprint(robot, episodes, overlays, curves, figures))
         _arms(stream, robot, episodes)
+        if torque is not None and episodes:
+            _limits(stream, torque, float(_starts(episodes)[-1]))
         for label, overlay in overlays.items():
             _overlay(stream, label, overlay)
         _learning(stream, curves)
@@ -172,6 +176,15 @@ def _arms(stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Seque
         y = (i - (len(episodes) - 1) / 2) * SPACING
         stream.log(_entity("arms", label), rr.Transform3D(translation=[0, y, 0]), static=True)
         _arm(stream, robot, label, sequence, starts, palette[label])
+
+
+def _limits(stream: rr.RecordingStream, torque: np.ndarray, seconds: float) -> None:
+    """Send both limits of each joint's torque as lines over the whole time."""
+    index = [rr.TimeColumn("time", duration=np.array([0.0, seconds]))]
+    for j, limit in enumerate(torque):
+        for side, sign in (("upper", 1.0), ("lower", -1.0)):
+            path = _entity("command", f"joint {j + 1}", f"{side} limit")
+            _series(stream, path, index, np.full(2, sign * limit), f"{side} limit", GOAL, 0.8)
 
 
 def _arm(
@@ -383,7 +396,7 @@ def _learning_tab(curves: Mapping[str, pd.DataFrame], pictured: bool) -> rrb.Con
 def _arms_tab(count: int, joints: Sequence[str], seconds: float) -> rrb.Container:
     """Return the 3D view beside its plots; from four arms on, above them."""
     width = SPACING * count
-    away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.7 * width)
+    away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.85 * width)
     eye = rrb.EyeControls3D(position=[away, -0.2 * away, 0.5 + 0.3 * away], look_target=[0.15, 0, 0.48])
     scene = rrb.Spatial3DView(origin="arms", name="arms", eye_controls=eye)
     distance = _plot("distance to goal, cm", "distance", rrb.Corner2D.RightTop, until=seconds)

@@ -263,7 +263,7 @@ SLOW = pytest.mark.slow
 
 @pytest.mark.parametrize("kind", [TQC, *(pytest.param(k, marks=SLOW) for k in (DDPG, TD3, SAC))])
 def test_compiled_learns_the_same(kind):
-    """Machine code gives the same updates within 1e-5, from the same state, and leaves random numbers alone."""
+    """Machine code gives the same updates within 1e-4 after several, and leaves random numbers alone."""
     plain, compiled = make(kind), make(kind)
     random = torch.get_rng_state()
     assert compiled.compile(B)

@@ -214,6 +214,8 @@ def test_exported_policy_is_the_trained_policy(trained):
     facts = session.get_modelmeta().custom_metadata_map
     assert facts["policy_hz"] == "50"
     assert len(facts["torque_scale_Nm"].split()) == 7
+    assert facts["joints"].split() == [f"joint{j}" for j in range(1, 8)]
+    assert facts["q_min_rad"].split()[3] == "-3.0718"
 
 
 def test_every_algorithm_trains(root):

@@ -183,6 +183,7 @@ def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
         overlays={"validation": make_overlay(panda.n)},
         curves={"tqc": make_curve()},
         figures={"learning": picture},
+        torque=np.full(panda.n, 5.0),
     )
     assert written == path
     assert [p.name for p in tmp_path.glob("*.rrd")] == ["recording.rrd"]
@@ -194,6 +195,7 @@ def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
         assert {f"{base}/goal", f"{base}/trail", f"{base}/links/link7"} <= found
         for j in range(panda.n):
             assert rr.new_entity_path(["command", f"joint {j + 1}", label]) in found
+    assert rr.new_entity_path(["command", "joint 7", "upper limit"]) in found
     for name in ("1 measured", "2 nominal", "3 identified"):
         assert rr.new_entity_path(["torque", "validation", "joint 7", name]) in found
     assert rr.new_entity_path(["learning", "success at 1 cm", "tqc"]) in found

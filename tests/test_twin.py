@@ -9,6 +9,7 @@ from r2s.arm import twin as hidden
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.arm.record import record
 from r2s.arm.twin import Twin
+from r2s.engines.dart import DartEngine
 from r2s.errors import UserError
 from r2s.evaluate import Kinematics
 from r2s.excitation import Excitation, check_limits, fourier
@@ -251,3 +252,23 @@ def test_a_payload_pulls_the_hand_down():
 def test_a_wrong_payload_is_said():
     with pytest.raises(UserError, match=r"arm.payload: -1.0 is not allowed"):
         Twin(panda(), 0, -1.0)
+
+
+def test_gears_bend_under_the_load():
+    """At rest the hand hangs lower than the motors say, by gravity over the stiffness; moving, they say nearly dq."""
+    robot, seen = panda(), {}
+    for stiffness in (None, 1e12, 1e4):
+        twin = Twin(robot, 0, 0.0, stiffness)
+        begin = twin.move_to(robot.q_home)
+        np.testing.assert_allclose(begin.q, robot.q_home, atol=3e-4)
+        link = twin._q
+        for k in range(300):
+            twin.command(np.sin(0.02 * k) * np.array([6, 6, 6, 6, 1, 1, 0.5]))
+        seen[stiffness] = twin.read()
+    np.testing.assert_allclose(seen[1e12].q, seen[None].q, atol=1e-4)
+    np.testing.assert_allclose(seen[1e4].dq, seen[None].dq, atol=0.05)
+    gravity = DartEngine(robot, gravity=True).gravity_torque(robot.q_home)
+    bent = gravity * robot.tau_max.max() / robot.tau_max / 1e4
+    np.testing.assert_allclose(robot.q_home - link, bent, atol=0.1 * np.abs(bent).max())
+    with pytest.raises(UserError, match=r"arm.stiffness: -1 is not allowed"):
+        Twin(robot, 0, 0.0, -1)

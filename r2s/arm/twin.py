@@ -20,14 +20,14 @@ from numba import njit
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.engines.dart import DartEngine
 from r2s.engines.description import Links
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 from r2s.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
-DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE = range(9, 17)
+DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
 # ... and of the state (rows, n)
-Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_FILTERED, Q_SEEN, TAU_SEEN = range(11)
+Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_FILTERED, Q_SEEN, TAU_SEEN, BENT = range(12)
 
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, or each reversal would kick
 ENCODER = 2e-5  # rad
@@ -47,14 +47,18 @@ class Twin:
     Args:
         robot: what it is believed to be. seed: of the robot drawn around that.
         payload: kg in the hand, a point mass that the gravity compensation does not know of.
+        stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque; None: rigid. The
+            encoders are on the motors' side, so that q and dq lack what the load bends; the gears do not swing.
 
     Raises:
-        UserError: a payload that is negative or not finite.
+        UserError: a payload that is negative, a stiffness that is not above 0, or either not finite.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: float = 0.0):
+    def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None):
         if not (np.isfinite(payload) and payload >= 0.0):
             raise UserError(f"arm.payload: {payload!r} is not allowed; kg from 0 on are")
+        if stiffness is not None:
+            check_number("arm.stiffness", stiffness, "(0, inf)")
         self.robot = robot
         self._seed = int(seed)
         rng = np.random.default_rng([self._seed, 0])
@@ -64,6 +68,8 @@ class Twin:
         at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
         inertia = 1 / np.diag(np.linalg.inv(self._nominal.mass_matrix(robot.q_home)))
         self._hidden = _draw_joints(robot, rng, inertia, at_home[0] - at_home[1])
+        if stiffness:
+            self._hidden[COMPLIANCE] = robot.tau_max.max() / (robot.tau_max * stiffness)
         if payload:
             self._engine = _engine(robot, _carry(robot, payload, *links))
         delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles
@@ -72,7 +78,7 @@ class Twin:
         self._delay, self._lag = delay, -np.expm1(-SIM_DT / lag)
         self._dq_filter = -np.expm1(-2 * np.pi * filter_hz * SIM_DT)
         self._line = np.zeros((int(delay) + 2, robot.n))
-        self._state = np.zeros((11, robot.n))
+        self._state = np.zeros((12, robot.n))
         self._reflexes = Reflexes(robot)
         self._episode = 0
         self._stopped: str | None = "no motion was started; call move_to first"
@@ -122,6 +128,7 @@ class Twin:
         n = self.robot.n
         self._rng = np.random.default_rng([self._seed, 1, self._episode])
         self._cycle = 0
+        q = q - self._hidden[COMPLIANCE] * self._engine.gravity_torque(q)  # the motors are where was asked for
         self._q, self._dq, self._tau_J_d = q, np.zeros(n), np.zeros(n)
         self._engine.reset(q, self._dq)
         self._mass = self._engine.mass_matrix(q)
@@ -199,7 +206,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     """
     n = robot.n
     level, offset_range, drag_max, noise_max = _magnitudes(robot)
-    p = np.empty((17, n))
+    p = np.empty((18, n))
     level = level * rng.uniform(0.7, 1.3, n)
     coulomb = 0.6 * level  # the rest of the level comes with speed
     lean = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
@@ -222,6 +229,7 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     p[NOISE_DQ] = rng.uniform(2e-3, 4e-3, n)  # before the filter
     p[NOISE_TAU] = noise_max * rng.uniform(0.5, 1.0, n)
     p[ARMATURE] = robot.model(gravity=False).dof_armature
+    p[COMPLIANCE] = 0.0
     return p
 
 
@@ -267,6 +275,7 @@ def _rest(p, s, q, believed, true):
         s[DRIVE, i] = left
         s[LEVEL, i] = np.inf
         s[BIAS, i] = true[i]
+        s[BENT, i] = p[COMPLIANCE, i] * (s[DRIVE, i] - s[FRICTION, i])
 
 
 @njit(cache=True)
@@ -335,9 +344,12 @@ def _sense(p, s, noise, q, v, before, mass, dq_filter, h):
         for j in range(n):
             inertial += mass[i, j] * (v[j] - before[j]) / h
         s[BIAS, i] = link - inertial
-        s[Q_SEEN, i] = ENCODER * np.round((q[i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
-        s[DQ_FILTERED, i] += dq_filter * (v[i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_FILTERED, i])
-        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of the sensor
+        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of gear and sensor
+        bent = p[COMPLIANCE, i] * (link - rotor)
+        turned, speed = q[i] + bent, v[i] + (bent - s[BENT, i]) / h
+        s[BENT, i] = bent
+        s[Q_SEEN, i] = ENCODER * np.round((turned + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
+        s[DQ_FILTERED, i] += dq_filter * (speed + p[NOISE_DQ, i] * noise[1, i] - s[DQ_FILTERED, i])
         s[TAU_SEEN, i] = link - rotor + p[NOISE_TAU, i] * noise[2, i]
     for i in range(n):
         s[V_GUESS, i] = v[i]

@@ -44,11 +44,6 @@ class Law:
         self._data = mujoco.MjData(self._model)
         self._mass = np.empty((robot.n, robot.n))
 
-    def reset(self) -> None:
-        """Forget what friction remembers of the motion before."""
-        mujoco.mj_resetData(self._model, self._data)
-        self._model.dof_damping[:] = self._file_damping
-
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Return F (n,) Nm, to be added to the torque tau (n,) Nm of the coming step from q, dq (n,)."""
         m, d = self._model, self._data
