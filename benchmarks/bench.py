@@ -25,9 +25,10 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from r2s import randomization  # noqa: E402
+from r2s.arm.twin import Twin  # noqa: E402
 from r2s.env import ReachEnv, Task, observation_scale  # noqa: E402
 from r2s.parameters import nominal_dynamics  # noqa: E402
-from r2s.robot import load_robot  # noqa: E402
+from r2s.robot import SIM_DT, load_robot  # noqa: E402
 from r2s.runs import _cpu  # noqa: E402
 from r2s.simulator import Simulator  # noqa: E402
 from r2s.tqc import TQC  # noqa: E402
@@ -220,13 +221,26 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
     return duel(ours, lambda: sb3.update(threads, count), count)
 
 
+def twin(robot) -> tuple[float, float]:
+    """The hidden twin against the arm that it stands for, cycles/s."""
+    arm, count, rates = Twin(robot, 0), 2000, []
+    for _ in range(REPEATS):
+        arm.move_to(robot.q_home)
+        began = time.perf_counter()
+        for k in range(count):
+            arm.command(np.full(robot.n, np.sin(0.01 * k)))
+            arm.read()
+        rates.append(count / (time.perf_counter() - began))
+    return float(np.median(rates)), 1 / SIM_DT
+
+
 def main() -> None:
     """Run all and print one table."""
     robot = load_robot(**conf("robot/panda"))
     dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     cores = os.cpu_count() or 1
     keep_memory()  # as a training does
-    rows, sb3 = {}, Sb3()
+    rows, sb3 = {"hidden twin / real time, cycles/s, 1 thread": twin(robot)}, Sb3()
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"
         rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)
