@@ -275,7 +275,7 @@ class ReachEnv(EnvBase):
         action = tensordict["action"].numpy().astype(np.float64)
         self._finite("action", action)
         command = self.actuation(np.clip(action, -1.0, 1.0) * self._torque, self.task.substeps)
-        self.sim.rollout(self.motors(command))
+        self.sim.rollout(self.motors(command), record=())
         self.sim.kinematics()
         dq = self.sim.dq.copy()
         ddq = (dq - self._dq) * self.task.ctrl_hz
