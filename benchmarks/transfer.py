@@ -1,7 +1,7 @@
 """Sim2Sim and Sim2Real where nothing was tuned: another engine, hidden twins, and the real clients.
 
-Parts, each run by its name and each but the driver's doing only what is missing; without a name docs/transfer.md is
-written from what is there:
+Parts, each run by its name and each doing only what is missing; without a name docs/transfer.md is written from what
+is there:
     python benchmarks/transfer.py twins [SEED ...]    identify, train, transfer: identified + DR and nominal without,
                                                       one training seed (100-109 by default)
     python benchmarks/transfer.py ablation [SEED ...] all five conditions and three training seeds, shorter trainings
@@ -111,9 +111,11 @@ def driver(seeds: Sequence[int]) -> None:
     sys.path.insert(0, str(ROOT / "tests"))
     from test_driver import PANDA, FR3Reflexes, hostile, within_fr3
 
-    rows = []
-    for seed in seeds:
-        for arm, rules in {"panda": (), "fr3": (within_fr3(PANDA), FR3Reflexes(PANDA))}.items():
+    rows = pd.read_csv(DRIVER).to_dict("records") if DRIVER.is_file() else []
+    for arm, rules in {"panda": (), "fr3": (within_fr3(PANDA), FR3Reflexes(PANDA))}.items():
+        for seed in seeds:
+            if any((row["arm"], row["seed"]) == (arm, seed) for row in rows):
+                continue
             cycles, reflexes, stops = hostile(1_000_000, seed, *rules)
             row = {"arm": arm, "seed": seed, "cycles": cycles, "over a rule": len(reflexes)}
             rows.append(row | {"orderly stops": len(stops)})
