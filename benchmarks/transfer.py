@@ -143,18 +143,30 @@ def transfers(part: str) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def interval(values: np.ndarray) -> str:
-    """Return the mean of values (twins, trainings) with a 95 % bootstrap interval over both, which are crossed."""
+def interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean of values (twins, trainings) and a 95 % bootstrap interval over both, which are crossed.
+
+    NaN, an overshoot where no hand overshot, is left out.
+    """
     rng = np.random.default_rng(0)
     rows, columns = (rng.integers(n, size=(10_000, n)) for n in values.shape)
-    low, high = np.percentile(values[rows[:, :, None], columns[:, None, :]].mean((1, 2)), [2.5, 97.5])
-    return f"{values.mean():.1f} [{low:.1f}, {high:.1f}]"
+    drawn = values[rows[:, :, None], columns[:, None, :]]
+    low, high = np.nanpercentile(np.nanmean(drawn, axis=(1, 2)), [2.5, 97.5])
+    return float(np.nanmean(values)), float(low), float(high)
+
+
+def cell(values: np.ndarray) -> str:
+    """Return mean and interval as a table has them."""
+    mean, low, high = interval(values)
+    return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def grid(table: pd.DataFrame, label: str, key: str) -> pd.DataFrame:
     """Return a measure under a condition, twins x training seeds; seeds that lack a twin are left out."""
-    there = table[table["condition"] == label].pivot(index="twin", columns="k", values=key)
-    return there.dropna(axis="columns") * MEASURES[key][1]
+    own = table[table["condition"] == label]
+    there = own.pivot(index="twin", columns="k", values=key)
+    whole = own.groupby("k")["twin"].nunique() == table["twin"].nunique()
+    return there.loc[:, whole[whole].index] * MEASURES[key][1]
 
 
 def conditions_table(table: pd.DataFrame) -> str:
@@ -162,8 +174,10 @@ def conditions_table(table: pd.DataFrame) -> str:
     out = {}
     for label in table["condition"].unique():
         each = {key: grid(table, label, key) for key in MEASURES}
+        if each["stops"].empty:  # no training seed has all twins yet
+            continue
         cells = {"twins x seeds": "{} x {}".format(*each["stops"].shape)}
-        cells |= {MEASURES[key][0]: interval(values.to_numpy()) for key, values in each.items()}
+        cells |= {MEASURES[key][0]: cell(values.to_numpy()) for key, values in each.items()}
         out[label] = cells | {"worst twin < 2 cm, %": f"{each['success_2cm'].mean(axis=1).min():.1f}"}
     return markdown(pd.DataFrame.from_dict(out, orient="index").rename_axis("trained on"))
 
@@ -202,17 +216,21 @@ def ablation_tables() -> list[str]:
     if table.empty:
         return ["Not run."]
     keys = ("success_2cm", "success_1cm", "return_paper", "ee_path_rmse_mm", "tau_rmse_Nm", "time_to_reach_s")
-    out = {}
+    out, said = {}, []
     for after, before in STEPS:
-        if {after, before} <= set(table["condition"]):
-            two = {key: (grid(table, after, key) - grid(table, before, key)).dropna(axis="columns") for key in keys}
-            out[f"{before} -> {after}"] = {MEASURES[k][0]: interval(v.to_numpy()) for k, v in two.items()}
+        two = {key: (grid(table, after, key) - grid(table, before, key)).dropna(axis="columns") for key in keys}
+        if two["return_paper"].empty:
+            continue
+        out[f"{before} -> {after}"] = {MEASURES[k][0]: cell(v.to_numpy()) for k, v in two.items()}
+        words = []
+        for key, name in (("success_1cm", "success within 1 cm"), ("return_paper", "return")):
+            _, low, high = interval(two[key].to_numpy())
+            words.append(f"{name} {'better' if low > 0 else 'worse' if high < 0 else 'not to be told apart'}")
+        said.append(f"- {before} -> {after}: {', '.join(words)}")
     changes = markdown(pd.DataFrame.from_dict(out, orient="index").rename_axis("change"))
-    return [
-        conditions_table(table),
-        "The same, as differences on the same twins with the same training seeds:",
-        changes,
-    ]
+    title = "The same, as differences on the same twins with the same training seeds:"
+    plainly = "Said plainly, by whether an interval has 0 in it:\n\n" + "\n".join(said)
+    return [conditions_table(table), title, changes, plainly]
 
 
 def engines_table() -> list[str]:
