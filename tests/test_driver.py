@@ -79,7 +79,7 @@ def hostile(cycles, seed, robot=PANDA, check=None):
         for _ in range(2000):
             k += 1
             tau = driver(state, target(kind, k, rng))
-            check.command(tau, state.tau_J_d)  # torque and rate, to the letter
+            check.command(tau, state.tau_J_d)  # torque range and rate
             try:
                 arm.command(tau)
                 state = arm.read()
