@@ -230,7 +230,11 @@ def ablation_tables() -> list[str]:
     changes = markdown(pd.DataFrame.from_dict(out, orient="index").rename_axis("change"))
     title = "The same, as differences on the same twins with the same training seeds:"
     plainly = "Said plainly, by whether an interval has 0 in it:\n\n" + "\n".join(said)
-    return [conditions_table(table), title, changes, plainly]
+    done = min(grid(table, label, "stops").shape[1] for label in CONDITIONS)
+    missing = (
+        f"{done} of {len(TRAININGS)} training seeds have been run on all twins; `ablation` goes on with the rest."
+    )
+    return [conditions_table(table), title, changes, plainly, *([missing] if done < len(TRAININGS) else [])]
 
 
 def engines_table() -> list[str]:
