@@ -79,18 +79,19 @@ def twins(
     """Identify each twin, train with seed k under each condition, take every policy to its twin."""
     side_by_side([["stage=identify", f"arm.seed={seed}", f"name=judge_{seed}"] for seed in seeds])
     pairs = [(label, seed) for label in labels for seed in seeds]
-    jobs = {}
+    trainings = {}  # by name: those of the nominal model are the same for every twin
     for label, seed in pairs:
         model, dr = CONDITIONS[label]
         found = NOMINAL if model == "nominal" else (f"calibration=runs/identify/judge_{seed}",)
         name = trained(part, seed, label, k)
-        jobs[name] = [f"name={name}", f"dr={dr}", f"seed={k}", *training, *found]
-    side_by_side(list(jobs.values()))
+        trainings[name] = [f"name={name}", f"dr={dr}", f"seed={k}", *training, *found]
+    side_by_side(list(trainings.values()))
+    transfers = []
     for label, seed in pairs:
-        name = f"{part}_{seed}_{short(label)}_{k}"
         policy = f"policy=runs/train/{trained(part, seed, label, k)}"
-        jobs[name] = ["stage=transfer", policy, f"arm.seed={seed}", f"name={name}", *transfer]
-    side_by_side([jobs[name] for name in jobs if "transfer" in jobs[name][0]])
+        name = f"name={part}_{seed}_{short(label)}_{k}"
+        transfers.append(["stage=transfer", policy, f"arm.seed={seed}", name, *transfer])
+    side_by_side(transfers)
 
 
 def engines(policy: str) -> None:

@@ -21,6 +21,7 @@ import torch
 import yaml
 from conftest import REAL, ROOT
 
+from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
 
 TOY = ["+experiment=toy"]
@@ -281,6 +282,14 @@ MISTAKES = {
 }
 
 
+def one_line(done, pattern):
+    """Check that a command said what was wrong in one line on stderr, and ended with status 2."""
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert re.search(pattern, lines[0])
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistake_gets_one_line(mistake, recording, tmp_path):
     """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
@@ -316,10 +325,7 @@ def test_mistake_gets_one_line(mistake, recording, tmp_path):
     for word, path in places.items():
         command = command.replace(word, str(path))
     done = r2s(*command.split(), f"root={tmp_path / 'runs'}")
-    assert done.returncode == 2, done.stdout + done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert re.search(MISTAKES[mistake], lines[0])
+    one_line(done, MISTAKES[mistake])
     assert not (tmp_path / "runs").exists()
 
 
@@ -354,11 +360,21 @@ def test_mistake_in_a_transfer_gets_one_line(mistake, trained, tmp_path):
     if "address" in mistake:
         pytest.importorskip("panda_py")
     done = r2s("stage=transfer", f"policy={trained}", *mistake.split(), f"root={tmp_path / 'runs'}")
-    assert done.returncode == 2, done.stdout + done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert re.search(IN_TRANSFER[mistake], lines[0])
+    one_line(done, IN_TRANSFER[mistake])
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_policy_for_an_fr3_meets_one(root):
+    """Trained with its limits, which are those of the emulator, and through its client without a stop."""
+    pytest.importorskip("pylibfranka")
+    succeed("robot=fr3", "name=fr3", f"root={root}", *TOY)
+    config = yaml.safe_load((root / "train" / "fr3" / "config.yaml").read_text())["robot"]
+    np.testing.assert_array_equal(config["q_min"], fci.FR3_Q_MIN)
+    np.testing.assert_array_equal(config["q_max"], fci.FR3_Q_MAX)
+    np.testing.assert_array_equal(config["dq_max"], fci.FR3_DQ_MAX)
+    words = ["arm=fr3_emulated", "simulator=none", "evaluation.episodes=1", "name=fr3", f"root={root}"]
+    succeed("stage=transfer", f"policy={root / 'train' / 'fr3'}", *words, *TOY)
+    assert (root / "transfer" / "fr3" / "stops.txt").read_text() == "none\n"
 
 
 def test_names_that_are_taken_get_one_line(tmp_path):

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.actuation import Actuation, SoftLimits
-from r2s.arm.control import VELOCITY_NOISE
 from r2s.arm.deploy import reach
 from r2s.arm.driver import DEADLINE_S, Driver
-from r2s.arm.fci import FR3_Q_MAX, FR3_Q_MIN, fr3_velocity_bounds
+from r2s.arm.fci import outside_fr3
 from r2s.arm.fr3 import within_fr3
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.simulated import SimulatedArm
@@ -53,12 +52,8 @@ class FR3Reflexes(Reflexes):
     def state(self, q, dq):
         """Raise ArmStopped if an FR3 would."""
         super().state(q, dq)
-        if (q < FR3_Q_MIN).any() or (q > FR3_Q_MAX).any():
-            raise ArmStopped("beyond a position limit")
-        low, high = fr3_velocity_bounds(q)
-        over = np.maximum(low - dq, dq - high)
-        if (over > VELOCITY_NOISE).any():
-            raise ArmStopped(f"joint {over.argmax() + 1}: too fast near its position limit")
+        if (outside := outside_fr3(q, dq)) is not None:
+            raise ArmStopped(outside[1])
 
 
 def hostile(cycles, seed, robot=PANDA, check=None):

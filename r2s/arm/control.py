@@ -17,7 +17,6 @@ from r2s.robot import SIM_DT
 KINDS = ("late", "drop", "discontinuity", "joint_limit", "estop")
 PATIENCE = 20  # cycles without an answer, in a row, until Franka's arms stop themselves
 RATE_OVER = 100  # commands that control_command_success_rate looks back on
-VELOCITY_NOISE = 0.02  # rad/s, which an FR3's bound near a position limit must forgive a joint at rest
 INSIDE = 0.02  # rad from a position limit, to which an operator opens an arm that stopped beyond it
 GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, which the client's model wants to know from the state
 _ERRORS = (  # the words of `Reflexes`, and libfranka's place of the same error
@@ -131,7 +130,8 @@ class Control:
             error = next((place for word, place in _ERRORS if word in str(reason)), fci.JOINT_REFLEX)
             self._abort(error, str(reason))
             return
-        if self._version == 10 and (outside := self._outside_fr3()) is not None:
+        seen = self._arm.read()
+        if self._version == 10 and (outside := fci.outside_fr3(seen.q, seen.dq)) is not None:
             self._abort(*outside)
         elif self._has("joint_limit"):
             self._abort(fci.JOINT_POSITION_LIMITS, "a joint limit was injected")
@@ -163,25 +163,6 @@ class Control:
             self.state["errors"] = 0
             self._hold(np.clip(self._arm.read().q, low + INSIDE, high - INSIDE))
         return True
-
-    def _outside_fr3(self) -> tuple[int, str] | None:
-        """Return the error and the words for a joint beyond an FR3's limits."""
-        seen = self._arm.read()
-        out = np.maximum(fci.FR3_Q_MIN - seen.q, seen.q - fci.FR3_Q_MAX)
-        if out.max() > 0:
-            i = int(out.argmax())
-            allowed = f"{fci.FR3_Q_MIN[i]:g} to {fci.FR3_Q_MAX[i]:g}"
-            words = f"joint {i + 1}: position {seen.q[i]:.4f} rad, an FR3 allows {allowed}"
-            return fci.JOINT_POSITION_LIMITS, words
-        low, high = fci.fr3_velocity_bounds(seen.q)
-        over = np.maximum(low - seen.dq, seen.dq - high)
-        i = int(over.argmax())
-        if over[i] <= VELOCITY_NOISE:
-            return None
-        return fci.JOINT_VELOCITY, (
-            f"joint {i + 1}: velocity {seen.dq[i]:.3f} rad/s, at {seen.q[i]:.4f} rad an FR3 allows "
-            f"{low[i]:.3f} to {high[i]:.3f}"
-        )
 
     def _hold(self, q: np.ndarray) -> None:
         self._arm.move_to(q)

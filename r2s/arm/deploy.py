@@ -49,16 +49,17 @@ class Stop:
     """Why an episode ended early.
 
     Attributes:
-        episode: from 0. reason: in the words of the arm or of the driver.
+        episode: from 0. when: in it. reason: in the words of the arm or of the driver.
         log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, and the command Nm thereupon.
     """
 
     episode: int
+    when: str
     reason: str
     log: np.ndarray
 
     def __str__(self) -> str:
-        return f"episode {self.episode + 1}{self.reason}"
+        return f"episode {self.episode + 1}, {self.when}: {self.reason}"
 
 
 @torch.no_grad()
@@ -95,9 +96,9 @@ def reach(
     stops: list[Stop] = []
     seen: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
 
-    def stop(reason: str) -> None:
+    def stop(when: str, reason: object) -> None:
         rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in seen]
-        stops.append(Stop(e, reason, np.array(rows).reshape(-1, 1 + 4 * robot.n)))
+        stops.append(Stop(e, when, str(reason), np.array(rows).reshape(-1, 1 + 4 * robot.n)))
 
     def ask(q: np.ndarray, dq: np.ndarray, place: np.ndarray, jacobian: np.ndarray, goal: np.ndarray) -> np.ndarray:
         effort = driver.effort[None] / torque
@@ -119,7 +120,7 @@ def reach(
             state = arm.move_to(starts[e])
         except ArmStopped as reason:
             state, stopped = arm.read(), True
-            stop(f", on the way to its start: {reason}")
+            stop("on the way to its start", reason)
         place, jacobian = kinematics(state.q)
         distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
         before, sent = state.dq, 0.0
@@ -143,7 +144,7 @@ def reach(
                         if driver.done:
                             raise ArmStopped(driver.stopping)
                 except ArmStopped as reason:
-                    stop(f", {state.t:.2f} s: {reason}")
+                    stop(f"{state.t:.2f} s", reason)
                     stopped = True
                 place, jacobian = kinematics(state.q)
             q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, state.tau_J_d
@@ -152,7 +153,7 @@ def reach(
             before = state.dq
             reward[e, k] = worth(distance[e, k], distance0, state.dq, ddq)
         if not stopped and driver.stopping is not None:  # the end came before the arm was at rest
-            stop(f", {state.t:.2f} s: {driver.stopping}")
+            stop(f"{state.t:.2f} s", driver.stopping)
             stopped = True
         if stopped:
             distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs

@@ -42,7 +42,7 @@ class Rules(NamedTuple):
     Attributes:
         q_min, q_max: rad. most: rad/s, how fast joints may go. brake: rad/s^2, twice the deceleration that a way to a
             position limit is judged by. heavy: whose speed a target must not carry over what is allowed.
-        slowing, offset: as of Robot.slowing, doubled; harmless where there is none.
+        slowing, offset: those of Robot.slowing, the deceleration doubled; where there is none they bound nothing.
         soft_low, soft_high, soft_gain, soft_dq: as of r2s.actuation.SoftLimits.
     """
 

@@ -57,6 +57,7 @@ FR3_Q_MIN = np.array([-2.9007, -1.8361, -2.9007, -3.0770, -2.8763, 0.4398, -3.05
 FR3_Q_MAX = np.array([2.9007, 1.8361, 2.9007, -0.1169, 2.8763, 4.6216, 3.0508])
 FR3_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
 FR3_VELOCITY_OFFSET = np.array([0.6599, 0.2517, 0.2, 0.3533, 0.5757, 0.4878, 0.4628])
+FR3_VELOCITY_NOISE = 0.02  # rad/s, which that bound must forgive a joint at rest near its limit
 FR3_DECELERATION = np.array([6, 2.585, 3.5, 4, 17, 5.5, 17])
 
 _STATE = (
@@ -100,6 +101,22 @@ def fr3_velocity_bounds(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.minimum(FR3_DQ_MAX, np.maximum(0, free))
 
     return -bound(q - FR3_Q_MIN), bound(FR3_Q_MAX - q)
+
+
+def outside_fr3(q: np.ndarray, dq: np.ndarray) -> tuple[int, str] | None:
+    """Return the error and the words for a joint at q, dq (7,) rad, rad/s that is beyond an FR3's limits, or None."""
+    out = np.maximum(FR3_Q_MIN - q, q - FR3_Q_MAX)
+    i = int(out.argmax())
+    if out[i] > 0:
+        allowed = f"{FR3_Q_MIN[i]:g} to {FR3_Q_MAX[i]:g}"
+        return JOINT_POSITION_LIMITS, f"joint {i + 1}: position {q[i]:.4f} rad, an FR3 allows {allowed}"
+    low, high = fr3_velocity_bounds(q)
+    over = np.maximum(low - dq, dq - high)
+    i = int(over.argmax())
+    if over[i] <= FR3_VELOCITY_NOISE:
+        return None
+    allowed = f"{low[i]:.3f} to {high[i]:.3f}"
+    return JOINT_VELOCITY, f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, at {q[i]:.4f} rad an FR3 allows {allowed}"
 
 
 def urdf(robot: Robot) -> str:
