@@ -531,12 +531,12 @@ def transfer(cfg, overrides):
         if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = measures(done), done
-        if engine is not None and draw is not None:
-            progress, shown = counted(f"reach in {cfg.simulator.name}")
-            done = engine_reach(policy, engine, robot, task, draw, starts, goals, shown)
-            progress.close()
-            rows[cfg.simulator.name] = measures(done) | gap(done, episodes["mujoco"])
-            episodes[cfg.simulator.name] = done
+            if engine is not None:
+                progress, shown = counted(f"reach in {cfg.simulator.name}")
+                done = engine_reach(policy, engine, robot, task, draw, starts, goals, shown)
+                progress.close()
+                rows[cfg.simulator.name] = measures(done) | gap(done, episodes["mujoco"])
+                episodes[cfg.simulator.name] = done
         if arm is not None:
             fade = cfg.arm.soft_start_s
             if dynamics is not None:  # what the model says of this arm, behind the same driver
@@ -677,31 +677,6 @@ def check_overrides(words):
     GlobalHydra.instance().clear()
 
 
-def resumed(cfg, overrides):
-    """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
-    import json
-
-    from omegaconf import OmegaConf
-
-    from r2s.errors import UserError, nearest
-    from r2s.runs import check_not_running
-
-    folder = Path(cfg.resume)
-    if not (folder / "config.yaml").is_file():
-        names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
-        raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
-    if extra := [o for o in overrides if not o.startswith("resume=")]:
-        raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
-    before = OmegaConf.load(folder / "config.yaml")
-    if before.stage not in ("identify", "train"):
-        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
-    if json.loads((folder / "meta.json").read_text())["status"] == "done":
-        raise UserError(f"resume: {folder} is finished")
-    check_not_running(folder)
-    before.resume = str(folder)
-    return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
-
-
 def check_counts(cfg):
     """Raise UserError where what counts something is no such number."""
     from omegaconf import OmegaConf
@@ -726,6 +701,55 @@ def check_type(key, before, after):
     old, new = OmegaConf.select(before, key, throw_on_missing=False), OmegaConf.select(after, key)
     if number(old) and isinstance(new, str):
         raise UserError(f"{key}: '{new}' is not a number, such as {old:g}")
+
+
+def resumed(cfg, overrides):
+    """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
+    from omegaconf import OmegaConf
+
+    from r2s.errors import UserError, nearest
+    from r2s.runs import is_done
+
+    folder = Path(cfg.resume)
+    if not (folder / "config.yaml").is_file():
+        names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
+        raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
+    if extra := [o for o in overrides if not o.startswith("resume=")]:
+        raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
+    before = OmegaConf.load(folder / "config.yaml")
+    if before.stage not in ("identify", "train"):
+        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
+    if is_done(folder):
+        raise UserError(f"resume: {folder} is finished")
+    before.resume = str(folder)
+    return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
+
+
+def is_there(cfg, overrides):
+    """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
+    from omegaconf import OmegaConf
+
+    from r2s.errors import UserError
+    from r2s.runs import is_done
+
+    if not cfg.name:
+        raise UserError("only_missing: give the run folder a name=, such as name='${algo.name}_${seed}'")
+    folder = Path(cfg.root) / cfg.stage / cfg.name
+    if not (folder / "meta.json").is_file():
+        return False
+
+    def typed(words):
+        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
+        return {w for w in words if not w.startswith(beside)}
+
+    before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
+    if other := sorted(before ^ typed(overrides)):
+        raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
+    if is_done(folder):
+        print(f"already there: {folder}")
+        return True
+    cfg.resume = str(folder)
+    return False
 
 
 def main():
@@ -774,36 +798,6 @@ def main():
                 sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
-
-
-def is_there(cfg, overrides):
-    """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
-    import json
-
-    from omegaconf import OmegaConf
-
-    from r2s.errors import UserError
-    from r2s.runs import check_not_running
-
-    if not cfg.name:
-        raise UserError("only_missing: give the run folder a name=, such as name='${algo.name}_${seed}'")
-    folder = Path(cfg.root) / cfg.stage / cfg.name
-    if not (folder / "meta.json").is_file():
-        return False
-
-    def typed(words):
-        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
-        return {w for w in words if not w.startswith(beside)}
-
-    before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
-    if other := sorted(before ^ typed(overrides)):
-        raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
-    if json.loads((folder / "meta.json").read_text())["status"] == "done":
-        print(f"already there: {folder}")
-        return True
-    check_not_running(folder)
-    cfg.resume = str(folder)
-    return False
 
 
 def failed(error):

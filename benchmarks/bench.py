@@ -17,29 +17,19 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-import yaml
+from common import MACHINE, NEW, ROBOT, ROOT, conf
 from rich.console import Console
 from rich.table import Table
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
-
-from r2s import randomization  # noqa: E402
-from r2s.arm.twin import Twin  # noqa: E402
-from r2s.env import ReachEnv, Task, observation_scale  # noqa: E402
-from r2s.parameters import nominal_dynamics  # noqa: E402
-from r2s.robot import SIM_DT, load_robot  # noqa: E402
-from r2s.runs import _cpu  # noqa: E402
-from r2s.simulator import Simulator  # noqa: E402
-from r2s.tqc import TQC  # noqa: E402
-from r2s.train import keep_memory, products  # noqa: E402
+from r2s import randomization
+from r2s.arm.twin import Twin
+from r2s.env import ReachEnv, Task, observation_scale
+from r2s.robot import SIM_DT
+from r2s.simulator import Simulator
+from r2s.tqc import TQC
+from r2s.train import keep_memory, products
 
 REPEATS = 15
-
-
-def conf(path: str) -> dict:
-    """Read one file of conf/."""
-    return yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
 
 
 def duel(ours: Callable[[], object], peer: Callable[[], object], work: float) -> tuple[float, float]:
@@ -236,8 +226,7 @@ def twin(robot) -> tuple[float, float]:
 
 def main() -> None:
     """Run all and print one table."""
-    robot = load_robot(**conf("robot/panda"))
-    dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    robot, dynamics = ROBOT, NEW
     cores = os.cpu_count() or 1
     keep_memory()  # as a training does
     rows, sb3 = {"hidden twin / real time, cycles/s, 1 thread": twin(robot)}, Sb3()
@@ -250,7 +239,7 @@ def main() -> None:
             rows[f"TQC / TorchRL's TQCLoss, {way}"] = learner(robot, threads, matmul)
             rows[f"TQC / sb3-contrib's TQC, {way}"] = against_sb3(robot, threads, matmul, sb3)
     sb3.close()
-    table = Table(title=f"{_cpu()}, {cores} cores, mujoco {mujoco.__version__}, torch {torch.__version__}")
+    table = Table(title=f"{MACHINE}, mujoco {mujoco.__version__}, torch {torch.__version__}")
     for column in ("what", "r2s", "peer", "ratio"):
         table.add_column(column, justify="left" if column == "what" else "right")
     for what, (ours, peer) in rows.items():
@@ -258,7 +247,7 @@ def main() -> None:
     Console(width=110).print(table)
     folder = ROOT / "runs" / "bench"
     folder.mkdir(parents=True, exist_ok=True)
-    machine = {"cpu": _cpu(), "cores": cores, "python": platform.python_version(), "torch": torch.__version__}
+    machine = {"machine": MACHINE, "python": platform.python_version(), "torch": torch.__version__}
     measured = {k: {"r2s": o, "peer": p, "ratio": o / p} for k, (o, p) in rows.items()}
     (folder / "bench.json").write_text(json.dumps({"machine": machine, "rows": measured}, indent=1) + "\n")
     print(f"written: {folder.relative_to(ROOT)}/bench.json")

@@ -1,39 +1,28 @@
-"""What a person reads: figures (PNG), tables for the terminal, and the same in report.md and report.html.
+"""What a person reads: tables for the terminal, and the same in report.md and report.html.
 
 A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
-identification has is in r2s/report_identification.py.
+identification has is in r2s/report_identification.py, figures are in r2s/report_figures.py.
 """
 
 import os
 from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from html import escape as escape_html
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from r2s.comparison import Trained, band
 from r2s.friction import BRISTLE
 from r2s.identified import SHARPER, Identified
 from r2s.parameters import LINK, UNITS, WHOLE_ARM, Estimate, ParameterSpace, inertia_scale
 from r2s.robot import Robot
-from r2s.viewer import Episode, colours
 
-DPI = 120
-LEGEND_WIDTH = 160  # letters, of a figure
-MOST_POINTS = 4000  # of a line or a cloud in a figure
-LONGEST = 30.0  # s of torque in a figure: more is a solid band
-PAUSE = 0.1  # s on a figure's axis, for a pause of any length
 SUCCESS = {
     "success_5cm": "5 cm, %",
     "success_2cm": "2 cm, %",
@@ -48,150 +37,6 @@ LEGEND = (
 Item = str | list[str] | pd.DataFrame | Path  # of a report: paragraph, bullets, table, picture
 
 
-@contextmanager
-def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3) -> Iterator[list[Axes]]:
-    """Give `count` axes in a grid, with one legend for all, and save the figure to `path`."""
-    rows = -(-count // columns)
-    figure = Figure(figsize=(12, 0.9 + height * rows), dpi=DPI, layout="constrained")
-    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
-    yield axes
-    for axis in axes:
-        axis.grid(alpha=0.3, linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.title.set_fontsize(10)
-    figure.suptitle(title, fontsize=13, fontweight="bold")
-    named = {name: line for axis in axes for line, name in zip(*axis.get_legend_handles_labels(), strict=True)}
-    if named:
-        fit = max(1, LEGEND_WIDTH // (max(map(len, named)) + 6))
-        columns = min(len(named), 6, fit)
-        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-
-
-def joint_panels(path: Path, n: int, title: str):
-    """Give `panels` for n joints."""
-    return panels(path, n, 2 if n > 3 else 1, title)
-
-
-def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Make y logarithmic, with numbers that people read at these `ticks` of every decade."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=ticks))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return what leaves at most `most` of `count` rows."""
-    return slice(None, None, max(1, -(-count // most)))
-
-
-def torque_figure(
-    path: Path, t: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray], title: str
-) -> Path:
-    """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s: the paper's fig. 4.
-
-    The first `LONGEST` seconds are drawn, pauses cut short; the RMSE in the titles is over everything.
-    """
-    colour, (clock, pauses) = colours(["measured", *predicted]), clock_of(t)
-    rows = np.flatnonzero(clock <= LONGEST)
-    title += f" (the first {LONGEST:g} s of {clock[-1]:.0f} s)" if len(rows) < len(t) else ""
-    rows = rows[thin(len(rows))]
-    breaks = np.searchsorted(rows, pauses[pauses <= rows[-1]])  # no line over a pause
-
-    def line(values: np.ndarray) -> np.ndarray:
-        return np.insert(values[rows], breaks, np.nan)
-
-    with joint_panels(path, measured.shape[1], title) as axes:
-        for j, axis in enumerate(axes):
-            x = line(clock)
-            axis.plot(x, line(measured[:, j]), color=colour["measured"], linewidth=2.2, alpha=0.7, label="measured")
-            scores = []
-            for label, tau in predicted.items():
-                axis.plot(x, line(tau[:, j]), color=colour[label], linewidth=0.9, label=label)
-                scores.append(f"{label} {np.sqrt(np.mean((tau[:, j] - measured[:, j]) ** 2)):.3g}")
-            axis.set_title(f"joint {j + 1}: RMSE {', '.join(scores)} Nm", loc="left")
-            seconds = "time, s, pauses cut short" if len(pauses) else "time, s"
-            axis.set(xlabel=seconds, ylabel="torque, Nm", xlim=(0, clock[rows[-1]]))
-    return path
-
-
-def clock_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
-
-    A pause is a step of more than five usual ones, or a clock that starts again.
-    """
-    steps = np.diff(t)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    jump = (steps <= 0) | (steps > 5 * usual)
-    return np.concatenate([[0.0], np.cumsum(np.where(jump, PAUSE, steps))]), np.flatnonzero(jump) + 1
-
-
-def learning_figure(path: Path, runs: Mapping[str, pd.DataFrame]) -> Path:
-    """Draw success at 5, 2 and 1 cm and the paper's return over minutes; runs are {name: evaluations.csv}."""
-    shown = {
-        "success_5cm": "success at 5 cm, %",
-        "success_2cm": "success at 2 cm, %",
-        "success_1cm": "success at 1 cm, %",
-        "return_paper": "return, eq. (2) over 4 s",
-    }
-    colour = colours(runs)
-    with panels(path, len(shown), 2, "learning", height=3.0) as axes:
-        for axis, (column, title) in zip(axes, shown.items(), strict=True):
-            scale = 100 if column in SUCCESS else 1
-            for label, table in runs.items():
-                if column in table:
-                    minutes = table["wall_clock_s"] / 60
-                    axis.plot(minutes, scale * table[column], color=colour[label], marker=".", label=label)
-            if column in SUCCESS:
-                axis.set_ylim(-3, 103)
-            axis.set_title(title, loc="left")
-            axis.set_xlabel("wall clock, minutes")
-    return path
-
-
-def bands_figure(path: Path, grouped: Mapping[str, Sequence[Trained]]) -> Path:
-    """Draw learning curves of groups of seeds: interquartile mean and range, over env steps, updates and minutes."""
-    shown = {"success_1cm": "success at 1 cm, %", "return_paper": "return, eq. (2) over 4 s"}
-    over = {"env_steps": ("environment steps, thousand", 1e-3), "updates": ("updates, thousand", 1e-3)}
-    over |= {"wall_clock_s": ("wall clock, minutes", 1 / 60)}
-    colour = colours(grouped)
-    with panels(
-        path, len(shown) * len(over), len(over), "learning: seeds' interquartile mean, all seeds", 3.0
-    ) as axes:
-        places = [(y, x) for y in shown for x in over]
-        for axis, (y, x) in zip(axes, places, strict=True):
-            scale = 100 if y in SUCCESS else 1
-            for label, group in grouped.items():
-                at, (middle, low, high) = band(group, x, y)
-                axis.fill_between(over[x][1] * at, scale * low, scale * high, color=colour[label], alpha=0.18, lw=0)
-                axis.plot(over[x][1] * at, scale * middle, color=colour[label], label=label)
-            axis.set_title(shown[y], loc="left")
-            axis.set_xlabel(over[x][0])
-    return path
-
-
-def scores_figure(path: Path, table: pd.DataFrame) -> Path:
-    """Draw what `summary_table` returns: a dot and a 95 % interval per group, one panel per measure."""
-    names = {"success_1cm": "success at 1 cm, %", "success_5mm": "success at 5 mm, %"}
-    names |= {"distance_median_m": "median distance, mm", "return_paper": "return, eq. (2) over 4 s"}
-    scale = {"success_1cm": 100, "success_5mm": 100, "distance_median_m": 1e3, "return_paper": 1}
-    labels = list(dict.fromkeys(table["group"]))
-    colour = colours(labels)
-    with panels(path, len(names), 2, "last evaluation: interquartile mean and 95 % interval over seeds", 3.0) as axes:
-        for axis, measure in zip(axes, names, strict=True):
-            rows = table[table["measure"] == measure].set_index("group")
-            for i, label in enumerate(labels):
-                r = scale[measure] * rows.loc[label, ["iqm", "low", "high"]].astype(float)
-                axis.plot([r["low"], r["high"]], [i, i], color=colour[label], linewidth=4, alpha=0.4)
-                axis.plot([r["iqm"]], [i], "o", color=colour[label])
-            axis.set_yticks(range(len(labels)), labels)
-            axis.invert_yaxis()
-            axis.set_title(names[measure], loc="left")
-    return path
-
-
 def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
     """Return one row of strings per group: interquartile mean [95 % interval] of each measure."""
     names = {m: title for m, title in SUCCESS.items() if m in set(table["measure"])}
@@ -203,25 +48,6 @@ def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
         middle, low, high = (scale * r[k] for k in ("iqm", "low", "high"))
         cells[names[r["measure"]]] = f"{middle:.1f} [{low:.1f}, {high:.1f}]"
     return pd.DataFrame.from_dict(out, orient="index").rename_axis("success within")
-
-
-def reach_figure(path: Path, episodes: Mapping[str, Sequence[Episode]]) -> Path:
-    """Draw the distance to up to four goals over time, one line per label: MuJoCo against the arm."""
-    colour = colours(episodes)
-    count = max(1, min(4, max((len(e) for e in episodes.values()), default=0)))
-    with panels(path, count, min(count, 2), "distance to the goal", height=3.0) as axes:
-        for k, axis in enumerate(axes):
-            shown = {label: sequence[k] for label, sequence in episodes.items() if k < len(sequence)}
-            for label, episode in shown.items():
-                distance = 100 * np.maximum(episode.distance, 1e-5)
-                axis.plot(episode.t - episode.t[0], distance, color=colour[label], label=label)
-            for level in (5, 2, 1):
-                axis.axhline(level, color="#555555", linewidth=0.7, linestyle=":")
-            log_axis(axis)
-            goal = next((f" at ({', '.join(f'{x:.2f}' for x in e.goal)}) m" for e in shown.values()), "")
-            axis.set_title(f"goal {k + 1}{goal}", loc="left")
-            axis.set(xlabel="time, s", ylabel="distance, cm")
-    return path
 
 
 class Value(NamedTuple):

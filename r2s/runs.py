@@ -179,16 +179,16 @@ def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def check_not_running(folder: Path) -> None:
-    """Raise UserError if a process of this computer still writes into a run folder."""
+def is_done(folder: Path) -> bool:
+    """Return whether a run is finished; raises UserError if a process of this computer still writes into it."""
     meta = json.loads((folder / "meta.json").read_text())
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node() or process["pid"] == os.getpid():
-        return
+        return meta["status"] == "done"
     try:
         os.kill(process["pid"], 0)
     except ProcessLookupError:
-        return
+        return False
     except PermissionError:
         pass  # another user's
     raise UserError(f"{folder}: process {process['pid']} is still at it; wait for it, or stop it")

@@ -16,10 +16,15 @@ from r2s.identified import Identified
 from r2s.parameters import parameter_space
 from r2s.recording import Recording
 from r2s.report_figures import (
+    bands_figure,
     convergence_figure,
     friction_figure,
     latency_figure,
+    learning_figure,
     position_figure,
+    reach_figure,
+    scores_figure,
+    torque_figure,
     traces_figure,
     whiteness_figure,
     whiteness_table,
@@ -55,7 +60,7 @@ def identification(
     predicted = {label: motion.tau + e for label, e in error.items()}  # beside the recorded torque, delay undone
     kind = "commanded torque" if commanded else "link-side torque"
     title = f"{kind} of validation motion, low-pass {cutoff_hz:g} Hz"
-    pictures = {"torque": report.torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)}
+    pictures = {"torque": torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)}
     if commanded:
         windows = cut_windows(validation, max(window_s, 0.5) if validation.duration > 1.0 else window_s)
         replays = {label: replay(robot, d, windows) for label, d in both.items()}
@@ -91,7 +96,7 @@ def identification(
 def training(run: Run, robot: Robot) -> None:
     """Draw the learning curves."""
     curves = {run.folder.name: pd.read_csv(run.folder / "evaluations.csv")}
-    learning = report.learning_figure(run.figure("learning"), curves)
+    learning = learning_figure(run.figure("learning"), curves)
     write_recording(run.folder / "recording.rrd", robot, curves=curves, figures={"learning": learning})
 
 
@@ -109,15 +114,15 @@ def transfer(
     Args:
         run, robot: whose. episodes: per simulator and arm.
         rows: the same with what was measured. torque: (n,) Nm, the most that a policy may ask for.
-        timing: of the arm's cycle. stops: why the arm stopped.
+        timing: of the arm's cycle, None where there was no arm. stops: why the arm stopped.
     """
     shown = {label: first(e) for label, e in episodes.items()}
-    for label in episodes:
-        np.savez_compressed(run.folder / f"episodes_{label}.npz", **asdict(episodes[label]))
+    for label, e in episodes.items():
+        np.savez_compressed(run.folder / f"episodes_{label}.npz", **asdict(e))
     if stops:
         logs = {f"episode_{stop.episode + 1}": stop.log for stop in stops}
         np.savez_compressed(run.folder / "stops.npz", **logs)  # type: ignore[arg-type]
-    reach = report.reach_figure(run.figure("reach"), shown)
+    reach = reach_figure(run.figure("reach"), shown)
     traces = traces_figure(run.figure("traces"), episodes)
     pictures = {"traces": traces}
     sections: dict[str, Sequence] = {"The same policy and goals": [report.reach_rows(rows), report.gap_rows(rows)]}
@@ -125,9 +130,8 @@ def transfer(
         pictures["latency"] = latency_figure(run.figure("latency"), asdict(timing))
         cycle = pd.DataFrame(timing.table()).set_index("what").map(lambda x: f"{x:.3g}")
         sections["On the clock of this computer"] = [cycle]
-    write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures=pictures, torque=torque)
-    if "stops" in str(rows):
         sections["Why the arm stopped"] = [list(map(str, stops)) or "It did not."]
+    write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures=pictures, torque=torque)
     report.report_markdown(run.folder / "report.md", sections | {"Figures": [reach, *pictures.values()]})
 
 
@@ -145,8 +149,8 @@ def compare(run: Run, robot: Robot, runs: Sequence[Trained]) -> dict[str, pd.Dat
     for name, table in tables.items():
         if len(table):
             table.to_csv(run.folder / f"{name}.csv", index=False)
-    figures = {"learning": report.bands_figure(run.figure("learning"), grouped)}
-    figures["scores"] = report.scores_figure(run.figure("scores"), tables["scores"])
+    figures = {"learning": bands_figure(run.figure("learning"), grouped)}
+    figures["scores"] = scores_figure(run.figure("scores"), tables["scores"])
     curves = {r.folder.name: r.curve for r in runs}
     write_recording(run.folder / "recording.rrd", robot, curves=curves, figures=figures)
     sections: dict[str, Sequence] = {
@@ -187,9 +191,9 @@ def pipeline(
         predicted = {k: saved[k] for k in ("nominal", "identified")}
         overlay = Overlay(saved["t"], saved["measured"], predicted)
     title = "torque of validation motion"
-    learning = report.learning_figure(run.figure("learning"), curves)
-    torque = report.torque_figure(run.figure("torque"), overlay.t, overlay.measured, predicted, title)
-    pictures = [torque, learning, report.reach_figure(run.figure("reach"), episodes)]
+    learning = learning_figure(run.figure("learning"), curves)
+    torque = torque_figure(run.figure("torque"), overlay.t, overlay.measured, predicted, title)
+    pictures = [torque, learning, reach_figure(run.figure("reach"), episodes)]
     overlays = {"real against simulated torque": overlay}
     write_recording(
         run.folder / "recording.rrd",

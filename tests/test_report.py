@@ -152,13 +152,13 @@ def figures(folder: Path, robot: Robot, found: Identified) -> list[Path]:
     episodes = {"mujoco": [make_episode(robot, k) for k in range(5)], "arm": [make_episode(robot, 9)]}
     errors = {name: tau - overlay.measured for name, tau in overlay.predicted.items()}
     return [
-        report.torque_figure(folder / "torque.png", overlay.t, overlay.measured, overlay.predicted, "torque"),
+        report_figures.torque_figure(folder / "torque.png", overlay.t, overlay.measured, overlay.predicted, "torque"),
         report_figures.position_figure(folder / "position.png", windows, near),
         report_figures.friction_figure(folder / "friction.png", laws, robot.dq_max, cloud, draws),
         report_figures.convergence_figure(folder / "convergence.png", found.history),
         report_figures.whiteness_figure(folder / "whiteness.png", overlay.t, errors, 10.0, 0.4),
-        report.learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
-        report.reach_figure(folder / "reach.png", episodes),
+        report_figures.learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
+        report_figures.reach_figure(folder / "reach.png", episodes),
     ]
 
 
@@ -174,7 +174,7 @@ def test_every_figure_is_written_and_shows_something(tmp_path, panda, identified
 
 def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
     path = tmp_path / "recording.rrd"
-    picture = report.learning_figure(tmp_path / "learning.png", {"a": make_curve()})
+    picture = report_figures.learning_figure(tmp_path / "learning.png", {"a": make_curve()})
     labels = {"mujoco": 3, "twin, nominal": 2, "a/b": 1}
     written = viewer.write_recording(
         path,
@@ -412,7 +412,7 @@ def test_seconds_of_a_resumed_run_go_on():
 
 
 def test_pauses_are_cut_short():
-    clock, pauses = report.clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
+    clock, pauses = report_figures.clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
     assert pauses.tolist() == [3, 5]
 

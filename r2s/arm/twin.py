@@ -20,7 +20,7 @@ from numba import njit
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.engines.dart import DartEngine
 from r2s.engines.description import Links
-from r2s.errors import UserError, check_number
+from r2s.errors import check_number
 from r2s.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
@@ -55,8 +55,7 @@ class Twin:
     """
 
     def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None):
-        if not (np.isfinite(payload) and payload >= 0.0):
-            raise UserError(f"arm.payload: {payload!r} is not allowed; kg from 0 on are")
+        check_number("arm.payload", payload, "[0, inf)")
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")
         self.robot = robot
