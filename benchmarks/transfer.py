@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROBOT, ROOT, STEADY, markdown, side_by_side
+from common import MACHINE, ROOT, STEADY, markdown, side_by_side
 
 from r2s.arm.driver import ALLOWED, FREE
 from r2s.evaluate import Episodes, gap
@@ -216,9 +216,7 @@ def twins_tables() -> list[str]:
 
 def driver_in_the_gap() -> list[str]:
     """Return what part of the way from the simulation of the training to the twin is the driver's."""
-    fast = FREE * ALLOWED
     ways = ("simulation to twin, mm", "simulation to model behind the driver, mm", "from there to twin, mm")
-    shares = (f"faster than {fast:.2f} in simulation, %", "behind the driver, %")
     out = {}
     for label in ("nominal, no DR", "identified, no DR"):  # without DR the simulation is the model itself
         rows = []
@@ -227,18 +225,17 @@ def driver_in_the_gap() -> list[str]:
                 files = (folder / f"episodes_{where}.npz" for where in ("mujoco", "predicted", "twin"))
                 trained, predicted, twin = (Episodes(**np.load(file)) for file in files)
                 pairs = (trained, twin), (trained, predicted), (predicted, twin)
-                over = [(np.abs(e.dq) > fast * ROBOT.dq_max).any((1, 2)).mean() for e in (trained, predicted)]
-                rows.append([gap(a, b)["ee_path_rmse_mm"] for a, b in pairs] + [100 * share for share in over])
+                rows.append([gap(a, b)["ee_path_rmse_mm"] for a, b in pairs])
         if rows:
-            out[label] = dict(zip(ways + shares, np.mean(rows, axis=0), strict=True))
+            out[label] = dict(zip(ways, np.mean(rows, axis=0), strict=True))
     if len(out) < 2:
         return []
     table = pd.DataFrame.from_dict(out, orient="index").rename_axis("trained on")
     nominal, identified = table[ways[0]]
     return [
         "The gaps above leave out the driver, of which trainings know nothing: it takes torque away where a joint is "
-        f"about to be faster than {fast:.2f} of its limit, and sooner near position limits. RMSE of the path, and "
-        "episodes with a joint that fast, means over twins and training seeds; the second column is the driver's:",
+        f"about to be faster than {FREE * ALLOWED:.2f} of its limit, and sooner near position limits. RMSE of the "
+        "path, means over twins and training seeds; the second column is the driver's:",
         markdown(table.map(lambda x: f"{x:.1f}")),
         "From the simulation as trained in to the twin, identification shrinks the gap only "
         f"{nominal / identified:.1f} times.",
