@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 from common import MACHINE, ROOT, markdown, side_by_side
 
-from r2s.comparison import groups, improvement_table, read_runs, sensitivity_table, summary_table
-from r2s.report import scores_rows
+from r2s.reporting.comparison import groups, improvement_table, read_runs, sensitivity_table, summary_table
+from r2s.reporting.tables import scores_rows
 
 ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
 SEEDS = range(20, 25)

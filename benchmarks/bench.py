@@ -21,13 +21,14 @@ from common import MACHINE, NEW, ROBOT, ROOT, conf
 from rich.console import Console
 from rich.table import Table
 
-from r2s import randomization
 from r2s.arm.twin import Twin
-from r2s.env import ReachEnv, Task, observation_scale
-from r2s.robot import SIM_DT
-from r2s.simulator import Simulator
-from r2s.tqc import TQC
-from r2s.train import keep_memory, products
+from r2s.learning import randomization
+from r2s.learning.env import ReachEnv
+from r2s.learning.tqc import TQC
+from r2s.learning.train import keep_memory, products
+from r2s.physics.robot import SIM_DT
+from r2s.physics.simulator import Simulator
+from r2s.tasks.reach import Task, observation_scale
 
 REPEATS = 15
 
@@ -95,7 +96,7 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
 def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     """TQC updates against TorchRL's eager TQCLoss with the same networks, batch and optimiser, updates/s.
 
-    Ours are compiled, as a training's are; `matmul` is the precision of their products (r2s/train.py).
+    Ours are compiled, as a training's are; `matmul` is the precision of their products (r2s/learning/train.py).
     """
     from tensordict import TensorDict
     from tensordict.nn import TensorDictModule

@@ -16,10 +16,10 @@ sys.path.insert(0, str(ROOT))
 from hydra.utils import instantiate  # noqa: E402
 
 from r2s.arm.ramp import poses_about, ramp  # noqa: E402
-from r2s.arm.record import record  # noqa: E402
-from r2s.excitation import fourier  # noqa: E402
-from r2s.parameters import nominal_dynamics  # noqa: E402
-from r2s.robot import load_robot  # noqa: E402
+from r2s.arm.tracking import record  # noqa: E402
+from r2s.excitation.fourier import fourier  # noqa: E402
+from r2s.physics.dynamics import nominal_dynamics  # noqa: E402
+from r2s.physics.robot import load_robot  # noqa: E402
 from r2s.runs import _cpu  # noqa: E402
 
 

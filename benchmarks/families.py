@@ -12,8 +12,8 @@ import numpy as np
 from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
 
 from r2s.arm.simulated import SimulatedArm
-from r2s.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK
-from r2s.validation import compare_families
+from r2s.identification.family_selection import compare_families
+from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK
 
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
 

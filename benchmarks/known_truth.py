@@ -13,9 +13,9 @@ from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, poses_about, ra
 
 from r2s.arm.interface import ArmStopped
 from r2s.arm.simulated import SimulatedArm
-from r2s.identify import identify
-from r2s.parameters import inertia_scale
-from r2s.validation import prediction_errors
+from r2s.identification.identify import identify
+from r2s.identification.link_inertia import inertia_scale
+from r2s.identification.prediction import prediction_errors
 
 TRUTH = replace(NEW, delay=3e-3)
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}

@@ -10,9 +10,9 @@ import sys
 import numpy as np
 from common import MACHINE, OLD, ROBOT, ROOT, how, searches
 
-from r2s.identify import identify
-from r2s.readers import read
-from r2s.validation import prediction_errors
+from r2s.identification.identify import identify
+from r2s.identification.prediction import prediction_errors
+from r2s.recordings.readers import read
 
 COLUMNS = {"t": "t", "q": "q", "dq": "dq", "tau": None, "trajectory": None}
 BLOCKS = {"first third": (0.0, 1 / 3), "middle third": (1 / 3, 2 / 3), "last third": (2 / 3, 1.0)}

@@ -67,10 +67,12 @@ def there(seed: int, path: str) -> None:
     from sb3_contrib import TQC
     from stable_baselines3.common.callbacks import BaseCallback
 
-    from r2s import randomization
-    from r2s.env import ReachEnv, Task, observation_scale
-    from r2s.evaluate import make_evaluation, measures
-    from r2s.rewards import curriculum
+    from r2s.learning import randomization
+    from r2s.learning.env import ReachEnv
+    from r2s.learning.evaluate import make_evaluation
+    from r2s.tasks.episode import measures
+    from r2s.tasks.reach import Task, observation_scale
+    from r2s.tasks.rewards import curriculum
 
     torch.set_num_threads(1)
     task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})

@@ -13,10 +13,10 @@ from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, record, replace, sea
 from known_truth import NOISE, TERMS, TRUTH
 
 from r2s.arm.simulated import SimulatedArm
-from r2s.identify import CLEAR
-from r2s.problem import Problem, searched
-from r2s.replay_residual import ReplayResidual
-from r2s.torque_residual import TorqueResidual
+from r2s.identification.identify import CLEAR
+from r2s.identification.problem import Problem, searched
+from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.torque_residual import TorqueResidual
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

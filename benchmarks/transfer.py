@@ -23,8 +23,8 @@ import numpy as np
 import pandas as pd
 from common import MACHINE, ROOT, STEADY, markdown, side_by_side
 
-from r2s.arm.driver import ALLOWED, FREE
-from r2s.evaluate import Episodes, gap
+from r2s.physics.limits import ALLOWED, FREE
+from r2s.tasks.episode import Episodes, gap
 
 RUNS = ROOT / "runs"
 DRIVER = RUNS / "bench" / "driver.csv"

@@ -12,8 +12,8 @@ import numpy as np
 from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, poses_about, ramp, record, searches
 
 from r2s.arm.twin import Twin
-from r2s.identify import identify
-from r2s.validation import prediction_errors
+from r2s.identification.identify import identify
+from r2s.identification.prediction import prediction_errors
 
 
 def one(seed: int) -> dict:

@@ -11,7 +11,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
@@ -22,6 +21,7 @@ from typing import Any, Self
 import numpy as np
 
 from r2s.errors import UserError
+from r2s.files import whole
 
 PACKAGES = (
     "mujoco",
@@ -112,10 +112,8 @@ class Run:
         if not path.is_file():
             done = {k: np.asarray(v) for k, v in make().items()}
             path.parent.mkdir(exist_ok=True)
-            part = path.with_suffix(".part")
-            with open(part, "wb") as file:
-                np.savez(file, **done)  # type: ignore[arg-type]
-            os.replace(part, path)
+            with whole(path) as part:
+                np.savez(part, **done)  # type: ignore[arg-type]
         with np.load(path) as file:
             return {k: file[k] for k in file.files}
 
@@ -166,9 +164,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
             return [finite(v) for v in node]
         return None if isinstance(node, float) and not math.isfinite(node) else node
 
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(finite(document), indent=1) + "\n")
-    os.replace(part, path)
+    with whole(path) as part:
+        part.write_text(json.dumps(finite(document), indent=1) + "\n")
 
 
 def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
@@ -250,38 +247,3 @@ def _cpu() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-class Progress:
-    """A line that says how far, how fast, how long still; rewritten on a terminal, now and then elsewhere."""
-
-    def __init__(self, label: str, every_s: float = 10.0):
-        self._label, self._began, self._shown = label, time.perf_counter(), 0.0
-        self._live = sys.stderr.isatty()
-        self._every = 0.2 if self._live else every_s
-        self._width = 0
-
-    def __call__(self, share: float, text: str = "") -> None:
-        """Show that `share` of the work is done, with a rate or result in `text`."""
-        now = time.perf_counter()
-        if now - self._shown < self._every:
-            return
-        self._shown = now
-        elapsed = now - self._began
-        left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
-        line = f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}".rstrip()
-        if self._live:
-            self._width = max(self._width, len(line))
-            print("\r" + line.ljust(self._width)[:180], end="", file=sys.stderr, flush=True)
-        else:
-            print(line, file=sys.stderr, flush=True)
-
-    def close(self, text: str = "") -> None:
-        """End the line with what came of it."""
-        line = f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}".rstrip()
-        print(("\r" + line.ljust(self._width)) if self._live else line, file=sys.stderr, flush=True)
-
-
-def clock(seconds: float) -> str:
-    """Return m:ss."""
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

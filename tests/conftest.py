@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from r2s.robot import Robot, load_robot
+from r2s.physics.robot import Robot, load_robot
 
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"

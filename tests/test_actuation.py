@@ -9,11 +9,12 @@ from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.actuation import MAX_DELAY, Motors
 from r2s.arm.simulated import SimulatedArm
-from r2s.env import ReachEnv, Task
-from r2s.parameters import nominal_dynamics
-from r2s.robot import SIM_DT
+from r2s.learning.env import ReachEnv
+from r2s.physics.actuation import MAX_DELAY, Motors
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import SIM_DT
+from r2s.tasks.reach import Task
 
 
 def noise(m, steps, n=3, seed=0):

@@ -20,15 +20,16 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions import TanhNormal
 from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
 
-from r2s.ddpg import DDPG
-from r2s.env import Task, observation_scale
 from r2s.errors import UserError
-from r2s.networks import Critics, Learner
-from r2s.policy import export_onnx, load_policy, save_policy
-from r2s.sac import SAC
-from r2s.td3 import TD3
-from r2s.tqc import TQC
-from r2s.train import train
+from r2s.learning.ddpg import DDPG
+from r2s.learning.learner import Learner
+from r2s.learning.networks import Critics
+from r2s.learning.policy import export_onnx, load_policy, save_policy
+from r2s.learning.sac import SAC
+from r2s.learning.td3 import TD3
+from r2s.learning.tqc import TQC
+from r2s.learning.train import train
+from r2s.tasks.reach import Task, observation_scale
 
 ALL = (DDPG, TD3, SAC, TQC)
 NEAR = {"rtol": 1e-5, "atol": 1e-5}

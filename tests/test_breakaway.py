@@ -11,11 +11,12 @@ from r2s.arm.interface import ArmStopped
 from r2s.arm.ramp import MARGIN, ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
-from r2s.breakaway import Ramps, breakaway
 from r2s.errors import UserError
-from r2s.parameters import nominal_dynamics
-from r2s.readers import read
-from r2s.recording import Recording
+from r2s.identification.breakaway import breakaway
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.recordings.ramps import Ramps
+from r2s.recordings.readers import read
+from r2s.recordings.recording import Recording
 
 ELSEWHERE = np.array([0.4, 0.3, -0.4, 0.4, 0.5, 0.4, -0.5])  # rad from home
 

@@ -13,17 +13,17 @@ import pytest
 import torch
 from conftest import conf
 
-from r2s import rewards
-from r2s.env import ReachEnv, Task, observation_scale
 from r2s.errors import UserError
-from r2s.evaluate import make_evaluation
-from r2s.friction import BRISTLE
-from r2s.parameters import nominal_dynamics, of_family
-from r2s.randomization import draw
-from r2s.robot import load_robot
-from r2s.simulator import Dynamics
-from r2s.tqc import TQC
-from r2s.train import Budget, replay, train
+from r2s.learning.env import ReachEnv
+from r2s.learning.evaluate import make_evaluation
+from r2s.learning.randomization import draw
+from r2s.learning.tqc import TQC
+from r2s.learning.train import Budget, replay, train
+from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
+from r2s.physics.friction import BRISTLE
+from r2s.physics.robot import load_robot
+from r2s.tasks import rewards
+from r2s.tasks.reach import Task, observation_scale
 
 ROOT = Path(__file__).parent.parent
 QUICK = [

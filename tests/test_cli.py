@@ -30,7 +30,14 @@ TOY = ["+experiment=toy"]
 # Commands are forked off a server that has imported what they import anyway: seconds less for each of a hundred.
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
-    ["hydra", "r2s.arm.deploy", "r2s.engines.episodes", "r2s.report", "r2s.tell", "r2s.tqc", "r2s.train"]
+    [
+        "hydra",
+        "r2s.arm.deploy",
+        "r2s.engines.episodes",
+        "r2s.reporting.pages",
+        "r2s.learning.tqc",
+        "r2s.learning.train",
+    ]
 )
 
 
@@ -200,9 +207,9 @@ def test_exported_policy_is_the_trained_policy(trained):
     import onnxruntime
     import torch
 
-    from r2s.env import Task
-    from r2s.policy import load_policy
-    from r2s.robot import load_robot
+    from r2s.learning.policy import load_policy
+    from r2s.physics.robot import load_robot
+    from r2s.tasks.reach import Task
 
     config = yaml.safe_load((trained / "config.yaml").read_text())
     task = Task(**(config["task"] | {"reach": tuple(config["task"]["reach"])}))

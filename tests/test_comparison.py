@@ -6,18 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from r2s.comparison import (
-    band,
-    groups,
-    improvement,
-    improvement_table,
-    interquartile_mean,
-    interval,
-    read_runs,
-    sensitivity_table,
-    summary_table,
-)
 from r2s.errors import UserError
+from r2s.reporting.comparison import band, groups, improvement_table, read_runs, sensitivity_table, summary_table
+from r2s.reporting.statistics import improvement, interquartile_mean, interval
 
 
 def write_run(folder, seed, lr, score, algo="tqc", status="done", extra=""):

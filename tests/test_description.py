@@ -10,11 +10,11 @@ import pytest
 from conftest import conf
 from test_engines import ODD_ARM
 
-from r2s.engines.description import coulomb_viscous, write_mjcf, write_sdf, write_urdf
 from r2s.errors import UserError
-from r2s.parameters import nominal_dynamics
-from r2s.robot import load_robot
-from r2s.simulator import single_arm
+from r2s.physics.description import coulomb_viscous, write_mjcf, write_sdf, write_urdf
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
+from r2s.physics.simulator import single_arm
 
 
 def identified(robot):

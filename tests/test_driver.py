@@ -8,18 +8,19 @@ from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.actuation import Actuation, SoftLimits
 from r2s.arm.deploy import reach
 from r2s.arm.driver import DEADLINE_S, Driver
 from r2s.arm.fci import outside_fr3
 from r2s.arm.fr3 import within_fr3
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.simulated import SimulatedArm
-from r2s.env import Task
-from r2s.evaluate import fixed_episodes
-from r2s.parameters import nominal_dynamics
-from r2s.policy import make_policy
-from r2s.robot import SIM_DT, load_robot
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import make_policy
+from r2s.physics.actuation import Actuation
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.tasks.reach import Task
 
 PANDA = load_robot(**conf("robot/panda"))
 TASK = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})

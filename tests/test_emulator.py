@@ -23,19 +23,19 @@ import torch
 from conftest import ROOT, conf
 
 from r2s.arm import fci
-from r2s.arm.control import Control, Fault
 from r2s.arm.deploy import reach
-from r2s.arm.emulator import Emulator, main
+from r2s.arm.emulator.control import Control, Fault
+from r2s.arm.emulator.process import Emulator, main
+from r2s.arm.emulator.server import listen
 from r2s.arm.fr3 import FR3
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.panda import Panda
-from r2s.arm.server import listen
 from r2s.arm.twin import Twin
-from r2s.env import Task
 from r2s.errors import UserError
-from r2s.evaluate import fixed_episodes
-from r2s.policy import make_policy
-from r2s.robot import SIM_DT, load_robot
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import make_policy
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.tasks.reach import Task
 
 CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3, 10)}
 CYCLES = 300

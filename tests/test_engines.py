@@ -8,16 +8,16 @@ import pytest
 import torch
 from conftest import conf
 
-from r2s import randomization
 from r2s.engines.dart import DartEngine
 from r2s.engines.episodes import reach
 from r2s.engines.interface import MujocoEngine
-from r2s.env import Task
 from r2s.errors import UserError
-from r2s.evaluate import fixed_episodes, make_evaluation
-from r2s.parameters import nominal_dynamics
-from r2s.policy import make_policy
-from r2s.robot import load_robot
+from r2s.learning import randomization
+from r2s.learning.evaluate import fixed_episodes, make_evaluation
+from r2s.learning.policy import make_policy
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
+from r2s.tasks.reach import Task
 
 ODD_ARM = """
 <mujoco model="odd">

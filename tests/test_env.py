@@ -11,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs.utils import check_env_specs
 
-from r2s import randomization
-from r2s.actuation import Actuation, SoftLimits, low_pass_gain
-from r2s.env import ReachEnv, Task, observation_scale, observe, sample_goals
 from r2s.errors import UserError
-from r2s.parameters import nominal_dynamics
-from r2s.rewards import PAPER, TERMS, curriculum, terms
+from r2s.learning import randomization
+from r2s.learning.env import ReachEnv
+from r2s.physics.actuation import Actuation, low_pass_gain
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.tasks.reach import Task, observation_scale, observe, sample_goals
+from r2s.tasks.rewards import PAPER, TERMS, curriculum, terms
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
 
@@ -319,7 +321,7 @@ def test_a_list_of_torque_fractions_must_fit(panda):
 
 def test_the_observation_is_the_one_an_arm_gives(make):
     """What the environment returns is `observe` of state, nominal kinematics, goal and last command, as on an arm."""
-    from r2s.evaluate import Kinematics
+    from r2s.physics.rigid_body import Kinematics
 
     env = make(4)
     run(env, actions(3, 4))

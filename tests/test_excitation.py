@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from conftest import conf
 
-from r2s.arm.record import record
+from r2s.arm.tracking import record
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
-from r2s.excitation import Excitation, fourier, information, load
-from r2s.motion_checks import (
+from r2s.excitation.fourier import fourier, information
+from r2s.excitation.motion import Excitation, load
+from r2s.excitation.safety import (
     CLEARANCE_M,
     TORQUE_SHARE,
     Space,
@@ -25,9 +26,9 @@ from r2s.motion_checks import (
     check_torque,
     friction_margin,
 )
-from r2s.recording import Recording
-from r2s.regressor import GRAVITY, Links, regressor
-from r2s.robot import load_robot
+from r2s.physics.rigid_body import GRAVITY, Links, regressor
+from r2s.physics.robot import load_robot
+from r2s.recordings.recording import Recording
 
 
 @cache

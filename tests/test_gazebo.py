@@ -8,8 +8,8 @@ from conftest import conf
 from r2s.engines.dart import DartEngine
 from r2s.engines.gazebo import RELEASES, GazeboEngine, bindings
 from r2s.errors import UserError
-from r2s.parameters import nominal_dynamics
-from r2s.robot import load_robot
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
 
 
 @pytest.fixture(scope="module")

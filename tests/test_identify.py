@@ -10,26 +10,29 @@ from conftest import REAL, conf
 from hydra.utils import instantiate
 
 from r2s.arm.ramp import ramp
-from r2s.arm.record import record
 from r2s.arm.simulated import SimulatedArm
+from r2s.arm.tracking import record
 from r2s.errors import UserError
-from r2s.excitation import fourier
-from r2s.friction import FAMILIES, family
-from r2s.identified import _settled
-from r2s.identify import identify
-from r2s.parameters import LINK, inertia_scale, nominal_dynamics, of_family, parameter_space
-from r2s.problem import searched
-from r2s.randomization import draw_identified, physical
-from r2s.readers import read
-from r2s.recording import Recording
-from r2s.replay_residual import ReplayResidual
-from r2s.robot import load_robot
-from r2s.search_cmaes import CovarianceAdaptation
-from r2s.search_ga import Genetic
-from r2s.search_least_squares import LeastSquares
-from r2s.torque_residual import TorqueResidual
-from r2s.validation import left_out, prediction_errors
-from r2s.windows import cut_windows, replay
+from r2s.excitation.fourier import fourier
+from r2s.identification.family_selection import left_out
+from r2s.identification.identify import identify
+from r2s.identification.link_inertia import LINK, inertia_scale
+from r2s.identification.parameters import parameter_space
+from r2s.identification.prediction import prediction_errors
+from r2s.identification.problem import searched
+from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.search.cmaes import CovarianceAdaptation
+from r2s.identification.search.genetic import Genetic
+from r2s.identification.search.least_squares import LeastSquares
+from r2s.identification.torque_residual import TorqueResidual
+from r2s.identification.uncertainty import _settled
+from r2s.identification.windows import cut_windows, replay
+from r2s.learning.randomization import draw_identified, physical
+from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.physics.friction import FAMILIES, family
+from r2s.physics.robot import load_robot
+from r2s.recordings.readers import read
+from r2s.recordings.recording import Recording
 
 ARM = """
 <mujoco model="threelink">

@@ -5,11 +5,13 @@ import pytest
 import torch
 from conftest import conf
 
-from r2s.env import Task
-from r2s.evaluate import fixed_episodes, make_evaluation, measures
-from r2s.oracle import Oracle, minimum_jerk
-from r2s.parameters import nominal_dynamics
-from r2s.robot import load_robot
+from r2s.excitation.minimum_jerk import minimum_jerk
+from r2s.learning.computed_torque import Oracle
+from r2s.learning.evaluate import fixed_episodes, make_evaluation
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
+from r2s.tasks.episode import measures
+from r2s.tasks.reach import Task
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,7 @@ def test_a_wrong_model_shows(panda, task, dynamics):
 def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dynamics):
     """The hand is at the goal to 0.2 mm."""
     oracle = Oracle(panda, task, dynamics)
-    from r2s.evaluate import Kinematics
+    from r2s.physics.rigid_body import Kinematics
 
     kinematics = Kinematics(panda)
     for start, goal in zip(*fixed_episodes(panda, task, 40), strict=True):

@@ -10,26 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.errors import UserError
-from r2s.friction import FAMILIES, STRIBECK
-from r2s.parameters import (
-    CHOLESKY,
-    LINK,
-    UNITS,
-    WHOLE_ARM,
-    Estimate,
-    inertia_scale,
-    links,
-    load_parameters,
-    load_posterior,
-    log_cholesky,
-    nominal_dynamics,
-    of_family,
-    parameter_space,
-    pseudo_inertia,
-    save_parameters,
-)
-from r2s.randomization import draw, draw_identified, physical
-from r2s.robot import load_robot
+from r2s.identification.link_inertia import CHOLESKY, LINK, inertia_scale, links, log_cholesky, pseudo_inertia
+from r2s.identification.parameter_file import load_parameters, load_posterior, save_parameters
+from r2s.identification.parameters import UNITS, WHOLE_ARM, Estimate, parameter_space
+from r2s.learning.randomization import draw, draw_identified, physical
+from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.physics.friction import FAMILIES, STRIBECK
+from r2s.physics.robot import load_robot
 
 ALL = conf("config")["identify"]["bounds"]
 EDGES = {"breakaway_positive": [0.0, 1.5], "breakaway_negative": [-1.5, 0.0]}

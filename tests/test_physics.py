@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from r2s.actuation import SoftLimits
 from r2s.errors import UserError
-from r2s.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
-from r2s.robot import load_robot
-from r2s.simulator import Dynamics, Simulator
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
+from r2s.physics.limits import SoftLimits
+from r2s.physics.robot import load_robot
+from r2s.physics.simulator import Simulator
 
 ONE_JOINT = """
 <mujoco model="light">
@@ -470,7 +471,7 @@ def test_a_pushed_joint_reaches_the_speed_at_which_friction_balances(light, law)
 
 UNTOUCHED = """
 import mujoco, numpy as np
-from r2s import friction
+from r2s.physics import native_friction as friction
 ARM = '''<mujoco>{size}<worldbody><body><joint axis="0 1 0" damping="0.1" {user}/><geom size="0.1" pos="0 0 -0.3"/>
 <body pos="0 0 -0.3"><joint axis="0 1 0" {user}/><geom size="0.05" pos="0 0 -0.3"/></body></body>
 </worldbody></mujoco>'''

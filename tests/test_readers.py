@@ -13,8 +13,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from r2s.errors import UserError
-from r2s.readers import files_of, read
-from r2s.readers_robot import choose_joints
+from r2s.recordings.readers import files_of, read
+from r2s.recordings.robot_logs import choose_joints
 
 PANDA = [f"panda_joint{j}" for j in range(1, 8)]
 EPOCH = 1_700_000_000_123_456_789  # ns

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from r2s.errors import UserError
-from r2s.readers import read
-from r2s.recording import SPLIT_GUARD_S, Recording
+from r2s.recordings.readers import read
+from r2s.recordings.recording import SPLIT_GUARD_S, Recording
 
 GAZ2019 = Path(__file__).parents[2] / "shared/data/gaz2019_panda/train.npz"
 OMEGA = 2 * np.pi * 1.3  # rad/s

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from r2s.parameters import links
-from r2s.regressor import GRAVITY, Links, kinematics, regressor, rigid_body, six
-from r2s.robot import load_robot
+from r2s.identification.link_inertia import links
+from r2s.physics.rigid_body import GRAVITY, Links, kinematics, regressor, rigid_body, six
+from r2s.physics.robot import load_robot
 
 
 def numbers(values):

@@ -19,14 +19,35 @@ from matplotlib.image import imread
 from rerun.chunk import RrdReader
 from rich.console import Console
 
-from r2s import report, report_figures, report_identification, tell, viewer
-from r2s.friction import BRISTLE
-from r2s.identified import Identified
-from r2s.parameters import LINK, Estimate, nominal_dynamics, of_family, parameter_space
-from r2s.recording import Recording
-from r2s.robot import Robot, load_robot
-from r2s.validation import prediction_errors
-from r2s.viewer import Episode, Overlay
+from r2s.identification.link_inertia import LINK
+from r2s.identification.parameters import Estimate, parameter_space
+from r2s.identification.prediction import prediction_errors
+from r2s.identification.uncertainty import Identified
+from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.physics.friction import BRISTLE
+from r2s.physics.robot import Robot, load_robot
+from r2s.recordings.recording import Recording
+from r2s.reporting import pages, viewer
+from r2s.reporting.colours import colours
+from r2s.reporting.document import UNSEEN, report_html, report_markdown
+from r2s.reporting.doubts import _grouped
+from r2s.reporting.figures import clock_of
+from r2s.reporting.identification_figures import (
+    _running,
+    autocorrelation,
+    convergence_figure,
+    friction_figure,
+    position_figure,
+    torque_figure,
+    whiteness_figure,
+    whiteness_table,
+)
+from r2s.reporting.identification_page import identification_sections
+from r2s.reporting.identification_tables import identification_table, identification_tables
+from r2s.reporting.learning_figures import learning_figure
+from r2s.reporting.reach_figures import reach_figure
+from r2s.reporting.tables import SUCCESS, reach_table
+from r2s.reporting.viewer_layout import PAUSE, Episode, Overlay, clock_of_log, starts_of
 
 EVERY_SHAPE = """
 <mujoco model="shapes">
@@ -152,13 +173,13 @@ def figures(folder: Path, robot: Robot, found: Identified) -> list[Path]:
     episodes = {"mujoco": [make_episode(robot, k) for k in range(5)], "arm": [make_episode(robot, 9)]}
     errors = {name: tau - overlay.measured for name, tau in overlay.predicted.items()}
     return [
-        report_figures.torque_figure(folder / "torque.png", overlay.t, overlay.measured, overlay.predicted, "torque"),
-        report_figures.position_figure(folder / "position.png", windows, near),
-        report_figures.friction_figure(folder / "friction.png", laws, robot.dq_max, cloud, draws),
-        report_figures.convergence_figure(folder / "convergence.png", found.history),
-        report_figures.whiteness_figure(folder / "whiteness.png", overlay.t, errors, 10.0, 0.4),
-        report_figures.learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
-        report_figures.reach_figure(folder / "reach.png", episodes),
+        torque_figure(folder / "torque.png", overlay.t, overlay.measured, overlay.predicted, "torque"),
+        position_figure(folder / "position.png", windows, near),
+        friction_figure(folder / "friction.png", laws, robot.dq_max, cloud, draws),
+        convergence_figure(folder / "convergence.png", found.history),
+        whiteness_figure(folder / "whiteness.png", overlay.t, errors, 10.0, 0.4),
+        learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
+        reach_figure(folder / "reach.png", episodes),
     ]
 
 
@@ -174,7 +195,7 @@ def test_every_figure_is_written_and_shows_something(tmp_path, panda, identified
 
 def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
     path = tmp_path / "recording.rrd"
-    picture = report_figures.learning_figure(tmp_path / "learning.png", {"a": make_curve()})
+    picture = learning_figure(tmp_path / "learning.png", {"a": make_curve()})
     labels = {"mujoco": 3, "twin, nominal": 2, "a/b": 1}
     written = viewer.write_recording(
         path,
@@ -217,12 +238,12 @@ def test_the_drawn_links_are_where_the_arm_was(tmp_path, panda):
 
 def test_episodes_follow_one_another_and_all_arms_start_together(panda):
     long, short = make_episode(panda, 0, rows=60), make_episode(panda, 1, rows=20)
-    starts = viewer._starts({"a": [short, long], "b": [long]})
-    assert starts.tolist() == pytest.approx([0, 1.18 + viewer.PAUSE, 2 * (1.18 + viewer.PAUSE)])
+    starts = starts_of({"a": [short, long], "b": [long]})
+    assert starts.tolist() == pytest.approx([0, 1.18 + PAUSE, 2 * (1.18 + PAUSE)])
 
 
 def test_a_clock_that_stops_or_restarts_still_runs_forward():
-    clock = viewer._clock(np.array([5.0, 5.01, 9.0, 9.01, 0.0, 0.01]))
+    clock = clock_of_log(np.array([5.0, 5.01, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.11, 0.12, 0.22, 0.23])
 
 
@@ -245,9 +266,9 @@ def test_a_recording_that_fails_leaves_nothing(tmp_path, panda):
 
 def test_colours_are_fixed_by_meaning_and_differ():
     labels = ["mujoco", "twin, identified", "twin, nominal", "measured", "arm, identified", "dart"]
-    found = viewer.colours(labels)
+    found = colours(labels)
     assert len(set(found.values())) == len(labels)
-    assert found["twin, nominal"] == viewer.colours(["nominal"])["nominal"]
+    assert found["twin, nominal"] == colours(["nominal"])["nominal"]
 
 
 SUMMARY = {
@@ -261,20 +282,20 @@ SUMMARY = {
 
 
 def test_the_identification_table_holds_the_numbers_in_110_columns(console, panda, identified):
-    report.identification_table(console, panda, identified, {"train": SUMMARY, "validation": SUMMARY})
+    identification_table(console, panda, identified, {"train": SUMMARY, "validation": SUMMARY})
     text = printed(console)
     assert max(map(len, text.splitlines())) <= 110
     f = identified.found
     parameters = (f"0.5 → {f.x[1]:.3g}", f"[{f.low[1]:.3g}, {f.high[1]:.3g}]", f"0 → {1e3 * f.x[21]:.3g}")
     for expected in (*parameters, "0.111", "0.444", "0.25", "6.25", "0.81", "451", "mean", "delay, ms"):
         assert expected in text
-    assert text.count(report.UNSEEN) == 1 + text.count("?: it is wider")
+    assert text.count(UNSEEN) == 1 + text.count("?: it is wider")
     assert text.count(" ? ") == np.sum(~f.identifiable)
 
 
 def test_ten_numbers_per_link_take_one_line_in_the_terminal(console, panda):
     found = make_identified(panda, LINKS)
-    report.identification_table(console, panda, found, {})
+    identification_table(console, panda, found, {})
     text = printed(console)
     assert max(map(len, text.splitlines())) <= 110
     assert "link_" not in text
@@ -292,7 +313,7 @@ def everything(robot, found, recording, **more) -> dict:
     }
     summary = {"train": SUMMARY | {"seconds": 8.0}, "validation": SUMMARY | {"seconds": 2.0}}
     nominal = more.pop("nominal", found.space.nominal)
-    return report_identification.identification_sections(robot, nominal, found, recording, summary, **how | more)
+    return identification_sections(robot, nominal, found, recording, summary, **how | more)
 
 
 def words_of(sections: dict) -> str:
@@ -319,7 +340,7 @@ def test_tables_one_to_four_hold_old_new_and_interval(panda, identified, recordi
     assert tensors.loc["3", "Ixz"].startswith(f"{1e3 * panda.inertia[2, 0, 2]:.3g} → ")
     assert scales.loc["3", "new"].split()[0] == f"{space.block(f.x, 'inertia_scale')[2]:.3g}"
     friction = tables_of(sections, "Table IV")[0]
-    assert friction.loc["5", "phi1\nNm"] == f"0.5\n{report.UNSEEN}"
+    assert friction.loc["5", "phi1\nNm"] == f"0.5\n{UNSEEN}"
     assert friction.loc["1", "phi1\nNm"].split("\n")[0].endswith(" ?")
 
 
@@ -373,7 +394,7 @@ def test_what_the_data_cannot_tell_is_said_in_words(panda, identified, recording
     assert "low-passed at 10 Hz" in text
     assert "40 Hz (4 times the cutoff)" in text
     everywhere = [f"{b}[{j}]" for b in ("phi3", "link_d1") for j in range(1, 8)] + ["delay"]
-    assert report_identification._grouped(everywhere, 7) == "phi3 of all joints; d1 of all links; delay"
+    assert _grouped(everywhere, 7) == "phi3 of all joints; d1 of all links; delay"
 
 
 def test_the_family_that_was_chosen_is_named(panda, identified, recording):
@@ -392,10 +413,10 @@ def test_filtered_white_noise_is_called_white_and_a_drift_is_not():
     paused = t + 5.0 * (t > 12.0)
     column = "far lags outside the band, %"
     for clock in (t, paused):
-        outside = report_figures.whiteness_table(clock, tau, 10.0)[column].astype(float)
+        outside = whiteness_table(clock, tau, 10.0)[column].astype(float)
         assert 2 < outside.mean() < 9
     slow = tau + 0.3 * np.sin(2 * np.pi * 0.2 * t)[:, None]
-    table = report_figures.whiteness_table(t, slow, 10.0)
+    table = whiteness_table(t, slow, 10.0)
     assert table[column].astype(float).min() > 50
     assert float(table.loc["1", "mean, Nm"]) == pytest.approx(slow[:, 0].mean(), rel=1e-2, abs=1e-3)
 
@@ -403,16 +424,16 @@ def test_filtered_white_noise_is_called_white_and_a_drift_is_not():
 def test_autocorrelation_does_not_cross_a_pause():
     t = np.r_[np.arange(50), 500 + np.arange(50)] * 0.01
     x = np.repeat([1.0, -1.0], 50)[:, None]
-    assert report_figures.autocorrelation(t, x, 30)[:, 0] == pytest.approx(np.ones(30))
-    assert report_figures.autocorrelation(0.01 * np.arange(100), x, 30)[-1, 0] < 0.6
+    assert autocorrelation(t, x, 30)[:, 0] == pytest.approx(np.ones(30))
+    assert autocorrelation(0.01 * np.arange(100), x, 30)[-1, 0] < 0.6
 
 
 def test_seconds_of_a_resumed_run_go_on():
-    assert report_figures._running(np.array([1.0, 2.0, 0.5, 1.5])).tolist() == [1.0, 2.0, 2.5, 3.5]
+    assert _running(np.array([1.0, 2.0, 0.5, 1.5])).tolist() == [1.0, 2.0, 2.5, 3.5]
 
 
 def test_pauses_are_cut_short():
-    clock, pauses = report_figures.clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
+    clock, pauses = clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
     assert pauses.tolist() == [3, 5]
 
@@ -439,10 +460,10 @@ class Page(HTMLParser):
 
 
 def test_the_html_report_is_one_file_that_loads_nothing(tmp_path, panda, identified):
-    picture = report_figures.convergence_figure(tmp_path / "convergence.png", identified.history)
+    picture = convergence_figure(tmp_path / "convergence.png", identified.history)
     table = pd.DataFrame({"a <b>": ["1 ?\n[0, 2]", "x & y"]}, index=pd.Index(["1", "2"], name="joint"))
     sections = {"Title <script>": ["5 < 6"], "Numbers": [table, ["one", "two"], picture], "Last": ["end"]}
-    text = report.report_html(tmp_path / "report.html", sections).read_text(encoding="utf-8")
+    text = report_html(tmp_path / "report.html", sections).read_text(encoding="utf-8")
     page = Page()
     page.feed(text)
     assert page.open == []
@@ -469,7 +490,7 @@ def test_identification_tells_everything_at_once(tmp_path, panda, identified, re
 
     run = SimpleNamespace(folder=tmp_path, figure=figure)
     summary = {"train": errors, "validation": errors}
-    tell.identification(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
+    pages.identification(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
     with np.load(tmp_path / "torque.npz") as saved:
         for name, key in (("identified", "torque_rmse_Nm"), ("nominal", "nominal_torque_rmse_Nm")):
             assert np.sqrt(((saved[name] - saved["measured"]) ** 2).mean(0)) == pytest.approx(errors[key])
@@ -485,8 +506,8 @@ def test_identification_tells_everything_at_once(tmp_path, panda, identified, re
 
 
 def test_the_reach_table_shows_percent_and_dashes_for_what_is_missing(console):
-    full = dict.fromkeys(report.SUCCESS, 0.5) | {"distance_median_m": 0.0123, "return_paper": -31.25}
-    report.reach_table(console, {"[mujoco]": full, "arm": {"success_5cm": 1.0}}, "reaching")
+    full = dict.fromkeys(SUCCESS, 0.5) | {"distance_median_m": 0.0123, "return_paper": -31.25}
+    reach_table(console, {"[mujoco]": full, "arm": {"success_5cm": 1.0}}, "reaching")
     lines = printed(console).splitlines()
     mujoco_line = next(line for line in lines if "[mujoco]" in line).split()
     arm_line = next(line for line in lines if " arm " in line).split()
@@ -495,9 +516,9 @@ def test_the_reach_table_shows_percent_and_dashes_for_what_is_missing(console):
 
 
 def test_the_markdown_report_links_figures_relative_and_holds_the_tables(tmp_path, panda, identified):
-    tables = report.identification_tables(panda, identified, {})
+    tables = identification_tables(panda, identified, {})
     sections = {"Identification": ["Words.", *tables.values()], "Figures": [tmp_path / "figures" / "a b.png"]}
-    text = report.report_markdown(tmp_path / "report.md", sections).read_text()
+    text = report_markdown(tmp_path / "report.md", sections).read_text()
     assert text.startswith("# Identification\n\nWords.\n")
     assert "](figures/a%20b.png)" in text
     assert str(tmp_path) not in text

@@ -5,13 +5,17 @@ import numpy as np
 import pytest
 from conftest import conf
 
-from r2s.env import ReachEnv, Task
 from r2s.errors import UserError
-from r2s.excitation import check_limits, fourier
-from r2s.parameters import LINK, nominal_dynamics, parameter_space
-from r2s.recording import Recording
-from r2s.robot import load_robot
-from r2s.torque_residual import TorqueResidual
+from r2s.excitation.fourier import fourier
+from r2s.excitation.safety import check_limits
+from r2s.identification.link_inertia import LINK
+from r2s.identification.parameters import parameter_space
+from r2s.identification.torque_residual import TorqueResidual
+from r2s.learning.env import ReachEnv
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
+from r2s.recordings.recording import Recording
+from r2s.tasks.reach import Task
 
 ARM = """
 <mujoco model="threelink">

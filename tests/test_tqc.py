@@ -11,8 +11,8 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.modules.distributions import TanhNormal
 from torchrl.objectives import TQCLoss
 
-from r2s.networks import sample_tanh
-from r2s.tqc import TQC, QuantileHuber
+from r2s.learning.networks import sample_tanh
+from r2s.learning.tqc import TQC, QuantileHuber
 
 D, N, B = 11, 3, 64
 HIDDEN = (32, 24)

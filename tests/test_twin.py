@@ -7,13 +7,15 @@ import pytest
 
 from r2s.arm import twin as hidden
 from r2s.arm.interface import Arm, ArmStopped
-from r2s.arm.record import record
+from r2s.arm.tracking import record
 from r2s.arm.twin import Twin
 from r2s.engines.dart import DartEngine
 from r2s.errors import UserError
-from r2s.evaluate import Kinematics
-from r2s.excitation import Excitation, check_limits, fourier
-from r2s.robot import load_robot
+from r2s.excitation.fourier import fourier
+from r2s.excitation.motion import Excitation
+from r2s.excitation.safety import check_limits
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import load_robot
 
 SMALL_ARM = """
 <mujoco model="small">

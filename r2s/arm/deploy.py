@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from r2s import rewards
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped
-from r2s.env import Task, observe
-from r2s.evaluate import Acts, Episodes, Kinematics
-from r2s.robot import SIM_DT
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import SIM_DT
+from r2s.tasks import rewards
+from r2s.tasks.episode import Acts, Episodes
+from r2s.tasks.reach import Task, observe
 
 LOGGED_S = 1.0  # before a stop, of every cycle
 

@@ -9,13 +9,14 @@ public headers of libfranka-common (service_types.h, rbk_types.h), checked again
 import mujoco
 import numpy as np
 
-from r2s.robot import Robot
+from r2s.physics.robot import Robot
 
 PORT = 1337  # libfranka cannot ask for another one: several robots are several addresses
 VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
 MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # deviations follow, unused
+
 
 _SHARED = ("Connect", "Move", "StopMove")
 _SETTERS = (
@@ -38,18 +39,22 @@ MOVE_STATUS = {
 }  # fmt: skip
 DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of the other requests; a wrong version is 1, too
 
+
 # torque control in a Move request, and in the state while it runs; 0.9 has no "none" among motion generators
 EXTERNAL_CONTROLLER = 2
 GENERATOR_ASKED = {5: 1, 10: 4}
 GENERATOR_RUNNING = {5: 2, 10: 5}
 OTHER_CONTROLLER, NO_GENERATOR = 3, 0
 
+
 IDLE, MOVE_MODE, GUIDING, REFLEX, USER_STOPPED = 1, 2, 3, 4, 5  # robot_mode
+
 
 # places in `errors` and `reflex_reason`, of 41
 N_ERRORS = 41
 JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX = 0, 3, 6
 COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34
+
 
 # an FR3's own limits, which are not a Panda's: rad, rad/s, and, because it allows less speed the closer a joint is to
 # its position limit, rad/s and rad/s^2; Franka's documentation
@@ -59,6 +64,7 @@ FR3_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
 FR3_VELOCITY_OFFSET = np.array([0.6599, 0.2517, 0.2, 0.3533, 0.5757, 0.4878, 0.4628])
 FR3_VELOCITY_NOISE = 0.02  # rad/s, which that bound must forgive a joint at rest near its limit
 FR3_DECELERATION = np.array([6, 2.585, 3.5, 4, 17, 5.5, 17])
+
 
 _STATE = (
     ("O_T_EE", 16), ("O_T_EE_d", 16), ("F_T_EE", 16), ("EE_T_K", 16), ("F_T_NE", 16), ("NE_T_EE", 16),
@@ -83,6 +89,7 @@ def _state_type(number: str, values: tuple[tuple[str, int], ...]) -> np.dtype:
 
 
 STATE = {5: _state_type("<f8", _STATE), 10: _state_type("<f4", _STATE + _ACCELEROMETERS)}
+
 
 _MOTION = (
     ("message_id", "<u8"), ("q_c", "<f8", (7,)), ("dq_c", "<f8", (7,)), ("O_T_EE_c", "<f8", (16,)),

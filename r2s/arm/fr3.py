@@ -12,7 +12,7 @@ import numpy as np
 from r2s.arm import fci
 from r2s.arm.franka import Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
-from r2s.robot import Robot
+from r2s.physics.robot import Robot
 
 
 def within_fr3(robot: Robot) -> Robot:

@@ -13,11 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from r2s.arm import fci
-from r2s.arm.interface import ArmState, ArmStopped, InverseInertia, Reflexes
-from r2s.arm.record import Tracker
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.tracking import Tracker
 from r2s.errors import UserError
-from r2s.excitation import Excitation
-from r2s.robot import SIM_DT, Robot
+from r2s.excitation.motion import Excitation
+from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.robot import SIM_DT, Robot
 
 SPEED = 0.2  # of dq_max, on the way to a place
 ACCELERATION = 0.2  # of ddq_max

@@ -8,10 +8,9 @@ came with, `command` ends the cycle and waits for the next.
 from dataclasses import dataclass
 from typing import Protocol
 
-import mujoco
 import numpy as np
 
-from r2s.robot import SIM_DT, Robot
+from r2s.physics.robot import SIM_DT, Robot
 
 RATE_TOLERANCE = 1e-3  # Nm: a command that was limited to the allowed step in another precision still passes
 
@@ -105,24 +104,3 @@ class Reflexes:
             raise ArmStopped(f"joint {i + 1}: position {q[i]:.4f} rad, allowed {r.q_min[i]:g} to {r.q_max[i]:g} rad")
         i = int(np.argmax(np.abs(dq) / r.dq_max))
         raise ArmStopped(f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, allowed +-{r.dq_max[i]:g} rad/s")
-
-
-class InverseInertia:
-    """How torques accelerate the joints of an arm at rest, by the nominal model.
-
-    1 over its diagonal is the inertia that each joint feels with the others free.
-    """
-
-    def __init__(self, robot: Robot):
-        self._model = robot.model(gravity=False)
-        self._data = mujoco.MjData(self._model)
-        self._mass = np.empty((robot.n, robot.n))
-
-    def __call__(self, q: np.ndarray) -> np.ndarray:
-        """Return M^-1 (n, n), 1/(kg m^2), at q (n,) rad."""
-        self._data.qpos[:] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_crb(self._model, self._data)
-        mujoco.mj_fullM(self._model, self._data, self._mass)
-        return np.linalg.inv(self._mass)

@@ -14,7 +14,7 @@ import numpy as np
 
 from r2s.arm.franka import Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
-from r2s.robot import Robot
+from r2s.physics.robot import Robot
 
 NO_FILTER_HZ = 1000.0  # libfranka's kMaxCutoffFrequency: the low-pass is off
 WATCH_S = 0.1  # between looks whether the thread that commands is still alive

@@ -1,6 +1,6 @@
 """Ramp the torque of one joint after the other, both ways, until it moves: the paper's breakaway protocol.
 
-It runs on any arm behind the arm interface; r2s/breakaway.py makes torques of what it records.
+It runs on any arm behind the arm interface; r2s/identification/breakaway.py makes torques of what it records.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 
 from r2s.arm.interface import Arm, ArmState
-from r2s.breakaway import MOVED, Ramps
 from r2s.errors import UserError
-from r2s.recording import Recording
-from r2s.robot import SIM_DT, Robot
+from r2s.identification.breakaway import MOVED
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.ramps import Ramps
+from r2s.recordings.recording import Recording
 
 BIG = 40.0  # Nm of tau_max: joints with so much inertia that they move late, and are to be ramped slowly
 KEPT = 5  # cycles recorded after the joint has moved
@@ -47,7 +48,7 @@ def ramp(
 
     A ramp is a short rest without command, then a command of one joint that rises from 0 at `rate`, the others at
     0, until the joint is `moved` away (or the command is `largest`, or another joint strays). Then all joints are
-    stopped, and let go once at rest; that is not recorded. Rows are as in `r2s.arm.record`: the state read in a
+    stopped, and let go once at rest; that is not recorded. Rows are as in `r2s.arm.tracking`: the state read in a
     cycle and the command sent in it. A joint that slides without command, because what gravity compensation leaves
     is more than its friction holds, rests and is ramped from the command that stopped it instead.
 

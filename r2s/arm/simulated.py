@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from r2s.actuation import Motors
 from r2s.arm.interface import ArmState, Reflexes
-from r2s.robot import SIM_DT, Robot
-from r2s.simulator import Dynamics, Simulator
+from r2s.physics.actuation import Motors
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.simulator import Simulator
 
 
 class SimulatedArm:
-    """MuJoCo with the friction law of r2s/friction.py, for identification against a known truth.
+    """MuJoCo with the friction law of r2s/physics/friction.py, for identification against a known truth.
 
     Args:
         robot, dynamics: the arm and its truth.

@@ -19,15 +19,16 @@ from numba import njit
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.engines.dart import DartEngine
-from r2s.engines.description import Links
 from r2s.errors import check_number
-from r2s.robot import SIM_DT, Robot
+from r2s.physics.description import Links
+from r2s.physics.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
 DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
 # ... and of the state (rows, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_FILTERED, Q_SEEN, TAU_SEEN, BENT = range(12)
+
 
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, or each reversal would kick
 ENCODER = 2e-5  # rad

@@ -10,9 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from r2s.engines.description import Links, about, make_pose, shaped
 from r2s.errors import UserError
-from r2s.robot import SIM_DT, Robot
+from r2s.physics.description import Links, about, make_pose, shaped
+from r2s.physics.robot import SIM_DT, Robot
 
 
 class DartEngine:

@@ -5,13 +5,16 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from r2s import rewards
-from r2s.actuation import Actuation, Motors, SoftLimits
 from r2s.engines.interface import Engine, Law
-from r2s.env import Task, observe
-from r2s.evaluate import GOAL_SEED, Acts, Episodes, Kinematics
-from r2s.robot import Robot
-from r2s.simulator import Dynamics
+from r2s.learning.evaluate import GOAL_SEED
+from r2s.physics.actuation import Actuation, Motors
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import Robot
+from r2s.tasks import rewards
+from r2s.tasks.episode import Acts, Episodes
+from r2s.tasks.reach import Task, observe
 
 
 @torch.no_grad()
@@ -25,7 +28,7 @@ def reach(
     goals: np.ndarray,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Episodes:
-    """Run one episode per goal; arm e has the e-th draw, as in `r2s.evaluate.make_evaluation`.
+    """Run one episode per goal; arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`.
 
     Args:
         policy: observation -> action.

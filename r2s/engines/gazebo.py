@@ -1,7 +1,7 @@
 """Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
 
 One blocking `server.run` per millisecond. The world has physics and nothing else, and is written from the same
-description as the other engines' (r2s/engines/description.py). Gazebo is on no Python index: it comes from OSRF's
+description as the other engines' (r2s/physics/description.py). Gazebo is on no Python index: it comes from OSRF's
 packages or conda-forge, with bindings of its own.
 """
 
@@ -14,10 +14,10 @@ from types import ModuleType
 
 import numpy as np
 
-from r2s.engines.description import chain, write_sdf
 from r2s.errors import UserError
-from r2s.robot import Robot
-from r2s.simulator import Dynamics
+from r2s.physics.description import chain, write_sdf
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
 
 RELEASES = ("gz.sim", "gz.sim9", "gz.sim8")  # Jetty, Ionic, Harmonic
 

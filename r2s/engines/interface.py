@@ -9,9 +9,10 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from r2s.actuation import SoftLimits
-from r2s.robot import Robot
-from r2s.simulator import Dynamics, single_arm
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.physics.robot import Robot
+from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
@@ -27,9 +28,9 @@ class Engine(Protocol):
 
 
 class Law:
-    """The joint torque of r2s/friction.py beside a command, for engines that take nothing but torque.
+    """The joint torque of r2s/physics/friction.py beside a command, for engines that take nothing but torque.
 
-    The law of r2s/friction.py is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
+    That law is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
     (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias does the same with F = P - h D a, where a
     is what the implicit step will come to. Without that term real wrist joints chatter at 1 ms.
 

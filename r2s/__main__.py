@@ -1,0 +1,5 @@
+"""`python -m r2s`: the same as `python run.py`."""
+
+from r2s.cli import main
+
+main()

@@ -1,0 +1,273 @@
+"""The robot's side of the Franka Control Interface on loopback: requests by TCP, states and commands by UDP."""
+
+import contextlib
+import ipaddress
+import select
+import socket
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from r2s.arm import fci
+from r2s.arm.emulator.control import Control
+from r2s.errors import UserError
+from r2s.physics.robot import SIM_DT
+
+IDLE_MS = 20  # between states while nothing moves, in lock-step: nobody needs a thousand a second
+BACKOFF_S = (1e-3, 0.4)  # between states that wait for a motion's first answer; a client gives up after 1 s
+
+
+class Server:
+    """Serves one client after the other, in one thread.
+
+    A motion begins when the client has answered the newest state; until then the arm stands still and states are
+    repeated, because a client may skip some while it starts. That answer is not applied: the first command of a
+    motion is the answer to the first state whose control_command_success_rate is above zero.
+    """
+
+    def __init__(self, listener: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
+        self.address: str = listener.getsockname()[0]
+        self._listener, self._control, self._urdf = listener, control, urdf.encode()
+        self._version, self._realtime = version, realtime
+        self._tcp: socket.socket | None = None
+        self._udp: socket.socket | None = None
+        self._forget()
+
+    def serve(self, parent: int | None = None, note: Callable[[str], None] = lambda line: None) -> None:
+        """Run until the pipe `parent` closes (None: for good); `note` gets a line per event."""
+        self._note = note
+        while True:
+            due = None if self._due is None else max(0.0, self._due - time.monotonic())
+            watched = [x for x in (parent, self._listener, self._tcp, self._udp) if x is not None]
+            ready = select.select(watched, [], [], due)[0]
+            if parent in ready:
+                return
+            try:
+                if self._tcp in ready:
+                    self._requests()
+                if self._listener in ready:
+                    self._accept()
+                if self._udp is not None and self._udp in ready:
+                    self._commands()
+                if self._due is not None and time.monotonic() >= self._due:
+                    self._tick()
+            except ConnectionError:
+                self._disconnect()
+
+    def _accept(self) -> None:
+        tcp, client = self._listener.accept()
+        if self._tcp is not None and _closed(self._tcp):  # one that left and came back within a moment
+            self._disconnect()
+        if self._tcp is not None:
+            tcp.close()  # one client at a time
+            self._note(f"{client[0]} refused, another client is connected")
+            return
+        tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._tcp = tcp
+
+    def _disconnect(self) -> None:
+        self._control.end()
+        for s in (self._tcp, self._udp):
+            if s is not None:
+                s.close()
+        self._tcp = self._udp = None
+        self._forget()
+        self._note("client gone")
+
+    def _forget(self) -> None:
+        self._received = b""
+        self._client: tuple[str, int] | None = None
+        self._move: int | None = None  # the id of the Move request that waits for its end
+        self._started = False  # whether that motion has had its first answer
+        self._answer: np.ndarray | None = None  # Nm, to the newest state; in real time it waits for the cycle's end
+        self._due: float | None = None  # when the next state is sent unless something else sends it
+        self._message_id = 0
+
+    # --- requests, by TCP ---------------------------------------------------------------------------------------
+
+    def _requests(self) -> None:
+        assert self._tcp is not None
+        data = self._tcp.recv(65536)
+        if not data:
+            raise ConnectionResetError
+        self._received += data
+        while len(self._received) >= fci.HEADER.itemsize:
+            command, number, size = np.frombuffer(self._received, fci.HEADER, 1)[0].tolist()
+            if len(self._received) < size:
+                return
+            payload, self._received = self._received[fci.HEADER.itemsize : size], self._received[size:]
+            names = fci.REQUESTS[self._version]
+            if size < fci.HEADER.itemsize or command >= len(names):
+                raise ConnectionResetError  # not libfranka
+            self._request(names[command], number, payload)
+
+    def _request(self, name: str, number: int, payload: bytes) -> None:
+        if name == "Connect":
+            self._connect(number, payload)
+        elif name == "Move":
+            self._begin(number, payload)
+        elif name == "StopMove":
+            self._control.end()
+            self._reply(name, number, fci.DONE)
+            if self._move is not None:
+                self._finish("Preempted")
+        elif name == "AutomaticErrorRecovery":
+            self._reply(name, number, fci.DONE if self._control.recover() else fci.EMERGENCY)
+        elif name == "GetRobotModel":
+            self._reply(name, number, fci.DONE, self._urdf)
+        elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
+            self._reply(name, number, fci.NOT_POSSIBLE)  # the library would be machine code; ask the URDF
+        else:
+            self._reply(name, number, fci.DONE)  # impedances, loads, thresholds: nothing here depends on them
+
+    def _connect(self, number: int, payload: bytes) -> None:
+        assert self._tcp is not None
+        version, port = np.frombuffer(payload, fci.CONNECT, 1)[0].tolist()
+        ours = np.array(self._version, "<u2").tobytes()
+        if version != self._version:
+            self._note(f"a client of version {version}, this is {self._version}")
+            self._reply("Connect", number, fci.NOT_POSSIBLE, ours)
+            return
+        self._client = self._tcp.getpeername()[0], port
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.bind((self.address, 0))
+        self._udp.setblocking(False)
+        self._reply("Connect", number, fci.DONE, ours)
+        self._due = time.monotonic()
+        self._note("client connected")
+
+    def _begin(self, number: int, payload: bytes) -> None:
+        controller, generator = np.frombuffer(payload, fci.MOVE, 1)[0].tolist()
+        status = fci.MOVE_STATUS[self._version]
+        if (controller, generator) != (fci.EXTERNAL_CONTROLLER, fci.GENERATOR_ASKED[self._version]):
+            self._note(f"Move with modes {controller}, {generator}: only torque control is served")
+            self._reply("Move", number, status["InvalidArgument"])
+        elif not self._control.can_move:
+            self._reply("Move", number, status["NotPossible"])
+        else:
+            self._control.begin()
+            self._move, self._started, self._answer = number, False, None
+            self._wait = BACKOFF_S[0]
+            self._reply("Move", number, status["MotionStarted"])
+            self._due = time.monotonic()
+
+    def _reply(self, name: str, number: int, status: int, more: bytes = b"") -> None:
+        assert self._tcp is not None
+        command = fci.REQUESTS[self._version].index(name)
+        size = fci.HEADER.itemsize + 1 + len(more)
+        self._tcp.sendall(np.array((command, number, size), fci.HEADER).tobytes() + bytes([status]) + more)
+
+    # --- the cycle, by UDP --------------------------------------------------------------------------------------
+
+    def _commands(self) -> None:
+        """Take what the client sent; only an answer to the newest state counts."""
+        assert self._udp is not None
+        kind = fci.COMMAND[self._version]
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                data, sender = self._udp.recvfrom(4096)
+                if sender != self._client or len(data) != kind.itemsize or self._move is None:
+                    continue
+                command = np.frombuffer(data, kind, 1)[0]
+                if command["message_id"] != self._message_id:
+                    continue
+                if command[fci.FINISHED[self._version]]:
+                    self._control.end()
+                    self._finish("Success")
+                elif not self._started:
+                    self._started = True
+                    self._control.first_answer()
+                    self._send()
+                elif self._realtime:
+                    self._answer = command["tau_J_d"].copy()
+                else:
+                    self._cycle(command["tau_J_d"].copy())
+
+    def _cycle(self, tau: np.ndarray | None) -> None:
+        """One cycle, and those after it whose states are lost: nobody can answer them."""
+        self._control.cycle(tau)
+        while self._control.lost and not self._realtime:
+            self._message_id += 1
+            self._control.cycle(None)
+        if self._control.running:
+            self._send()
+        else:
+            self._note(f"motion aborted: {self._control.stopped_by}")
+            self._finish(self._control.aborted_as)
+
+    def _tick(self) -> None:
+        """Send the state that is due, at a motion's pace or an idle one's."""
+        assert self._due is not None
+        if self._started and self._realtime:
+            answer, self._answer = self._answer, None
+            self._cycle(answer)
+        else:
+            self._send()
+        if self._realtime:
+            # after a stall of this machine the robot's time goes on from here: states in a burst help nobody
+            self._due = max(self._due, time.monotonic() - SIM_DT) + SIM_DT
+        elif self._move is None:
+            self._due = time.monotonic() + IDLE_MS * SIM_DT
+        else:
+            self._due = time.monotonic() + self._wait
+            self._wait = min(2 * self._wait, BACKOFF_S[1])
+
+    def _send(self) -> None:
+        assert self._udp is not None
+        assert self._client is not None
+        self._message_id += 1 if self._realtime or self._move is not None else IDLE_MS
+        if self._control.lost:
+            return
+        if self._started and not self._realtime:
+            self._due = None  # now only an answer makes time pass
+        self._control.state["message_id"] = self._message_id
+        with contextlib.suppress(BlockingIOError):  # a full socket drops a packet, as a full cable would
+            self._udp.sendto(self._control.state.tobytes(), self._client)
+
+    def _finish(self, status: str) -> None:
+        """Tell the client by both ways that the motion is over."""
+        assert self._move is not None
+        move, self._move, self._started = self._move, None, False
+        self._due = time.monotonic()  # the state of an arm that holds
+        self._reply("Move", move, fci.MOVE_STATUS[self._version][status])
+
+
+def listen(address: str | None = None) -> socket.socket:
+    """Return a socket that listens at the FCI's port of a loopback address, the first free one by default.
+
+    Raises:
+        UserError: the address is not a loopback one, or taken.
+
+    """
+    if address is not None:
+        check_loopback(address)
+    candidates = [address] if address is not None else [f"127.0.0.{i}" for i in range(1, 255)]
+    for candidate in candidates:
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((candidate, fci.PORT))
+            listener.listen()
+            return listener
+        except OSError as error:
+            listener.close()
+            reason = error.strerror
+    raise UserError(f"emulator: port {fci.PORT} is not free on {address or 'any loopback address'} ({reason})")
+
+
+def _closed(tcp: socket.socket) -> bool:
+    try:
+        return tcp.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+def check_loopback(address: str) -> None:
+    """Raise UserError unless address is an IPv4 loopback one."""
+    with contextlib.suppress(ValueError):
+        if ipaddress.IPv4Address(address).is_loopback:
+            return
+    raise UserError(f"emulator: address '{address}' must be a loopback one, 127.0.0.1 to 127.255.255.254")

@@ -1,0 +1,127 @@
+"""Record an excitation on any arm, through the same calls and with the same caution that hardware needs."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from r2s.arm.interface import Arm
+from r2s.errors import UserError
+from r2s.excitation.motion import Excitation
+from r2s.excitation.safety import check_limits
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import Recording, declared_torque
+
+BANDWIDTH = 20.0  # rad/s, of the tracking loop: a few ms of delay leave it a wide margin
+CUTOFF_HZ = 100.0  # of the low-pass on the command, as libfranka's
+TORQUE_SHARE = 0.8  # of tau_max
+RATE_SHARE = 0.95  # of dtau_max
+LEARNING = 0.8  # of kp, in 1/s: with its three terms the loop keeps half its stability margin
+FRICTION_DQ = 0.03  # rad/s, over which the friction estimate changes sign
+PROGRESS_EVERY = 500  # cycles
+MASS_EVERY = 10  # cycles
+
+
+def record(
+    arm: Arm,
+    excitation: Excitation,
+    *,
+    torque: str = "commanded",
+    progress: Callable[[int, int], None] | None = None,
+) -> Recording:
+    """Follow the excitation at 1 kHz and return what the arm did.
+
+    Row k holds the state read in cycle k and, for 'commanded', the command sent in that same cycle (it is
+    tau_J_d of cycle k + 1): replaying tau[k : k + m] from state k predicts q[k + 1 : k + m + 1]. For
+    'measured', row k holds tau_J read together with q and dq, as robot logs do. t is the arm's clock.
+
+    Args:
+        arm: brought to the excitation's first posture here, and stopped at the end whatever happens.
+        excitation: on a clock of 1 ms.
+        torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, contains gravity).
+        progress: called now and then with (cycles done, cycles in all).
+
+    Raises:
+        ArmStopped: the arm ended the motion; nothing is returned of it.
+
+    """
+    declared_torque(torque)
+    _check(arm.robot, excitation)
+    controller = Tracker(arm.robot, excitation)
+    rows = len(excitation.t)
+    t = np.empty(rows)
+    q, dq, tau = (np.empty((rows, arm.robot.n)) for _ in range(3))
+    arm.move_to(excitation.q[0])
+    try:
+        for k in range(rows):
+            state = arm.read()
+            command = controller(k, state.q, state.dq, state.tau_J_d)
+            t[k], q[k], dq[k] = state.t, state.q, state.dq
+            tau[k] = command if torque == "commanded" else state.tau_J
+            arm.command(command)
+            if progress is not None and (k % PROGRESS_EVERY == 0 or k == rows - 1):
+                progress(k + 1, rows)
+    finally:
+        arm.stop()
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque=torque, name=arm.robot.name)
+
+
+class Tracker:
+    """PD control about the nominal model's torque, an estimate of what the model lacks, a safe command.
+
+    The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous
+    friction, adapted while moving as in Slotine and Li (IJRR 6(3), 1987). Without it a light wrist, whose
+    gains must be small, would be held back by friction as large as all its PD torque. Gains are the nominal
+    mass matrix times a bandwidth: they fit any arm, and joints with nearly parallel axes, which a gain per
+    joint drives unstable.
+    """
+
+    def __init__(self, robot: Robot, excitation: Excitation):
+        self._e = excitation
+        self._feedforward, self._mass = _nominal(robot, excitation)
+        dq = excitation.dq
+        drive = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
+        self._regressor = drive.transpose(1, 0, 2)  # (T, 3, n)
+        self._theta = np.zeros((3, robot.n))
+        # what a joint feels with the others free; Nm/s per (rad/s + BANDWIDTH rad) of error
+        alone = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
+        self._learn = LEARNING * SIM_DT * BANDWIDTH**2 * alone  # of each posture: a light one has to learn slowly
+        self._limit, self._step = TORQUE_SHARE * robot.tau_max, RATE_SHARE * robot.dtau_max * SIM_DT
+        self._smooth = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)
+        self._filtered = np.zeros(robot.n)
+
+    def __call__(self, k: int, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
+        """Return the command (n,) Nm of cycle k, from the state read in it and the command before."""
+        e = self._e
+        lag, slow = e.q[k] - q, e.dq[k] - dq
+        self._theta += self._learn[k // MASS_EVERY] * (slow + 0.5 * BANDWIDTH * lag) * self._regressor[k]
+        pull = self._mass[k // MASS_EVERY] @ (BANDWIDTH**2 * lag + 2 * BANDWIDTH * slow)
+        tau = self._feedforward[k] + pull + (self._theta * self._regressor[k]).sum(0)
+        self._filtered += self._smooth * (tau - self._filtered)
+        tau = np.minimum(np.maximum(self._filtered, -self._limit), self._limit)
+        change = np.minimum(np.maximum(tau - tau_J_d, -self._step), self._step)
+        return tau_J_d + change  # the rate limit is last
+
+
+def _nominal(robot: Robot, e: Excitation) -> tuple[np.ndarray, np.ndarray]:
+    """Return torque without gravity (T, n) Nm and every MASS_EVERY-th mass matrix (., n, n) kg m^2."""
+    model = robot.model(gravity=False)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # a limit's soft spring is no dynamics
+    data = mujoco.MjData(model)
+    tau = np.empty_like(e.q)
+    mass = np.empty((-(-len(e.t) // MASS_EVERY), robot.n, robot.n))
+    for k in range(len(e.t)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = e.q[k], e.dq[k], e.ddq[k]
+        mujoco.mj_inverse(model, data)
+        tau[k] = data.qfrc_inverse
+        if k % MASS_EVERY == 0:
+            mujoco.mj_fullM(model, data, mass[k // MASS_EVERY])
+    return tau, mass
+
+
+def _check(robot: Robot, e: Excitation) -> None:
+    if e.q.shape != (len(e.t), robot.n):
+        raise UserError(f"the excitation moves {e.q.shape[1]} joints, {robot.name} has {robot.n}")
+    if not np.allclose(np.diff(e.t), SIM_DT, rtol=1e-6, atol=0):
+        raise UserError(f"an arm is driven at {1 / SIM_DT:g} Hz; the excitation steps by {np.diff(e.t).mean():g} s")
+    check_limits(robot, e)

@@ -1,0 +1,1 @@
+"""Motions worth recording, and whether a motion is safe to send."""

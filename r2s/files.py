@@ -1,0 +1,21 @@
+"""Files that are there only once they are whole."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def whole(path: str | os.PathLike) -> Iterator[Path]:
+    """Give a path beside `path` to write to; it takes the name `path` when the block has ended well.
+
+    A block that fails, or a process that is killed in it, leaves what was at `path` as it was.
+    """
+    path = Path(path)
+    part = path.with_name(f"{path.stem}.part{path.suffix}")  # the suffix stays: some libraries go by it
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

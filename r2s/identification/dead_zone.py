@@ -1,0 +1,58 @@
+"""The edges of the dead zone from a recording: a scan, because the error has no gradient by them."""
+
+import numpy as np
+
+from r2s.identification.parameters import parameter_space
+from r2s.identification.problem import Report
+from r2s.identification.replay_residual import ReplayResidual
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
+TRUST = 0.01  # and by how much less the error must be to go that far
+
+
+def scan_breakaway(
+    robot: Robot,
+    dynamics: Dynamics,
+    recording: Recording,
+    largest: float | None,
+    *,
+    window_s: float,
+    stride: int,
+    nthread: int,
+    report: Report,
+) -> np.ndarray:
+    """Return the edges (n, 2) Nm of the dead zone that replay the recording best, everything else as in `dynamics`.
+
+    The error jumps where a joint is held or let go one step sooner, so there is no gradient: each edge is scanned
+    over [0, largest], all edges at once and each judged by its own joint, then again about the best, ever finer.
+    The coarse scan is done twice, because an edge looks different while the others are wrong. Without `largest` the
+    edges of `dynamics` were measured: only the fine scans are done, and where no hold tells them they stay.
+    """
+    top = largest or 2.0 * np.abs(dynamics.breakaway).max() + MEASURED
+    space = parameter_space(robot, dynamics, {"breakaway_negative": [-top, 0.0], "breakaway_positive": [0.0, top]})
+    data = ReplayResidual(
+        robot, space, recording, window_s=window_s, stride=stride, slowest=0.0, limit=50, nthread=nthread
+    )
+    x, step, coarse, passes = space.start, top / 12, 2, 6
+    if largest is None:
+        step, coarse, passes = MEASURED, 0, 3
+    sign = np.repeat([-1.0, 1.0], robot.n)
+    joint = np.tile(np.arange(robot.n), 2)
+    for k in range(passes):
+        offsets = np.linspace(0, top, 13) if k < coarse else step * np.arange(-2, 3)
+        base = np.zeros_like(x) if k < coarse else x
+        trials = np.clip(base[:, None] + sign[:, None] * offsets, space.lower[:, None], space.upper[:, None])
+        candidates = np.repeat(x[None], trials.size, axis=0).reshape(*trials.shape, -1)
+        candidates[np.arange(len(x)), :, np.arange(len(x))] = trials
+        cost = data.joint_error(candidates.reshape(-1, len(x))).reshape(*trials.shape, robot.n)
+        own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
+        if largest is None:
+            own *= 1.0 + TRUST * ((trials - space.start[:, None]) / MEASURED) ** 2
+        x = trials[np.arange(len(x)), own.argmin(1)]
+        step /= 1 if k < coarse else 2.5
+        row = {"pass": k + 1, "evaluations": data.candidates, "done": k + 1, "total": passes}
+        report(row | {"search": "breakaway"})
+    return x.reshape(2, robot.n).T

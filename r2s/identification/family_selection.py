@@ -1,0 +1,93 @@
+"""What a model predicts of motion that it was not fitted to: to choose one by, and to judge it.
+
+Nothing leaks: what is left out are whole blocks of time, or of phase where a motion repeats itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.problem import Problem, Report, fit_torque, searched
+from r2s.identification.torque_residual import TorqueResidual
+from r2s.physics.dynamics import Dynamics, of_family
+from r2s.physics.friction import FAMILIES
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+FAMILY_HZ = 50.0  # rows per second that families are compared on
+
+
+def left_out(recording: Recording, folds: int) -> list[tuple[Recording, Recording]]:
+    """Return (rest, block) for blocks of time, or of phase where the motion repeats itself; 0.1 s apart."""
+    clock = recording.t % recording.period if recording.period else recording.t
+    edges = np.quantile(clock, np.linspace(0, 1, folds + 1))
+    pairs = []
+    for low, high in pairwise(edges):
+        out = (clock >= low) & (clock <= high)
+        near = (clock > low - 0.1) & (clock < high + 0.1)
+        pairs.append((recording.select(~near), recording.select(out)))
+    return pairs
+
+
+def compare_families(
+    robot: Robot,
+    nominal: Dynamics,
+    recording: Recording,
+    bounds: Mapping[str, Sequence[float]],
+    prior: Mapping[str, float],
+    terms: Sequence[str],
+    folds: int,
+    how: Mapping[str, Any],
+    report: Report,
+) -> dict[str, Any]:
+    """Return {"error": (F,) relative to the best, "best": index}: torque predicted on motion left out.
+
+    A family with more parameters has to predict clearly better: by more than one standard error of the difference
+    over blocks of half a second (Breiman et al. 1984, the one-standard-error rule).
+    """
+    how = dict(how) | {"rate_hz": FAMILY_HZ}
+    spaces = [searched(robot, of_family(nominal, f.name), bounds, terms, recording) for f in FAMILIES]
+    blocks: list[list[np.ndarray]] = [[] for _ in FAMILIES]
+    for k, (rest, out) in enumerate(left_out(recording, folds)):
+        fit, test = (TorqueResidual(robot, spaces[0], part, **how) for part in (rest, out))
+        window = test.clusters[:: robot.n]
+        for left, space in zip(blocks, spaces, strict=True):
+            own = fit.on(space)
+            u = fit_torque(Problem(own, own, prior))
+            error = test.on(space).error(space.from_unit(u)[None])[0] ** 2
+            left.append(np.stack([error[window == w].mean(0) for w in np.unique(window)]))
+        cost = min(float(np.concatenate(left).mean()) for left in blocks)
+        report({"search": "family", "evaluations": 0, "cost": cost, "done": k + 1, "total": folds})
+    means = [np.concatenate(left) for left in blocks]  # (blocks, n) of each family
+    squares = [(m / means[0].mean(0)).sum(1) for m in means]
+    mean = np.array([s.mean() for s in squares])
+    best = int(mean.argmin())
+    for k in np.argsort([len(f.names) for f in FAMILIES], kind="stable"):
+        more = squares[k] - squares[best]
+        if mean[k] <= mean[best] + more.std() / np.sqrt(len(more)):
+            best = int(k)
+            break
+    return {"error": np.sqrt(mean / mean.min()), "best": best}
+
+
+def joints_kept(
+    robot: Robot,
+    space: ParameterSpace,
+    recording: Recording,
+    prior: Mapping[str, float],
+    folds: int,
+    how: Mapping[str, Any],
+) -> np.ndarray:
+    """Return (n,) bool: joints whose refit does not predict left-out motion at least 5 % better (RMSE).
+
+    Published parameters are a strong start on real arms; a refit has to earn its place.
+    """
+    squared = np.zeros((2, robot.n))
+    for rest, out in left_out(recording, folds):
+        fit, test = (TorqueResidual(robot, space, part, **how) for part in (rest, out))
+        x = space.from_unit(fit_torque(Problem(fit, fit, prior)))
+        squared += (test.error(np.stack([x, space.start])) ** 2).sum(1)
+    return squared[0] >= 0.9 * squared[1]

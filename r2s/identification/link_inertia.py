@@ -1,0 +1,68 @@
+"""Mass, centre and tensor of links as ten numbers that are physical at every value.
+
+The log-Cholesky parameters of Rucker and Wensing (IEEE RA-L 7(2), 2022) of the pseudo-inertia relative to the nominal
+one: J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
+"""
+
+import numpy as np
+
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+
+CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
+LINK = tuple(f"link_{name}" for name in CHOLESKY)
+
+
+def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """Return (..., 4, 4) [[Sigma, h], [h^T, m]] about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+
+    Sigma is the second moment of the mass; positive definite is the same as a tensor of positive moments that keep
+    the triangle inequality. A tensor that does not is given the nearest flat one and a little thickness.
+    """
+    second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
+    moments, axes = np.linalg.eigh(second)
+    moments = np.maximum(moments, 1e-6 * moments.max(-1, keepdims=True))
+    second = axes * moments[..., None, :] @ np.swapaxes(axes, -1, -2)
+    out = np.empty((*mass.shape, 4, 4))
+    h = mass[..., None] * com
+    out[..., :3, :3] = second + mass[..., None, None] * com[..., :, None] * com[..., None, :]
+    out[..., :3, 3] = out[..., 3, :3] = h
+    out[..., 3, 3] = mass
+    return out
+
+
+def _upper(j: np.ndarray) -> np.ndarray:
+    """Return the upper triangular U (..., 4, 4) with U U^T = j."""
+    return np.linalg.cholesky(j[..., ::-1, ::-1])[..., ::-1, ::-1]
+
+
+def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mass (..., n) kg, com (..., n, 3) m and tensor about it (..., n, 3, 3) for theta (..., n, 10)."""
+    v = np.zeros((*theta.shape[:-1], 4, 4))
+    for i in range(3):
+        v[..., i, i] = np.exp(theta[..., 1 + i])
+    v[..., 0, 1], v[..., 0, 2], v[..., 1, 2] = theta[..., 4], theta[..., 5], theta[..., 6]
+    v[..., :3, 3], v[..., 3, 3] = theta[..., 7:], 1.0
+    u = _upper(pseudo_inertia(robot.mass, robot.com, robot.inertia)) @ (np.exp(theta[..., :1])[..., None] * v)
+    j = u @ np.swapaxes(u, -1, -2)
+    mass = j[..., 3, 3]
+    com = j[..., :3, 3] / mass[..., None]
+    second = j[..., :3, :3] - mass[..., None, None] * com[..., :, None] * com[..., None, :]
+    return mass, com, np.trace(second, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - second
+
+
+def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
+    """Return theta (n, 10) of the links of `dynamics`: the inverse of `links`."""
+    mass = robot.mass if dynamics.mass is None else dynamics.mass
+    com = robot.com if dynamics.com is None else dynamics.com
+    base = _upper(pseudo_inertia(robot.mass, robot.com, robot.inertia))
+    v = np.linalg.solve(base, _upper(pseudo_inertia(mass, com, dynamics.inertia)))
+    scale, v = v[..., 3, 3], v / v[..., 3:, 3:]
+    diagonal = [np.log(v[..., i, i]) for i in range(3)]
+    rest = [v[..., 0, 1], v[..., 0, 2], v[..., 1, 2], v[..., 0, 3], v[..., 1, 3], v[..., 2, 3]]
+    return np.stack([np.log(scale), *diagonal, *rest], -1)
+
+
+def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+    """Return (..., n): the scale of tensors (..., n, 3, 3) over the nominal ones, by their traces."""
+    return np.trace(inertia, axis1=-2, axis2=-1) / np.trace(nominal, axis1=-2, axis2=-1)

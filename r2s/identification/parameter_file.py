@@ -1,0 +1,147 @@
+"""parameters.yaml and posterior.npz: what carries an identification to the other stages."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from r2s.errors import UserError, nearest
+from r2s.identification.parameters import LOGARITHMIC, UNITS, WHOLE_ARM, Estimate, ParameterSpace, parameter_space
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import family as friction_family
+from r2s.physics.robot import Robot
+
+
+def save_parameters(
+    path: Path,
+    space: ParameterSpace,
+    found: Estimate,
+    source: Mapping[str, Any],
+    note: Mapping[str, Any] | None = None,
+) -> None:
+    """Write parameters.yaml: value, unit, nominal, bounds, 95 % interval and whether the data could tell, per joint.
+
+    The draws of the joint distribution go to posterior.npz beside it: what dr=identified draws from.
+
+    Args:
+        path: the file.
+        space: what was searched.
+        found: the result.
+        source: where it came from (recording, search, run), kept as it is. note: further entries, kept as they are.
+    """
+    robot, fixed = space.robot, space.nominal
+
+    def numbers(values: np.ndarray) -> Any:
+        return float(f"{values[0]:.6g}") if len(values) == 1 else [float(f"{v:.6g}") for v in values]
+
+    document: dict[str, Any] = {"robot": robot.name, "joints": robot.n, "source": dict(source)}
+    document["friction_family"] = fixed.family.name
+    document["parameters"] = {}
+    for name in space.blocks:
+        entry: dict[str, Any] = {"unit": UNITS[name]}
+        rows = (found.x, space.start, space.lower, space.upper, found.low, found.high)
+        keys = ("value", "nominal", "lower_bound", "upper_bound", "interval95_low", "interval95_high")
+        entry |= {key: numbers(space.block(row, name)) for key, row in zip(keys, rows, strict=True)}
+        seen = space.block(found.identifiable, name).tolist()
+        document["parameters"][name] = entry | {"identifiable": seen[0] if name in WHOLE_ARM else seen}
+    document["fixed"] = {
+        "phi": fixed.phi.tolist(),
+        "offset": fixed.offset.tolist(),
+        "breakaway_negative": fixed.breakaway[:, 0].tolist(),
+        "breakaway_positive": fixed.breakaway[:, 1].tolist(),
+        "dq_min": fixed.dq_min,
+        "inertia": fixed.inertia.tolist(),
+    }
+    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in OPTIONAL if getattr(fixed, k) is not None}
+    document["fixed"] |= {k: float(getattr(fixed, k)) for k in WHOLE_ARM}
+    d = space.dynamics(found.x)
+    if d.mass is not None and d.com is not None:  # for the reader: what loads are the parameters
+        rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))
+        document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
+    document |= dict(note or {})
+    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
+    np.savez_compressed(path.with_name("posterior.npz"), names=np.array(space.names), samples=found.samples)
+
+
+FIXED = ("phi", "offset", "inertia")
+OPTIONAL = ("mass", "com", "load", "drag", "gain")
+
+
+def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
+    """Return the searched space and the values found of `calibration=RUN_FOLDER` (or of a parameters.yaml itself).
+
+    `space.dynamics(x)` is the identified arm.
+
+    Raises:
+        UserError: no such run or file, another robot's parameters, or a file that does not hold them.
+    """
+    path = Path(folder)
+    path = path / "parameters.yaml" if path.is_dir() else path
+    if not path.is_file():
+        siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
+        raise UserError(f"calibration: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")
+    try:
+        document = yaml.safe_load(path.read_text())
+        named, joints = document["robot"], document["joints"]
+        if (named, joints) == (robot.name, robot.n):
+            return _parse(document, robot)
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, yaml.YAMLError) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"calibration: {path} is not a parameters.yaml of r2s ({seen})") from None
+    raise UserError(
+        f"calibration: {path} is of '{named}' with {joints} joints; this arm is '{robot.name}' with {robot.n}"
+    )
+
+
+def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
+    """Return what `load_parameters` does; raises whatever a document that is none of ours leads to."""
+    found, fixed = document["parameters"], document["fixed"]
+
+    def numbers(name: str, value: Any, count: int) -> np.ndarray:
+        array = np.atleast_1d(np.array(value, dtype=float))
+        if len(array) != count or not np.isfinite(array).all():
+            raise ValueError(f"{name}: not {count} finite value{'s' * (count > 1)}")
+        return array
+
+    rows = [k for k in (*FIXED, *OPTIONAL) if k in FIXED or k in fixed]
+    own = {k: numbers(k, fixed[k], robot.n) for k in rows}
+    edges = [numbers(k, fixed[k], robot.n) for k in ("breakaway_negative", "breakaway_positive")]
+    nominal = Dynamics(
+        **own,  # type: ignore[arg-type]
+        breakaway=np.stack(edges, -1),
+        dq_min=float(fixed["dq_min"]),
+        family=friction_family(document["friction_family"]),
+        delay=float(fixed["delay"]),
+        lag=float(fixed["lag"]),
+    )
+    everything = {k: [1e-12 if k in LOGARITHMIC else -np.inf, np.inf] for k in found}
+    space = parameter_space(robot, nominal, everything)
+    return space, np.concatenate([numbers(k, found[k]["value"], space.size(k)) for k in space.blocks])
+
+
+def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
+    """Return the draws (S, P) of the joint distribution that `save_parameters` wrote beside `space`'s values.
+
+    Raises:
+        UserError: there are none, they are of other parameters, or the file does not hold them.
+    """
+    path = Path(folder)
+    path = (path if path.is_dir() else path.parent) / "posterior.npz"
+    if not path.is_file():
+        raise UserError(
+            f"dr=identified: no posterior.npz at {path.parent}; calibration= must be a run of stage=identify"
+        )
+    try:
+        with np.load(path) as file:
+            names, samples = file["names"].tolist(), file["samples"]
+        if samples.shape != (len(samples), len(names)):
+            raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")
+    except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"dr=identified: {path} is not a posterior.npz of r2s ({seen})") from None
+    if names != space.names:
+        raise UserError(f"dr=identified: {path} has other parameters than the parameters.yaml beside it")
+    return samples

@@ -1,0 +1,211 @@
+"""The parameters that identification searches, as one vector, and the file that carries them to the other stages.
+
+A vector is made of blocks: one value per joint or link (friction of one family, offsets, inertia), or one for the
+whole arm (delay, lag). A search sees only the unit cube; where a value spans decades its coordinate is logarithmic.
+
+Inertia has two parametrisations. `inertia_scale`, one per link, is the paper's (Table III NEW is an exact multiple of
+OLD). The full one is ten numbers per link, the log-Cholesky parameters of Rucker and Wensing (IEEE RA-L 7(2), 2022)
+of the pseudo-inertia relative to the nominal one: J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1],
+[0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]. All zero is the nominal link, and every value is physical.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from r2s.errors import UserError, choices, nearest
+from r2s.identification.link_inertia import LINK, inertia_scale, links, log_cholesky
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import FAMILIES
+from r2s.physics.robot import Robot
+
+UNITS = {name: unit for f in FAMILIES for name, unit in zip(f.names, f.units, strict=True)}
+UNITS |= {"offset": "Nm", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1", "inertia_scale": "1"}
+UNITS |= {name: "1" for name in LINK}
+UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
+LOGARITHMIC = ("phi1", "phi2", "coulomb", "stribeck_velocity", "presliding", "inertia_scale")
+WHOLE_ARM = ("delay", "lag")
+OF_LINKS = ("inertia_scale", *LINK)
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """The searched vector x of P values.
+
+    Attributes:
+        blocks: names in order; each is n values long, or one where it is of the whole arm.
+        n: joints.
+        lower, upper: (P,) bounds in SI units.
+        nominal: the dynamics that fixed blocks keep and that a search starts from.
+        robot: the arm; its links are what the inertia blocks are relative to.
+        break_command: (n, 2) Nm, the commands at which resting joints were seen to let go. With them the dead zone's
+            edges move along with the offset (edge = command + offset). None: edges are nominal, or blocks.
+    """
+
+    blocks: tuple[str, ...]
+    n: int
+    lower: np.ndarray
+    upper: np.ndarray
+    nominal: Dynamics
+    robot: Robot
+    break_command: np.ndarray | None = None
+
+    def size(self, name: str) -> int:
+        """Return how many values a block has."""
+        return 1 if name in WHOLE_ARM else self.n
+
+    @property
+    def names(self) -> list[str]:
+        """P names such as phi1[3] (joints count from 1)."""
+        return [b if b in WHOLE_ARM else f"{b}[{j + 1}]" for b in self.blocks for j in range(self.size(b))]
+
+    @property
+    def start(self) -> np.ndarray:
+        """(P,) the nominal dynamics as a vector, clipped into the bounds."""
+        d = self.nominal
+        values = dict(zip(d.family.names, d.phi.T, strict=False))
+        values |= {"offset": d.offset} | {k: v for k in ("load", "gain") if (v := getattr(d, k)) is not None}
+        drag = np.zeros((self.n, 2)) if d.drag is None else d.drag
+        values |= {"drag_sin": drag[:, 0], "drag_cos": drag[:, 1]}
+        values |= {"breakaway_negative": d.breakaway[:, 0], "breakaway_positive": d.breakaway[:, 1]}
+        values |= {"delay": np.array([d.delay]), "lag": np.array([d.lag])}
+        values |= {"inertia_scale": inertia_scale(d.inertia, self.robot.inertia)}
+        if any(b in LINK for b in self.blocks):
+            values |= dict(zip(LINK, log_cholesky(self.robot, d).T, strict=True))
+        zero = np.zeros(self.n)
+        return np.clip(np.concatenate([values.get(b, zero) for b in self.blocks]), self.lower, self.upper)
+
+    def block(self, x: np.ndarray, name: str) -> np.ndarray:
+        """Return the (..., n) values of one block of x (..., P); (..., 1) where it is of the whole arm."""
+        return x[..., self.where(name)]
+
+    def where(self, name: str) -> np.ndarray:
+        """Return the indices of a block in x."""
+        at = sum(self.size(b) for b in self.blocks[: self.blocks.index(name)])
+        return np.arange(at, at + self.size(name))
+
+    def spread_out(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
+        """Return (P,): one value per block, repeated over it; `default` for blocks without one."""
+        return np.concatenate([np.full(self.size(b), values.get(b, default)) for b in self.blocks])
+
+    def of_joints(self, joints: np.ndarray) -> np.ndarray:
+        """Return (P,) bool: friction and offset of the joints (n,) bool; inertia and delay belong to no joint."""
+        none = np.zeros(1, dtype=bool)
+        return np.concatenate([none if b in WHOLE_ARM else joints & (b not in OF_LINKS) for b in self.blocks])
+
+    @property
+    def _log(self) -> np.ndarray:
+        return self.spread_out({b: True for b in LOGARITHMIC}, False)
+
+    def to_unit(self, x: np.ndarray) -> np.ndarray:
+        """Map x (..., P) in SI units into the unit cube."""
+        low, high = self._warp(self.lower), self._warp(self.upper)
+        return (self._warp(x) - low) / (high - low)
+
+    def from_unit(self, u: np.ndarray) -> np.ndarray:
+        """Map unit-cube points u (..., P) to SI units."""
+        low, high = self._warp(self.lower), self._warp(self.upper)
+        w = low + np.clip(u, 0.0, 1.0) * (high - low)
+        return np.where(self._log, np.exp(np.where(self._log, w, 0.0)), w)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """(P,) the width of the bounds: of the logarithm where the coordinate is logarithmic, else in SI units."""
+        return self._warp(self.upper) - self._warp(self.lower)
+
+    def _warp(self, x: np.ndarray) -> np.ndarray:
+        return np.where(self._log, np.log(np.where(self._log, x, 1.0)), x)
+
+    def dynamics(self, x: np.ndarray) -> Dynamics:
+        """Return the dynamics of x (..., P); blocks that are not searched keep their nominal values."""
+        d, blocks = self.nominal, set(self.blocks)
+        lead = x.shape[:-1]
+
+        def value(name: str, nominal: np.ndarray) -> np.ndarray:
+            found = self.block(x, name) if name in blocks else np.broadcast_to(nominal, (*lead, self.n))
+            return np.asarray(found)
+
+        zero = np.zeros(self.n)
+        columns = [d.phi[..., k] for k in range(d.phi.shape[-1])]
+        columns += [zero] * (max([0, *(k + 1 for k, f in enumerate(d.family.names) if f in blocks)]) - len(columns))
+        phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
+        out = replace(d, phi=np.stack(phi, -1), offset=value("offset", d.offset))
+        edges = d.breakaway
+        if self.break_command is not None:
+            edges = self.break_command + out.offset[..., None]
+            edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
+        pair = [value(f"breakaway_{side}", edges[..., i]) for i, side in enumerate(("negative", "positive"))]
+        out = replace(out, breakaway=np.stack(pair, -1))
+        if "load" in blocks:
+            out = replace(out, load=self.block(x, "load"))
+        if "gain" in blocks:
+            out = replace(out, gain=self.block(x, "gain"))
+        if blocks & {"drag_sin", "drag_cos"}:
+            drag = np.zeros((self.n, 2)) if d.drag is None else d.drag
+            out = replace(out, drag=np.stack([value("drag_sin", drag[:, 0]), value("drag_cos", drag[:, 1])], -1))
+        if "delay" in blocks:
+            out = replace(out, delay=self.block(x, "delay")[..., 0])
+        if "lag" in blocks:
+            out = replace(out, lag=self.block(x, "lag")[..., 0])
+        if "inertia_scale" in blocks:
+            return replace(out, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
+        if blocks & set(LINK):
+            start = log_cholesky(self.robot, d).T if set(LINK) - blocks else np.zeros((len(LINK), self.n))
+            theta = np.stack([value(name, own) for name, own in zip(LINK, start, strict=True)], -1)
+            mass, com, inertia = links(self.robot, theta)
+            return replace(out, mass=mass, com=com, inertia=inertia)
+        return out
+
+
+def check_parameters(where: str, names: Iterable[str]) -> None:
+    """Raise UserError if one of the names is no parameter."""
+    for name in names:
+        if name not in UNITS:
+            raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(UNITS)}{nearest(name, UNITS)}")
+
+
+def parameter_space(
+    robot: Robot,
+    nominal: Dynamics,
+    bounds: Mapping[str, Sequence[float]],
+    break_command: np.ndarray | None = None,
+) -> ParameterSpace:
+    """Make the space from {"phi1": [low, high], ...}; a block that is not named is not searched.
+
+    Raises:
+        UserError: no block at all, an unknown one, one of another friction family or both kinds of inertia, or bounds
+            that are not two rising numbers (positive where logarithmic).
+    """
+    if not bounds:
+        raise UserError(f"bounds: no parameter is named; allowed: {choices(UNITS)}")
+    check_parameters("bounds", bounds)
+    for name, pair in bounds.items():
+        if len(pair) != 2 or not pair[0] < pair[1] or (name in LOGARITHMIC and pair[0] <= 0):
+            raise UserError(f"bounds.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
+        others = {k for f in FAMILIES for k in f.names} - set(nominal.family.names)
+        if name in others:
+            raise UserError(
+                f"bounds.{name}: friction family '{nominal.family.name}' has {choices(nominal.family.names)}"
+            )
+    if "inertia_scale" in bounds and set(bounds) & set(LINK):
+        raise UserError("bounds: inertia_scale and link_... describe the same tensors: name one of the two")
+    space = ParameterSpace(tuple(bounds), robot.n, np.zeros(0), np.zeros(0), nominal, robot, break_command)
+    sides = [space.spread_out({k: float(pair[i]) for k, pair in bounds.items()}, 0.0) for i in (0, 1)]
+    return replace(space, lower=sides[0], upper=sides[1])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What was found of a space: every array (P,) but `samples` (S, P), draws of the joint distribution.
+
+    Attributes:
+        x: values, SI units. low, high: 95 % interval. identifiable: whether the data could tell.
+    """
+
+    x: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    identifiable: np.ndarray
+    samples: np.ndarray

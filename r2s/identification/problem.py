@@ -1,0 +1,166 @@
+"""What is searched and by what measure: the parameters of a model, and residuals on the unit cube.
+
+A search is a function on the unit cube; it knows nothing of arms.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from r2s.errors import UserError, choices, nearest
+from r2s.identification.levenberg_marquardt import minimise
+from r2s.identification.link_inertia import LINK
+from r2s.identification.parameters import ParameterSpace, check_parameters, parameter_space
+from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.torque_residual import TorqueResidual
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import FAMILIES
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+NONE = 1e-4  # standard deviation of the belief in a value that is not searched
+STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
+TERMS = ("viscous", "offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
+Report = Callable[[dict], None]
+
+
+def check_choices(family: str, terms: Sequence[str]) -> None:
+    """Raise UserError if there is no such friction family, or no such term to search."""
+    for what, seen, known in (
+        ("friction.family: no family", [family], [*(f.name for f in FAMILIES), "auto"]),
+        ("identify.terms: unknown term", terms, TERMS),
+    ):
+        for name in seen:
+            if name not in known:
+                raise UserError(f"{what} '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
+
+
+def check_prior(prior: Mapping[str, float]) -> None:
+    """Raise UserError if the prior names what does not exist (it may name what is not searched), or no deviation."""
+    check_parameters("prior", prior)
+    for name, sigma in prior.items():
+        if not sigma > 0:
+            raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
+
+
+def searched(
+    robot: Robot,
+    nominal: Dynamics,
+    bounds: Mapping[str, Sequence[float]],
+    terms: Sequence[str],
+    recording: Recording,
+) -> ParameterSpace:
+    """Return the space of the family's parameters and `terms`; `link` stands for its ten blocks.
+
+    Delay and lag lie between a command and the motion, a gain error in the torque sensor: each is searched where
+    it is.
+
+    Raises:
+        UserError: a term without bounds.
+    """
+    names = [name for name in nominal.family.names if name in bounds]
+    if nominal.family.name == "sigmoid" and "viscous" not in terms:
+        names = [name for name in names if name != "viscous"]
+    for term in terms:
+        elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
+        if term == "viscous" or term in elsewhere:
+            continue
+        names += LINK if term == "link" else [term]
+    if missing := [name for name in names if name not in bounds]:
+        raise UserError(f"identify.bounds: none for {choices(missing)}")
+    return parameter_space(robot, nominal, {name: bounds[name] for name in names})
+
+
+class Problem:
+    """What a search sees: residuals on the unit cube, with what was believed before as rows of its own.
+
+    Args:
+        data: the residual that decides. quick: one on the level of torque, for a fast start; may be the same.
+        prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
+            the scale is logarithmic). Blocks that are not named are uniform in their bounds.
+        kept: (n,) bool, joints whose friction and offset stay nominal.
+    """
+
+    def __init__(
+        self,
+        data: ReplayResidual | TorqueResidual,
+        quick: TorqueResidual,
+        prior: Mapping[str, float],
+        kept: np.ndarray | None = None,
+    ):
+        self.data, self.quick_data, self.space = data, quick, data.space
+        space = data.space
+        self.start = space.to_unit(space.start)
+        uniform = space.spread / np.sqrt(12)
+        self.sigma = np.minimum(space.spread_out(prior, np.inf), uniform)
+        if kept is not None:
+            self.believe(space.of_joints(kept), NONE)
+        self.clusters = data.clusters
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(P,) rows of the prior per unit of the cube."""
+        return self.space.spread / self.sigma
+
+    def believe(self, at: np.ndarray, sigma: np.ndarray | float) -> None:
+        """Set the standard deviation of the belief in the nominal values `at`."""
+        self.sigma[at] = sigma
+
+    def cost(self, u: np.ndarray) -> float:
+        """Return the sum of squares at u (P,)."""
+        return float((self.residual(u[None]) ** 2).sum())
+
+    def residual(self, u: np.ndarray) -> np.ndarray:
+        """Return (C, R + P) for u (C, P) on the unit cube: data, then prior, in standard deviations."""
+        return self._with_prior(self.data, u)
+
+    def quick(self, u: np.ndarray) -> np.ndarray:
+        """Return `residual` on the level of torque."""
+        return self._with_prior(self.quick_data, u)
+
+    def quick_jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Return (R + P, P), the Jacobian of `quick` at u (P,)."""
+        h = np.where(u > 0.5, -STEP, STEP)
+        change = self.quick_data.change(self.space.from_unit(u), self.space.from_unit(u + h))
+        return np.concatenate([change / h, np.diag(self.weight)])
+
+    def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:
+        return np.concatenate([data(self.space.from_unit(u)), (u - self.start) * self.weight], axis=1)
+
+    def adapt(self, u: np.ndarray, fitted: bool) -> None:
+        """Let the residuals find their weights about u (P,)."""
+        for data in {id(d): d for d in (self.data, self.quick_data)}.values():
+            data.adapt(self.space.from_unit(u), fitted)
+
+    def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residual (R + P,) and its Jacobian (R + P, P) at u (P,)."""
+        if self.data is self.quick_data:
+            return self.quick(u[None])[0], self.quick_jacobian(u)
+        h = np.where(u > 0.5, -STEP, STEP)  # always into the cube
+        r = self.residual(np.concatenate([u[None], u + np.diag(h)]))
+        return r[0], ((r[1:] - r[0]) / h[:, None]).T
+
+
+class Search(Protocol):
+    """A search minimises the sum of squares of a Problem's residual from `start` (P,) and returns where it ended.
+
+    `report` gets a dict after every step or generation: search, evaluations, cost, done, total. `local` says whether
+    it goes on from its start, so that it can polish.
+    """
+
+    local: bool
+
+    def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
+        """Return u (P,) on the unit cube."""
+        ...
+
+
+def fit_torque(problem: Problem, rounds: int = 2) -> np.ndarray:
+    """Return u (P,) by least squares on the level of torque, weighed again after every round."""
+    u = problem.start
+    for k in range(rounds):
+        u = minimise(problem.quick, problem.quick_jacobian, u, 12, 1e-3)
+        if k < rounds - 1:
+            problem.quick_data.adapt(problem.space.from_unit(u), fitted=True)
+    return u

@@ -1,0 +1,195 @@
+"""What a candidate gets wrong of commanded motion (no gravity in the torque): eq. (8) by replay.
+
+Every candidate starts each window at the measured state, is fed the recorded commands and is compared with the
+recorded joint angles, all candidates and windows at once on one Batch. In units of its own standard deviation, as far
+as `adapt` could tell it. The same for every search; torque_residual.py has the same interface.
+"""
+
+import numpy as np
+
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.windows import Local, cut_windows
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.simulator import Simulator
+from r2s.recordings.recording import Recording
+
+USUAL = 0.9  # share of windows that noise is estimated from
+HUBER = 1.5  # size of a window's residual, over the median, from which it counts less
+Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite differences by start state and torque
+
+
+class ReplayResidual:
+    """Residual of a commanded recording: simulated minus recorded angles, means of `stride` ms each, made white.
+
+    `slowest`, `limit` and `edges`: see `cut_windows`.
+
+    A window's error has three sources, and generalised least squares weighs rows by what they make together:
+        error = Z b + e,   b ~ N(0, diag(d)) start angle, start velocity and a torque that no candidate explains,
+        constant over the window, per joint;   e ~ N(0, s^2) encoder noise.
+    Z are finite differences about a candidate; d and s come from the recording, later from what is left (`adapt`).
+
+    Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to.
+    """
+
+    unit = "mrad"
+
+    def __init__(
+        self,
+        robot: Robot,
+        space: ParameterSpace,
+        recording: Recording,
+        *,
+        window_s: float = 0.2,
+        stride: int = 5,
+        slowest: float = 0.0,
+        limit: int | None = None,
+        edges: np.ndarray | None = None,
+        batch: int = 36,
+        nthread: int = 0,
+    ):
+        self.space, self.windows, self._batch = space, cut_windows(recording, window_s, limit, slowest, edges), batch
+        w = self.windows
+        self.count = len(w.q0)
+        self._stride = stride
+        self._target = self._means(w.q)
+        last = stride * (1 + np.arange(self._target.shape[1]))
+        self._seen = np.repeat((last <= w.length[:, None])[..., None], robot.n, axis=2)
+        self.clusters = np.repeat(np.arange(self.count), self._target[0].size)
+        self._sim = Simulator(robot, space.nominal, batch * self.count, nthread)
+        self.candidates = 0
+        local = Local.of(recording.resample(SIM_DT))
+        self._noise, start = local.noise / np.sqrt(stride), local.sigma.ravel()
+        self._least = np.concatenate([start, np.full(robot.n, 1e-4)])
+        self._spread = np.concatenate([start, np.full(robot.n, 0.05)])
+        self.adapt(space.start, fitted=False)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        return (self._white(self.error(x)) * self._trust[:, None]).reshape(len(x), -1)
+
+    def error(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, W, S' n) rad: simulated minus recorded angles where they count, else 0."""
+        self.candidates += len(x)
+        return np.concatenate([self._chunk(x[i : i + self._batch]) for i in range(0, len(x), self._batch)])
+
+    def _chunk(self, x: np.ndarray) -> np.ndarray:
+        w, d = self.windows, self.space.dynamics(x)
+        timing = np.stack(np.broadcast_arrays(d.delay, d.lag, np.zeros(len(x)))[:2], -1)
+        kinds, kind = np.unique(timing, axis=0, return_inverse=True)
+        felt = np.stack([w.felt(*pair) for pair in kinds])
+        return self._simulate(d, felt[kind.ravel()], w.q0, w.dq0)
+
+    def _simulate(self, d: Dynamics, felt: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
+        """Return `error` of C candidates for torques felt (C, W, S, n) and starts (C, W, n) or (W, n)."""
+        count = len(felt)
+        ids = np.arange(count * self.count)
+        shape = (count, *self.windows.q0.shape)
+        self._sim.set_dynamics(d, ids, repeat=self.count)
+        n = q0.shape[-1]
+        q0, dq0, turn = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.turn))
+        self._sim.reset(q0, dq0, ids, turn)
+        q = self._sim.rollout(felt.reshape(-1, *felt.shape[2:]), ids=ids)["qpos"]
+        error = (self._means(q).reshape(count, *self._target.shape) - self._target) * self._seen
+        return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _means(self, q: np.ndarray) -> np.ndarray:
+        """Return (..., S', n): means of `stride` rows of q (..., S, n); the noise of each is its own."""
+        whole = q.shape[-2] // self._stride
+        parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
+        return parts.mean(-2)
+
+    def adapt(self, x: np.ndarray, fitted: bool) -> None:
+        """Find Z about x (P,) and the whitening; with `fitted`, d and s as well, from what x leaves unexplained."""
+        w, n = self.windows, self.space.n
+        d = self.space.dynamics(x)
+        felt, eye = w.felt(d.delay, d.lag), np.eye(n)[:, None]
+        zero = np.zeros((n, 1, n))
+        q0 = np.concatenate([w.q0[None], w.q0 + Q_STEP * eye, w.q0 + zero, w.q0 + zero])
+        dq0 = np.concatenate([w.dq0[None], w.dq0 + zero, w.dq0 + DQ_STEP * eye, w.dq0 + zero])
+        push = np.concatenate([np.zeros((1 + 2 * n, 1, 1, n)), TAU_STEP * eye[:, None]])
+        parts, count = [], len(q0)
+        for i in range(0, count, self._batch):
+            at = slice(i, i + self._batch)
+            parts.append(self._simulate(d, felt + push[at], q0[at], dq0[at]))
+        at_x = np.concatenate(parts)
+        self.candidates += count
+        steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
+        z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
+        self._trust = np.ones(self.count)
+        moves = self._seen.any((1, 2))  # the others have no error at all, and say nothing of its usual size
+        if fitted and moves.any():
+            usual = moves
+            for _ in range(2):  # a window in which something else happened tells nothing of the noise of the others
+                self._spread, self._noise = _random_effects(
+                    z[usual], at_x[0, usual], self._seen[usual], self._spread, self._noise, self._least
+                )
+                self._whiten(z)
+                size = self._window_size(at_x[0])
+                usual = moves & (size <= np.quantile(size[moves], USUAL))
+            self._trust = np.minimum(1.0, HUBER * np.median(size[moves]) / np.maximum(size, 1e-9))
+        self._whiten(z)
+
+    def _window_size(self, error: np.ndarray) -> np.ndarray:
+        """Return (W,) the RMS of a window's white residual, of rows that count."""
+        r = self._white(error[None])[0]
+        return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
+
+    def _white(self, error: np.ndarray) -> np.ndarray:
+        """Return (C, W, R') in standard deviations."""
+        r = error / np.tile(self._noise, self._target.shape[1])
+        part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
+        return r - part[..., 0, :]
+
+    def _whiten(self, z: np.ndarray) -> None:
+        """Keep the axes and factors of (I + E E^T)^(-1/2) = I - A (1 - 1 / sqrt(1 + l^2)) A^T, E = z d / s."""
+        effect = z * self._spread / np.tile(self._noise, self._target.shape[1])[:, None]
+        self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
+        self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+
+    @property
+    def unexplained(self) -> np.ndarray:
+        """(n,) Nm, one standard deviation of the torque over a window that no candidate explains."""
+        return self._spread[2 * self.space.n :]
+
+    def joint_error(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, n) mrad^2: the mean square error of each joint."""
+        return 1e6 * (self.error(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
+
+
+def _random_effects(
+    z: np.ndarray,
+    error: np.ndarray,
+    seen: np.ndarray,
+    spread: np.ndarray,
+    noise: np.ndarray,
+    least: np.ndarray,
+    rounds: int = 30,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
+
+    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b), from
+    `spread` and `noise` on. What b has in common over all windows is a parameter that is still wrong, an offset above
+    all, and no noise: taken for noise it would keep the next fit from putting it right. No d falls below `least`
+    (K,): of start angle and velocity what the encoder gives.
+    """
+    _, rows, k = z.shape
+    n = len(noise)
+    joint = np.tile(np.arange(n), rows // n)
+    counted = np.array([seen[..., j].sum() for j in range(n)])
+    for _ in range(rounds):
+        weighed = z / (noise[joint] ** 2)[:, None]
+        gram = weighed.transpose(0, 2, 1) @ z
+        scaled = spread[:, None] * gram * spread + np.eye(k)
+        inverse = np.linalg.inv(scaled)
+        mean = spread * np.einsum("wij,wj->wi", inverse, spread * np.einsum("wri,wr->wi", weighed, error))
+        covariance = spread[:, None] * inverse * spread
+        left = error - np.einsum("wri,wi->wr", z, mean)
+        uncertain = np.einsum("wri,wij,wrj->wr", z, covariance, z, optimize=True)
+        total = (left**2 + uncertain).sum(0)
+        new = np.array([total[joint == j].sum() for j in range(n)]) / np.maximum(counted, 1)
+        noise = np.maximum(np.where(counted > 0, np.sqrt(new), noise), 1e-6)
+        determined = 1.0 - np.einsum("wii->wi", covariance) / spread**2
+        about = mean - mean.mean(0)
+        spread = np.maximum(np.sqrt((about**2).sum(0) / np.maximum(determined.sum(0), 1e-3)), least)
+    return spread, noise

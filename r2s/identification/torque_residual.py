@@ -1,0 +1,156 @@
+"""What a candidate gets wrong of torque, at the measured motion.
+
+For measured link-side torque (with gravity) there is no command to replay, so the residual is the torque that rigid
+dynamics, friction and offset predict against the measured one. It exists for commanded torque, too, where it is a
+fast start. In units of its own standard deviation, as far as `adapt` could tell it.
+"""
+
+from copy import copy
+
+import numpy as np
+
+from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
+from r2s.identification.smooth_motion import Motion
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import BRISTLE, PRESLIDING, WIDTH_DQ
+from r2s.physics.rigid_body import GRAVITY, Links, regressor, rigid_body
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+LONGEST = 40  # rows: a residual that drifts slowly is not one single row
+BLOCK_S = 0.5  # s, stretches that the bootstrap draws
+
+
+class TorqueResidual:
+    """Residual of any recording: predicted minus recorded torque, zero-phase filtered, at `rate_hz`.
+
+    The rigid part is a product with a regressor made once. Friction is evaluated at less smoothed velocities and then
+    filtered as the torque was, because a filter rounds the step of friction at a reversal.
+    """
+
+    unit = "Nm"
+
+    def __init__(
+        self,
+        robot: Robot,
+        space: ParameterSpace,
+        recording: Recording,
+        *,
+        cutoff_hz: float = 10.0,
+        rate_hz: float = 100.0,
+        block_s: float = BLOCK_S,
+        presliding_rad: float = PRESLIDING,
+    ):
+        self.space = space
+        self.motion = m = Motion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+        self.commanded = recording.torque == "commanded"
+        gravity = None if self.commanded else GRAVITY
+        self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
+        self._y = y.reshape(*m.q.shape, -1)
+        still = np.zeros_like(m.q)
+        y = regressor(robot, m.q, still, still, GRAVITY)
+        self._gravity = y.reshape(*m.q.shape, -1)
+        self._nominal = Links(robot.mass, robot.com, robot.inertia).standard().ravel()
+        self._load = np.abs(self._gravity @ self._nominal)
+        block = (m.t / block_s).astype(int)
+        self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
+        self.candidates = 0
+        self._scale = np.ones(robot.n)
+        self.adapt(space.start, fitted=False)
+
+    def on(self, space: ParameterSpace) -> "TorqueResidual":
+        """Return this residual for candidates of another space."""
+        other = copy(self)
+        other.space = space
+        other.adapt(space.start, fitted=False)
+        return other
+
+    def predict(self, dynamics: Dynamics) -> np.ndarray:
+        """Return (T, n) Nm: rigid-body torque + friction - offset at the measured motion, of one arm."""
+        d, m = dynamics, self.motion
+        standard = self._standard(d).ravel()
+        out = self._rest + self._y @ standard
+        if d.gain is not None and not self.commanded:
+            out = out * (1.0 + d.gain)
+        turn = m.turn if d.family == BRISTLE else None
+        out += m.filtered(d.friction(m.fast, turn)) - d.offset
+        if self.commanded and (d.mass is not None or d.com is not None):  # what the compensation leaves
+            out += self._gravity @ (standard - self._nominal)
+        if d.drag is not None:
+            out -= d.drag[:, 0] * np.sin(m.q) + d.drag[:, 1] * np.cos(m.q)
+        if d.load is not None:
+            out += d.load * self._load * m.filtered(np.tanh(m.fast / WIDTH_DQ) if turn is None else turn)
+        return out
+
+    def error(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
+        self.candidates += len(x)
+        out = np.empty((len(x), *self.motion.q.shape))
+        d = self.space.dynamics(x)
+        for i in range(len(x)):
+            out[i] = self.off(d.one(i))
+        return out
+
+    def off(self, dynamics: Dynamics) -> np.ndarray:
+        """Return (T, n) Nm, predicted minus recorded, of one arm."""
+        late = float(dynamics.delay) + float(dynamics.lag) if self.commanded else 0.0
+        return self.predict(dynamics) - self.motion.tau_at(late)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        return (self.error(x) / self._scale).reshape(len(x), -1)
+
+    def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
+        """Return (R, P): what the residual at x (P,) changes by as each value in turn goes to `stepped` (P,).
+
+        The same as P calls with one value changed, but joints do not see each other's friction and the torque is
+        linear in standard parameters, so a dozen evaluations do.
+        """
+        space, n = self.space, self.space.n
+        d = space.dynamics(x)
+        base, out = self.off(d), np.zeros((*self.motion.q.shape, len(x)))
+        reach = self._y * (np.ones(n) if d.gain is None or self.commanded else 1.0 + d.gain)[:, None]
+        reach = reach + self._gravity if self.commanded else reach
+        before = self._standard(d).ravel()
+        for block in space.blocks:
+            at = space.where(block)
+            if block in OF_LINKS:
+                trials = np.repeat(x[None], n, axis=0)
+                trials[np.arange(n), at] = stepped[at]
+                after = self._standard(space.dynamics(trials)).reshape(n, -1)
+                out[..., at] = reach @ (after - before).T
+                continue
+            trial = x.copy()
+            trial[at] = stepped[at]
+            moved = self.off(space.dynamics(trial)) - base
+            if block in WHOLE_ARM:
+                out[..., at[0]] = moved
+            else:
+                out[:, np.arange(n), at] = moved
+        return (out / self._scale[:, None]).reshape(-1, len(x))
+
+    def _standard(self, d: Dynamics) -> np.ndarray:
+        """Return (..., n, 10) standard parameters."""
+        robot = self.space.robot
+        mass = robot.mass if d.mass is None else d.mass
+        return Links(mass, robot.com if d.com is None else d.com, d.inertia).standard()
+
+    def adapt(self, x: np.ndarray, fitted: bool) -> None:
+        """Set what counts as one standard deviation of an independent row, per joint.
+
+        It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing.
+        """
+        r = self.error(x[None])[0]
+        self._scale = (1.0 if fitted else 0.5) * np.sqrt((r**2).mean(0) * np.minimum(_correlation_length(r), LONGEST))
+
+
+def _correlation_length(r: np.ndarray) -> np.ndarray:
+    """Return (n,) samples: how far the residual's autocorrelation reaches before it falls below 1/e."""
+    centred = r - r.mean(0)
+    out = np.ones(r.shape[1])
+    for j, x in enumerate(centred.T):
+        power = np.abs(np.fft.rfft(x, 2 * len(x))) ** 2
+        correlation = np.fft.irfft(power)[: len(x)]
+        below = np.flatnonzero(correlation < correlation[0] / np.e)
+        out[j] = below[0] if len(below) else len(x)
+    return out

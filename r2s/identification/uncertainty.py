@@ -1,0 +1,175 @@
+"""The result of an identification, and how sure it is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from r2s.identification.parameters import Estimate, ParameterSpace
+from r2s.identification.problem import Problem
+from r2s.physics.dynamics import Dynamics
+
+DRAWS = 512  # of the joint distribution
+UNSEEN = 0.9  # of its prior's deviation: a value with so much left is hardly seen
+SHARPER = 4.0  # a parameter is identifiable when the half width of its interval is this much below its prior's sigma
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The result.
+
+    Attributes:
+        space, found: what was searched, and what was found (r2s/identification/parameters.py).
+        history: a row per step or generation of each search.
+        families: {"sigmoid": error on motion left out, ...} where the family was chosen, relative to the best.
+        null_directions: combinations of parameters that only the prior decides: (share of the prior's sigma left,
+            {name: part}), widest first.
+        unseen: names that keep their nominal value, because the data hardly say anything of them.
+        break_spread: (n, 2) Nm, repeatability of the breakaway, where it was measured.
+    """
+
+    space: ParameterSpace
+    found: Estimate
+    history: pd.DataFrame
+    families: dict[str, float]
+    null_directions: list[tuple[float, dict[str, float]]]
+    unseen: list[str]
+    break_spread: np.ndarray | None = None
+
+    @property
+    def x(self) -> np.ndarray:
+        """(P,) the values found, SI units."""
+        return self.found.x
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The identified arm."""
+        return self.space.dynamics(self.found.x)
+
+    @property
+    def saved(self) -> tuple[ParameterSpace, Estimate]:
+        """What goes into parameters.yaml: the result, with measured edges of the dead zone as blocks of their own."""
+        if self.break_spread is None:
+            return self.space, self.found
+        d, f = self.dynamics, self.found
+        edges = self.space.dynamics(f.samples).breakaway
+        spread = np.nan_to_num(self.break_spread, nan=0.0)
+        rng = np.random.default_rng(0)
+        edges = edges + spread * rng.standard_normal(edges.shape)
+        edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
+        samples = np.concatenate([f.samples, edges[..., 0], edges[..., 1]], -1)
+        x = np.concatenate([f.x, d.breakaway[:, 0], d.breakaway[:, 1]])
+        half = 1.96 * np.concatenate([spread[:, 0], spread[:, 1]])
+        n, p = self.space.n, len(f.x)
+        low, high = np.concatenate([f.low, x[p:] - half]), np.concatenate([f.high, x[p:] + half])
+        known = np.concatenate([f.identifiable, np.ones(2 * n, dtype=bool)])
+        limit = np.full(n, 10.0)
+        space = replace(
+            self.space,
+            blocks=(*self.space.blocks, "breakaway_negative", "breakaway_positive"),
+            lower=np.concatenate([self.space.lower, -limit, 0 * limit]),
+            upper=np.concatenate([self.space.upper, 0 * limit, limit]),
+            break_command=None,
+        )
+        return space, Estimate(x, low, high, known, samples)
+
+
+class Posterior(NamedTuple):
+    """u (P,) the result on the unit cube, draws about it as steps (S, P), and the data's information (P, P)."""
+
+    u: np.ndarray
+    steps: np.ndarray
+    information: np.ndarray
+
+
+def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
+    """Return draws of the joint distribution about the result u (P,), by a linearised block bootstrap.
+
+    Errors within a window are correlated, so windows are drawn with replacement (Kuensch 1989), and the belief is
+    drawn from its prior each time; each draw is one Gauss-Newton step from u. Where the data say nothing a draw is
+    one of the prior's. A bootstrap of few windows is too narrow where single windows decide, so the spread is not
+    let below what the residual's own variance gives. Draws are centred on their median: a few of them may go far.
+    """
+    rng = np.random.default_rng(seed)
+    residual, jacobian = problem.jacobian(u)
+    rows, p = len(problem.clusters), len(u)
+    j, r = jacobian[:rows], residual[:rows]
+    count = int(problem.clusters.max()) + 1
+    order = np.argsort(problem.clusters, kind="stable")
+    edges = np.searchsorted(problem.clusters[order], np.arange(count + 1))
+    j, r = j[order], r[order]
+    gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
+    score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
+    belief = np.diag(problem.weight**2)
+    pull = problem.weight**2 * (u - problem.start)
+    factor = max(1.0, float(np.sqrt(np.mean(r**2))))
+    steps = np.empty((DRAWS, p))
+    for k in range(DRAWS):
+        times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
+        believed = pull - problem.weight * rng.standard_normal(p)
+        h = np.tensordot(times, gram, 1) + belief
+        steps[k] = -np.linalg.solve(h, times @ score + believed)
+    information = gram.sum(0)
+    covariance = np.linalg.inv(information + belief)
+    own = np.sqrt(np.diag(covariance @ (factor**2 * information + belief) @ covariance))
+    seen = steps.std(0)
+    steps = (steps - np.median(steps, axis=0)) * np.maximum(1.0, own / np.maximum(seen, 1e-12))
+    return Posterior(u, steps, information)
+
+
+def conclude(
+    problem: Problem,
+    space: ParameterSpace,
+    sure: Mapping[str, Any],
+    history: pd.DataFrame,
+    families: dict[str, float],
+    break_spread: np.ndarray | None,
+) -> Identified:
+    """Return the result: what hardly any data spoke of goes back to nominal, and is named.
+
+    `space` is the problem's, with the dead zone that was found since.
+    """
+    u = np.array(sure["u"], dtype=float)
+    steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
+    prior = problem.sigma / space.spread  # on the unit cube
+    share = steps.std(0) / prior
+    u, unseen = _settled(u, problem.start, information + np.diag(problem.weight**2), share)
+    samples = space.from_unit(u + steps)
+    low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
+    half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
+    identifiable = half < prior / SHARPER
+    # in units of the prior, I + prior H prior: a direction that the data do not see keeps an eigenvalue of 1
+    gained, directions = np.linalg.eigh(np.eye(len(u)) + prior[:, None] * information * prior)
+    null = []
+    for g, v in zip(gained, directions.T, strict=True):
+        if g < 4.0:  # half of the prior's sigma is left, or more
+            parts = sorted(zip(space.names, v.tolist(), strict=True), key=lambda p: -abs(p[1]))
+            null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts[:6] if abs(part) > 0.2}))
+    names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
+    found = Estimate(space.from_unit(u), low, high, identifiable, samples)
+    return Identified(space, found, history, families, null, names, break_spread)
+
+
+def _settled(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return u (P,) with as many unseen values at `start` as cost nothing, and which (P,) bool those are.
+
+    A value may be unseen by itself and seen together with others, as the masses of two links in a row are: a value
+    goes back only if the others, moved to where that is best, explain the data and the belief as well as before: the
+    sum of squares may rise by 1 in all.
+
+    Args:
+        u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
+        share: (P,) of its prior's deviation that each value's has left.
+    """
+    best, unseen = u, np.zeros(len(u), dtype=bool)
+    for k in np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]:
+        some = unseen.copy()
+        some[k] = True
+        step = np.where(some, start - u, 0.0)
+        step[~some] = -np.linalg.solve(h[np.ix_(~some, ~some)], h[np.ix_(~some, some)] @ step[some])
+        if step @ h @ step <= 1.0:
+            best, unseen = u + step, some
+    return np.clip(best, 0.0, 1.0), unseen

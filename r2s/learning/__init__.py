@@ -1,0 +1,1 @@
+"""Policies: environment, randomization, algorithms, training, evaluation, and the model-based reference."""

@@ -1,0 +1,68 @@
+"""Where a training goes on after a stop: its whole state in one file, what it has seen in chunks beside it.
+
+The transitions are written once, as they come; the state names how many of them count, so that a stop between two
+checkpoints leaves nothing half done. Tensors, numbers and names only: torch.load(weights_only=True) reads it all.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import TensorDictReplayBuffer
+
+from r2s.files import whole
+
+
+class Checkpoint:
+    """The checkpoint of one training, in a folder of its own."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._kept, self._chunks = 0, list[str]()  # transitions in the chunks, and their names
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps that it holds; 0 where there is none."""
+        path = self.folder / "state.pt"
+        return torch.load(path, weights_only=True)["seen"] if path.is_file() else 0
+
+    def save(self, state: dict[str, Any], replay: TensorDictReplayBuffer, seen: int, size: int) -> None:
+        """Write the state and the transitions since the last call.
+
+        Args:
+            state: what to go on with. replay: of `size` at most, after `seen` transitions in all.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        chunk = f"replay_{seen:012d}.pt"
+        if seen - self._kept < size:
+            rows, self._chunks = torch.arange(self._kept, seen) % size, [*self._chunks, chunk]
+        else:  # all that was kept has been overwritten
+            rows, self._chunks = torch.arange(size), [chunk]
+        _write(self.folder / chunk, replay[rows].to_dict())
+        _write(self.folder / "state.pt", state | {"seen": seen, "chunks": self._chunks})
+        self._kept = seen
+
+    def load(self, replay: TensorDictReplayBuffer, size: int) -> dict[str, Any] | None:
+        """Return the state that was saved last, and fill `replay` with what it had seen; None where there is none."""
+        path = self.folder / "state.pt"
+        if not path.is_file():
+            return None
+        state = torch.load(path, weights_only=True)
+        self._kept, self._chunks = state["seen"], state["chunks"]
+        for chunk in self._chunks:
+            rows = torch.load(self.folder / chunk, weights_only=True)
+            replay.extend(TensorDict(rows, batch_size=[len(rows["action"])]))
+        replay.writer.load_state_dict({"_cursor": self._kept % size})
+        return state
+
+    def clear(self) -> None:
+        """Remove it: the training has come to its end."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    """Write a file that appears only once it is whole."""
+    with whole(path) as part:
+        torch.save(content, part)

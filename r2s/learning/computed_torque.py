@@ -1,0 +1,93 @@
+"""What a roboticist would do without learning: minimum-jerk joint motion, computed torque, friction compensation.
+
+It has a policy's interface and sees what a policy sees, at a policy's rate; the model is the one that policies train
+in. Every learned result is read against it (`algo=oracle`).
+"""
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2s.excitation.minimum_jerk import minimum_jerk
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.physics.robot import Robot
+from r2s.tasks.reach import Task
+
+STIFF = 12.0  # rad/s, bandwidth of the feedback, critically damped: 50 Hz and the delays of an arm bear no more
+POSTURE = 1e-3  # weight of staying near the start in the inverse kinematics, against metres of the end effector
+FAST = 0.8  # of a joint's velocity limit
+PEAK = 1.875  # of a minimum-jerk motion's speed, over its mean
+
+
+class Oracle:
+    """The reference controller of B arms; `action` as of r2s.learning.networks.Policy.
+
+    Args:
+        robot, task: the arm and what is asked of it.
+        dynamics: of one arm, what the controller believes.
+        move_s: s, shortest duration of a motion; no joint gets faster than FAST of its limit.
+    """
+
+    def __init__(self, robot: Robot, task: Task, dynamics: Dynamics, move_s: float = 0.6):
+        self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
+        self._model = robot.model(gravity=False)
+        mass = robot.mass if dynamics.mass is None else dynamics.mass
+        com = robot.com if dynamics.com is None else dynamics.com
+        bodies = self._model.jnt_bodyid
+        for body, m, c, inertia in zip(bodies, mass, com, dynamics.inertia, strict=True):
+            moments, axes = np.linalg.eigh(inertia)
+            axes[:, 0] *= np.sign(np.linalg.det(axes))
+            self._model.body_mass[body], self._model.body_ipos[body] = m, c
+            self._model.body_inertia[body] = moments
+            mujoco.mju_mat2Quat(self._model.body_iquat[body], axes.ravel())
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_setConst(self._model, self._data)
+        self._site = self._model.site(robot.ee_site).id
+        self._torque = task.torque(robot)
+        self._soft = SoftLimits.of(robot, self._torque)
+        self._plans: dict[int, tuple[np.ndarray, np.ndarray, float, int]] = {}
+
+    @torch.no_grad()
+    def action(self, observation: Tensor) -> Tensor:
+        """Return actions (B, n) in [-1, 1] for observations (B, d); no effort yet means that an episode begins."""
+        rows, n = observation.numpy().astype(np.float64), self.robot.n
+        out = np.empty((len(rows), n))
+        for i, row in enumerate(rows):
+            q, dq, goal, effort = row[:n], row[n : 2 * n], row[2 * n + 3 : 2 * n + 6], row[2 * n + 9 : 3 * n + 9]
+            if i not in self._plans or not effort.any():
+                end = self.reach(q, goal)
+                fastest = np.max(PEAK * np.abs(end - q) / (FAST * self.robot.dq_max))
+                self._plans[i] = q, end, max(self.move_s, float(fastest)), 0
+            start, end, seconds, k = self._plans[i]
+            self._plans[i] = start, end, seconds, k + 1
+            out[i] = self.torque(q, dq, *minimum_jerk(start, end, seconds, (k + 0.5) / self.task.ctrl_hz))
+        return torch.from_numpy(np.clip(out / self._torque, -1.0, 1.0).astype(np.float32))
+
+    def torque(self, q: np.ndarray, dq: np.ndarray, to: np.ndarray, dto: np.ndarray, ddto: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm that follows the reference `to`, `dto`, `ddto` (n,) from q, dq (n,)."""
+        data = self._data
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, dq, ddto + 2 * STIFF * (dto - dq) + STIFF**2 * (to - q)
+        rigid = np.zeros(self.robot.n)
+        mujoco.mj_fwdPosition(self._model, data)
+        mujoco.mj_fwdVelocity(self._model, data)
+        mujoco.mj_rne(self._model, data, 1, rigid)
+        return rigid + self.dynamics.friction(dto) - self.dynamics.offset - self._soft(q, dq)
+
+    def reach(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
+        """Return q (n,) within the limits whose end effector is at `goal` (3,) m, near `start`; damped steps."""
+        q, jacobian = start.copy(), np.empty((3, self.robot.n))
+        low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15
+        for _ in range(rounds):
+            self._data.qpos[:] = q
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_comPos(self._model, self._data)
+            mujoco.mj_jacSite(self._model, self._data, jacobian, None, self._site)
+            error = goal - self._data.site_xpos[self._site]
+            if np.linalg.norm(error) < 2e-4:
+                break
+            h = jacobian.T @ jacobian + POSTURE * np.eye(self.robot.n)
+            step = np.linalg.solve(h, jacobian.T @ error)
+            q = np.clip(q + step * min(1.0, 0.3 / np.abs(step).max()), low, high)
+        return q

@@ -1,0 +1,88 @@
+"""A policy on disk: policy.pt for r2s, policy.onnx for everything else. SI units in, torque in Nm out."""
+
+import contextlib
+import io
+import logging
+import warnings
+from pathlib import Path
+
+import torch
+
+from r2s.errors import UserError
+from r2s.learning.networks import Actor, Normalizer, Policy
+from r2s.physics.robot import Robot
+from r2s.tasks.reach import Task, observation_scale
+
+
+def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
+    """Return an untrained policy of this arm and task."""
+    mean, std = (torch.from_numpy(x) for x in observation_scale(robot, task))
+    torque = torch.from_numpy(task.torque(robot)).float()
+    return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
+
+
+def save_policy(folder: Path, policy: Policy) -> None:
+    """Write policy.pt: the state dict and the sizes that it fits."""
+    linear = [m.out_features for m in policy.actor.body if isinstance(m, torch.nn.Linear)]
+    torch.save({"state": policy.state_dict(), "hidden": linear[:-1]}, folder / "policy.pt")
+
+
+def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
+    """Return the policy of a run folder.
+
+    Raises:
+        UserError: no policy.pt there, or one of another arm.
+    """
+    path = Path(folder) / "policy.pt"
+    if not path.is_file():
+        raise UserError(f"policy: no policy.pt in {folder}")
+    saved = torch.load(path, weights_only=True)
+    policy = make_policy(robot, task, tuple(saved["hidden"]))
+    try:
+        policy.load_state_dict(saved["state"])
+    except RuntimeError:
+        raise UserError(f"policy: {path} does not fit {robot.name} with {robot.n} joints") from None
+    return policy.eval()
+
+
+def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
+    """Write policy.onnx: `observation` (B, d) in SI units -> `torque` (B, n) Nm, normalisation inside.
+
+    Its metadata carries what a driver needs: joint count and order, policy rate, torque limits, low-pass.
+    """
+    import onnx
+
+    example = torch.zeros(2, len(policy.normalizer.mean))
+    quiet = contextlib.redirect_stdout(io.StringIO())
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), quiet:
+        warnings.simplefilter("ignore")  # the exporter warns of its own internals
+        torch.onnx.export(
+            policy,
+            (example,),
+            str(path),
+            input_names=["observation"],
+            output_names=["torque"],
+            dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
+            external_data=False,
+            verbose=False,
+        )
+    model = onnx.load(path)
+    arm = robot.model(gravity=False)
+    facts = {
+        "robot": robot.name,
+        "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
+        "observation": "q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015); rad, rad/s, m",
+        "policy_hz": str(task.ctrl_hz),
+        "q_min_rad": " ".join(f"{q:g}" for q in robot.q_min),
+        "q_max_rad": " ".join(f"{q:g}" for q in robot.q_max),
+        "dq_max_rad_per_s": " ".join(f"{v:g}" for v in robot.dq_max),
+        "torque_max_Nm": " ".join(f"{t:g}" for t in robot.tau_max),
+        "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),
+        "torque_scale_Nm": " ".join(f"{t:g}" for t in policy.torque_scale.tolist()),
+        "low_pass_hz": str(task.cutoff_hz),
+        "torque": "without gravity, before low-pass, clip and rate limit",
+    }
+    for key, value in facts.items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.save(model, path)

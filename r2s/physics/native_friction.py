@@ -1,0 +1,209 @@
+"""The friction law inside MuJoCo's physics step: a compiled passive force that reads `jnt_user`.
+
+`install()` puts the law of friction.py into MuJoCo as a native passive force: `mujoco.batch.Batch` then gives every
+simulation its own arm at full speed. The same callback holds the driver's soft limits (limits.py), which need
+feedback every millisecond.
+
+The force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
+qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D: exact to first order, and stable
+where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
+"""
+
+import ctypes
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from numba import njit
+
+from r2s.physics.friction import WIDTH_DQ
+
+GRAVITY = 9.81  # m/s^2, of an upright base
+PHI = 6  # most parameters of a family
+MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
+
+
+# Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
+MARK, FAMILY, P1 = range(3)
+OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
+MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
+Q_LOW, Q_HIGH, Q_GAIN, DQ_SOFT, DQ_GAIN = range(MOMENT + 3, MOMENT + 8)  # soft limits; gains of 0: none
+WIDTH = DQ_GAIN + 1
+MARKER = 7_202_020.0
+
+
+def install() -> None:
+    """Put the native law into MuJoCo, once per process. Models without our marker in `jnt_user` are untouched."""
+    _callback()
+
+
+@njit(inline="always")
+def _law(code, p, v, h, memory):
+    """Return friction torque and slope of one joint; p (PHI,) of its family. `memory` (1,), z, moves on by v h."""
+    if code == 0:
+        x = p[1] * (v + p[2])
+        e = np.exp(-abs(x))
+        s = (1.0 if x >= 0 else e) / (1.0 + e)
+        x = p[1] * p[2]
+        e = np.exp(-abs(x))
+        s0 = (1.0 if x >= 0 else e) / (1.0 + e)
+        return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
+    if code == 3:
+        s = 1.0 if v > 0 else -1.0
+        z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
+        memory[0] = z
+        level = p[0] * (1.0 + p[1] if z > 0 else 1.0 - p[1]) * (1.0 + p[3] * np.exp(-((v / p[4]) ** 2)))
+        stiff = level / p[5]
+        rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
+        # what the coming step will do to it, at the present velocity
+        return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
+    turn = np.tanh(v / WIDTH_DQ)
+    level = p[0] * (1.0 + np.sign(v) * p[1])
+    fall = 0.0
+    if code == 2:
+        bump = p[3] * np.exp(-((v / p[4]) ** 2))
+        fall = level * bump * -2.0 * v / p[4] ** 2
+        level *= 1.0 + bump
+    return level * turn + p[2] * v, level * (1.0 - turn * turn) / WIDTH_DQ + fall * turn + p[2]
+
+
+@cache
+def _callback() -> Any:
+    from llvmlite import ir
+    from numba import carray, cfunc, types
+    from numba.extending import intrinsic
+
+    at = _struct_offsets()
+    nv_at, nuser_at = at["nv"] // 8, at["nuser_jnt"] // 8
+    user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
+    qpos_at, qvel_at = at["qpos"] // 8, at["qvel"] // 8
+    applied_at, passive_at = at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
+    memory_at = at["userdata"] // 8
+    xpos_at, xmat_at = at["xpos"] // 8, at["xmat"] // 8
+    anchor_at, axis_at, nbody_at = at["xanchor"] // 8, at["xaxis"] // 8, at["nbody"] // 8
+    model_words, data_words = (
+        max(at[k] for k in _MODEL_FIELDS) // 8 + 1,
+        max(at[k] for k in _DATA_FIELDS) // 8 + 1,
+    )
+
+    @intrinsic
+    def as_doubles(typingctx, address):
+        def codegen(context, builder, signature, args):
+            return builder.inttoptr(args[0], ir.DoubleType().as_pointer())
+
+        return types.CPointer(types.float64)(types.int64), codegen
+
+    @cfunc(types.void(types.CPointer(types.int64), types.CPointer(types.int64)))
+    def passive(model_ptr, data_ptr):
+        model = carray(model_ptr, (model_words,))
+        if model[nuser_at] != WIDTH:
+            return
+        n, nbody = model[nv_at], model[nbody_at]
+        user = carray(as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
+        damping = carray(as_doubles(model[damping_at]), (n,))  # type: ignore[call-arg]
+        data = carray(data_ptr, (data_words,))
+        q = carray(as_doubles(data[qpos_at]), (n,))  # type: ignore[call-arg]
+        qvel = carray(as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
+        applied = carray(as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
+        qfrc_passive = carray(as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
+        memory = carray(as_doubles(data[memory_at]), (n,))  # type: ignore[call-arg]
+        xpos = carray(as_doubles(data[xpos_at]), (nbody, 3))  # type: ignore[call-arg]
+        xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
+        anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
+        axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
+        # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
+        em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(n - 1, -1, -1):
+            if user[j, MARK] != MARKER:
+                return
+            v = qvel[j]
+            friction, slope = _law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
+            pull = user[j, OFFSET]
+            if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
+                pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
+            if user[j, LINK] != 0.0:
+                body = int(user[j, BODY])
+                m, h0, h1, h2 = (
+                    user[j, MASS_ERROR],
+                    user[j, MASS_ERROR + 1],
+                    user[j, MASS_ERROR + 2],
+                    user[j, MASS_ERROR + 3],
+                )
+                em += m
+                ex += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
+                ey += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
+                pull += GRAVITY * (axis[j, 1] * (ex - em * anchor[j, 0]) - axis[j, 0] * (ey - em * anchor[j, 1]))
+                m, h0, h1, h2 = user[j, MASS], user[j, MASS + 1], user[j, MASS + 2], user[j, MASS + 3]
+                lm += m
+                lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
+                ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
+                load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
+                turn = np.tanh(v / WIDTH_DQ)
+                friction += user[j, LOAD] * abs(load) * turn
+                slope += user[j, LOAD] * abs(load) * (1.0 - turn * turn) / WIDTH_DQ
+            slope = max(slope, 0.0)  # an implicit falling branch would take inertia away
+            # mj_passive has already subtracted dof_damping * v with the slope of the step before: put it right
+            force = (damping[j] - user[j, DAMPING]) * v - friction
+            damping[j] = user[j, DAMPING] + slope
+            drive = applied[j] + pull
+            held = (
+                user[j, FAMILY] != 3 and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            )
+            if user[j, DQ_GAIN] > 0.0 and abs(v) > user[j, DQ_SOFT]:
+                damping[j] += user[j, DQ_GAIN]
+                force -= user[j, DQ_GAIN] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
+            beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
+            force -= user[j, Q_GAIN] * beyond
+            qfrc_passive[j] += force + (-applied[j] if held else pull)
+
+    mujoco.set_mjcb_passive(passive.ctypes)
+    return passive  # kept alive by the cache: MuJoCo holds only the address
+
+
+_MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
+_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "userdata", "xpos", "xmat", "xanchor", "xaxis")
+
+
+def _struct_offsets() -> dict[str, int]:
+    """Return byte offsets within mjModel and mjData, found in live structs rather than written down.
+
+    Pointers are found by the address of their NumPy view, sizes by their place in mjModel's introspection.
+    """
+    joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
+    spec = mujoco.MjSpec.from_string(
+        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='3'/><worldbody>{joints}</worldbody></mujoco>"
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    sizes = [f.name for f in _size_fields()]
+    offsets = {name: 8 * sizes.index(name) for name in ("nv", "nbody", "nuser_jnt")}
+
+    def scan(struct: Any, names: tuple[str, ...]) -> None:
+        word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))
+        wanted = {getattr(struct, name).ctypes.data: name for name in names}
+        k = 0
+        while wanted:  # ends: every array's address is in its struct
+            if name := wanted.pop(word[k], None):
+                offsets[name] = 8 * k
+            k += 1
+
+    scan(model, ("jnt_user", "dof_damping"))
+    scan(data, _DATA_FIELDS)
+    seen = np.ctypeslib.as_array(ctypes.cast(model._address, ctypes.POINTER(ctypes.c_int64)), (len(sizes),))
+    if seen[sizes.index("nv")] != model.nv or seen[sizes.index("nuser_jnt")] != WIDTH:
+        raise RuntimeError(f"mujoco {mujoco.__version__}: mjModel is not laid out as its introspection says")
+    return offsets
+
+
+def _size_fields() -> list[Any]:
+    """Return mjModel's leading integer fields, all mjtSize (64 bit), in order."""
+    from mujoco.introspect import structs
+
+    fields: list[Any] = []
+    for field in structs.STRUCTS["mjModel"].fields:
+        if str(field.type) != "mjtSize":
+            break
+        fields.append(field)
+    return fields

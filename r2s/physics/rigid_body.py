@@ -1,0 +1,162 @@
+"""Inverse dynamics as a product: torque = regressor @ standard inertial parameters of the links.
+
+Ten numbers per link in the link's own frame, about the link's origin (Khalil and Dombre 2002, ch. 9):
+mass m, first moments h = m c, and the tensor's xx, yy, zz, xy, xz, yz. Everything is vectorised over the samples.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from r2s.physics.robot import Robot
+
+GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2, an upright base
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True)
+class Links:
+    """Mass, centre and tensor of n links; any leading batch shape.
+
+    Attributes:
+        mass: (..., n) kg. com: (..., n, 3) m, link frame.
+        inertia: (..., n, 3, 3) kg m^2 about the centre of mass, link axes.
+    """
+
+    mass: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+
+    def standard(self) -> np.ndarray:
+        """Return (..., n, 10): m, h, and the tensor about the link's origin (parallel axes)."""
+        m, c = self.mass[..., None], self.com
+        square = (c**2).sum(-1)[..., None, None] * np.eye(3) - c[..., :, None] * c[..., None, :]
+        tensor = six(self.inertia + m[..., None] * square)
+        lead = tensor.shape[:-1]  # each field may have its own batch
+        return np.concatenate([np.broadcast_to(m, (*lead, 1)), np.broadcast_to(m * c, (*lead, 3)), tensor], -1)
+
+
+def six(tensor: np.ndarray) -> np.ndarray:
+    """Return (..., 6) xx, yy, zz, xy, xz, yz of symmetric tensors (..., 3, 3)."""
+    rows, columns = zip(*_PAIRS, strict=True)
+    return tensor[..., rows, columns]
+
+
+def regressor(
+    robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
+) -> np.ndarray:
+    """Return (T, n, n, 10): what each standard parameter of each link adds to each joint's torque.
+
+    Args:
+        robot: its kinematics.
+        q, dq, ddq: (T, n) rad, rad/s, rad/s^2.
+        gravity: (3,) m/s^2, or None for an arm that compensates it.
+    """
+    place, frame, anchor, axis = kinematics(robot, q)
+    samples, n = q.shape
+    out = np.zeros((samples, n, n, 10))
+    omega, alpha = np.zeros((samples, 3)), np.zeros((samples, 3))
+    origin = np.zeros((samples, 3))
+    a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # falling up is standing still
+
+    def carried(a, omega, alpha, arm):
+        return a + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+
+    basis = np.zeros((6, 3, 3))
+    for c, (i, j) in enumerate(_PAIRS):
+        basis[c, i, j] = basis[c, j, i] = 1.0
+    for k in range(n):
+        a = carried(a, omega, alpha, anchor[:, k] - origin)
+        spin = axis[:, k] * dq[:, k, None]
+        alpha = alpha + axis[:, k] * ddq[:, k, None] + np.cross(omega, spin)
+        omega = omega + spin
+        a, origin = carried(a, omega, alpha, place[:, k] - anchor[:, k]), place[:, k]
+        R = frame[:, k]
+        force, moment = np.zeros((samples, 10, 3)), np.zeros((samples, 10, 3))
+        force[:, 0] = a
+        for i in range(3):
+            h = R[:, :, i]
+            force[:, 1 + i] = np.cross(alpha, h) + np.cross(omega, np.cross(omega, h))
+            moment[:, 1 + i] = np.cross(h, a)
+        own_omega, own_alpha = np.einsum("tji,tj->ti", R, omega), np.einsum("tji,tj->ti", R, alpha)
+        turned = np.einsum("cij,tj->tci", basis, own_alpha)
+        turned += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
+        moment[:, 4:] = np.einsum("tij,tcj->tci", R, turned)
+        for j in range(k + 1):  # a link is felt by the joints before it
+            about = moment + np.cross((place[:, k] - anchor[:, j])[:, None], force)
+            out[:, j, k] = np.einsum("ti,tci->tc", axis[:, j], about)
+    return out
+
+
+def kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return link origins (T, n, 3) and frames (T, n, 3, 3), joint anchors and axes (T, n, 3), in the base frame."""
+    model = robot.model(gravity=False)
+    data = mujoco.MjData(model)
+    bodies = model.jnt_bodyid
+    samples, n = q.shape
+    place, anchor, axis = (np.empty((samples, n, 3)) for _ in range(3))
+    frame = np.empty((samples, n, 3, 3))
+    for t in range(samples):
+        data.qpos = q[t]
+        mujoco.mj_kinematics(model, data)
+        place[t], frame[t] = data.xpos[bodies], data.xmat[bodies].reshape(n, 3, 3)
+        anchor[t], axis[t] = data.xanchor, data.xaxis
+    return place, frame, anchor, axis
+
+
+def rigid_body(
+    robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (rest (T, n) Nm, regressor (T, n, n, 10)): what no link of a joint adds, and what the links do.
+
+    The rest is the MJCF's armature and damping, and bodies welded to links. Arguments as in `regressor`.
+    """
+    model = robot.model(gravity=gravity is not None)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    if gravity is not None:
+        model.opt.gravity = gravity
+    data, whole = mujoco.MjData(model), np.empty_like(q)
+    for t in range(len(q)):
+        data.qpos, data.qvel, data.qacc = q[t], dq[t], ddq[t]
+        mujoco.mj_inverse(model, data)
+        whole[t] = data.qfrc_inverse
+    y = regressor(robot, q, dq, ddq, gravity)
+    return whole - np.einsum("tjkc,kc->tj", y, Links(robot.mass, robot.com, robot.inertia).standard()), y
+
+
+class Kinematics:
+    """Where the arm's hand is, from joint angles and the nominal geometry: what a real arm knows, too."""
+
+    def __init__(self, robot: Robot):
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._site = self._model.site(robot.ee_site).id
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ee (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        self._data.qpos = q
+        mujoco.mj_kinematics(self._model, self._data)
+        ee = self._data.site_xpos[self._site].copy()
+        return ee, np.cross(self._data.xaxis, ee - self._data.xanchor).T
+
+
+class InverseInertia:
+    """How torques accelerate the joints of an arm at rest, by the nominal model.
+
+    1 over its diagonal is the inertia that each joint feels with the others free.
+    """
+
+    def __init__(self, robot: Robot):
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._mass = np.empty((robot.n, robot.n))
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        """Return M^-1 (n, n), 1/(kg m^2), at q (n,) rad."""
+        self._data.qpos[:] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_crb(self._model, self._data)
+        mujoco.mj_fullM(self._model, self._data, self._mass)
+        return np.linalg.inv(self._mass)

@@ -1,0 +1,190 @@
+"""Many copies of the arm at once: `mujoco.batch.Batch` with the friction law inside the physics step.
+
+The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation, so
+the commanded simulator has no gravity. What the compensation gets wrong (it believes the nominal masses and centres)
+acts as a torque of its own (r2s/physics/friction.py).
+"""
+
+from collections.abc import Mapping
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from numba import njit
+
+from r2s.physics import native_friction as native
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.limits import SoftLimits
+from r2s.physics.robot import SIM_DT, Robot
+
+
+class Simulator:
+    """`nsim` arms stepped together on `nthread` threads (0: all), each with its own Dynamics.
+
+    Results are bit-identical at any thread count.
+    """
+
+    def __init__(self, robot: Robot, dynamics: Dynamics, nsim: int, nthread: int = 0, dt: float = SIM_DT):
+        native.install()
+        self.robot = robot
+        self.model = robot.model(gravity=False, user=native.WIDTH, dt=dt)
+        self.batch = mujoco.batch.Batch(self.model, nsim, nthread)
+        self.nsim = nsim
+        self._bodies = self.model.jnt_bodyid
+        self._site = self.model.site(robot.ee_site).id
+        self._user = self.batch.expand("jnt_user")
+        self._damping = self.batch.expand("dof_damping")  # the friction law writes it: must not be shared by threads
+        self._inertia = self.batch.expand("body_inertia")
+        self._iquat = self.batch.expand("body_iquat")
+        self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
+        self.q = self.batch.bind("qpos")
+        self.dq = self.batch.bind("qvel")
+        self._memory = self.batch.bind("userdata")
+        self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
+        self._site_xpos = self.batch.bind("site_xpos")
+        self.set_dynamics(dynamics)
+
+    def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray | None = None, repeat: int = 1) -> None:
+        """Give the arms `ids` (all by default) new dynamics, broadcast over the arms where it has no batch shape.
+
+        With repeat > 1 each of the given dynamics goes to that many consecutive arms.
+        """
+        arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
+        moments, axes = np.linalg.eigh(dynamics.inertia)
+        axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
+        mass = self.robot.mass if dynamics.mass is None else dynamics.mass
+        com = self.robot.com if dynamics.com is None else dynamics.com
+
+        def spread(a: np.ndarray, without: int) -> np.ndarray:
+            return np.repeat(a, repeat, axis=0) if a.ndim > without and repeat > 1 else a
+
+        at = arms[:, None], self._bodies
+        self._user[arms, :, : native.Q_LOW] = spread(_law_columns(self.robot, self.model, dynamics), 2)
+        self._damping[arms] = self.model.dof_damping
+        self._inertia[at] = spread(moments, 2)
+        self._iquat[at] = spread(_quaternions(axes), 2)
+        self._mass[at] = spread(mass, 1)
+        self._com[at] = spread(com, 2)
+        self.batch.set_const(ids)
+
+    def set_soft_limits(self, limits: SoftLimits) -> None:
+        """Let the driver's soft limits act in all arms; without this call there are none."""
+        self._user[:, :, native.Q_LOW :] = _soft_columns(limits)
+
+    def reset(
+        self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, turn: np.ndarray | float = 0.0
+    ) -> None:
+        """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics.
+
+        turn (m, n) in [-1, 1] is what friction with a memory remembers: how far its bristles are bent.
+        """
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        at = slice(None) if ids is None else ids
+        self.q[at] = q
+        self.dq[at] = dq
+        self._memory[at] = turn
+        self._damping[at] = self.model.dof_damping
+        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return copies of everything that makes the arms what they are, for `set_state`."""
+        return {name: array.copy() for name, array in self._arrays().items()}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go back to what `state` returned; what the arms do next is the same, bit for bit."""
+        for name in ("_user", "_inertia", "_iquat", "_mass", "_com"):
+            self._arrays()[name][:] = state[name]
+        self.batch.set_const()
+        self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for name in ("q", "dq", "_memory", "_damping"):
+            self._arrays()[name][:] = state[name]
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        names = ("q", "dq", "_memory", "_damping", "_user", "_inertia", "_iquat", "_mass", "_com")
+        return {name: getattr(self, name) for name in names}
+
+    def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
+        """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""
+        spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+        return self.batch.rollout(tau.shape[1], tau, control_spec=spec, record=record, ids=ids)
+
+    def kinematics(self) -> None:
+        """Make `ee` and `jacobian` current after a rollout."""
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
+
+    @property
+    def ee(self) -> np.ndarray:
+        """(nsim, 3) m, the end effector in the base frame."""
+        return self._site_xpos[:, self._site]
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """(nsim, 3, n) m/rad, translational Jacobian of the end effector: axis x (ee - anchor) for hinges."""
+        return _jacobian(self._xaxis, self._xanchor, self.ee)
+
+
+@njit(cache=True)
+def _jacobian(axis, anchor, ee):
+    out = np.empty((axis.shape[0], 3, axis.shape[1]))
+    for i in range(axis.shape[0]):
+        for j in range(axis.shape[1]):
+            x, y, z = ee[i] - anchor[i, j]
+            a, b, c = axis[i, j]
+            out[i, 0, j], out[i, 1, j], out[i, 2, j] = b * z - c * y, c * x - a * z, a * y - b * x
+    return out
+
+
+def single_arm(robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None) -> mujoco.MjModel:
+    """Return one arm's model with its links, its friction law and the driver's soft limits in it, without gravity."""
+    native.install()
+    model = robot.model(gravity=False, user=native.WIDTH)
+    moments, axes = np.linalg.eigh(dynamics.inertia)
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
+    at = model.jnt_bodyid
+    model.body_inertia[at], model.body_iquat[at] = moments, _quaternions(axes)
+    model.body_mass[at] = robot.mass if dynamics.mass is None else dynamics.mass
+    model.body_ipos[at] = robot.com if dynamics.com is None else dynamics.com
+    model.jnt_user[:, : native.Q_LOW] = _law_columns(robot, model, dynamics)
+    if soft is not None:
+        model.jnt_user[:, native.Q_LOW :] = _soft_columns(soft)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
+    """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
+    f = native
+    mass = robot.mass if d.mass is None else d.mass
+    moment = mass[..., None] * (robot.com if d.com is None else d.com)
+    load = np.zeros(robot.n) if d.load is None else d.load
+    drag = np.zeros((robot.n, 2)) if d.drag is None else d.drag
+    arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], load, drag[..., 0])
+    rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
+    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, d.family.code
+    rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
+    rows[..., f.OFFSET] = d.offset
+    rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
+    rows[..., f.DQ_MIN], rows[..., f.DAMPING] = d.dq_min, model.dof_damping
+    rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = drag
+    rows[..., f.LOAD], rows[..., f.BODY] = load, model.jnt_bodyid
+    rows[..., f.STEP] = model.opt.timestep
+    nominal = robot.mass[:, None] * robot.com
+    rows[..., f.MASS_ERROR] = mass - robot.mass
+    rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = moment - nominal
+    rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
+    rows[..., f.LINK] = d.load is not None or d.mass is not None or d.com is not None
+    return rows
+
+
+def _soft_columns(limits: SoftLimits) -> np.ndarray:
+    """Return the columns of `jnt_user` that are soft limits, (n, WIDTH - Q_LOW)."""
+    return np.stack([limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain], -1)
+
+
+def _quaternions(rotation: np.ndarray) -> np.ndarray:
+    """Return (..., 4) w x y z for rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    return flat.reshape(*rotation.shape[:-2], 4)

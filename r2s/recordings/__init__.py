@@ -1,0 +1,1 @@
+"""Recordings of an arm, and how files of all kinds become one."""

@@ -1,0 +1,23 @@
+"""One colour per label, the same in figures and in the viewer."""
+
+from collections.abc import Iterable
+
+KNOWN = {"measured": "#9aa0a6", "nominal": "#f28e2b", "identified": "#3b8fe0"}
+OTHERS = ("#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#3fb8b0", "#b0745a")
+
+
+def colours(labels: Iterable[str]) -> dict[str, str]:
+    """Return {label: "#rrggbb"}, legible on white and on black.
+
+    measured, nominal and identified (also as a part of a label: "twin, nominal") have their own everywhere;
+    the others take theirs in order.
+    """
+    found: dict[str, str] = {}
+    others = 0
+    for label in dict.fromkeys(labels):
+        meant = next((colour for word, colour in KNOWN.items() if word in label), None)
+        if meant is None or meant in found.values():
+            meant = OTHERS[others % len(OTHERS)]
+            others += 1
+        found[label] = meant
+    return found

@@ -1,0 +1,65 @@
+"""Figures (PNG): learning, comparison of runs, transfer, and those of an identification."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+DPI = 120
+LEGEND_WIDTH = 160  # letters, of a figure
+MOST_POINTS = 4000  # of a line or a cloud in a figure
+PAUSE = 0.1  # s on a figure's axis, for a pause of any length
+
+
+@contextmanager
+def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3) -> Iterator[list[Axes]]:
+    """Give `count` axes in a grid, with one legend for all, and save the figure to `path`."""
+    rows = -(-count // columns)
+    figure = Figure(figsize=(12, 0.9 + height * rows), dpi=DPI, layout="constrained")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
+    yield axes
+    for axis in axes:
+        axis.grid(alpha=0.3, linewidth=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.title.set_fontsize(10)
+    figure.suptitle(title, fontsize=13, fontweight="bold")
+    named = {name: line for axis in axes for line, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    if named:
+        fit = max(1, LEGEND_WIDTH // (max(map(len, named)) + 6))
+        columns = min(len(named), 6, fit)
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def joint_panels(path: Path, n: int, title: str):
+    """Give `panels` for n joints."""
+    return panels(path, n, 2 if n > 3 else 1, title)
+
+
+def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Make y logarithmic, with numbers that people read at these `ticks` of every decade."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=ticks))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
+def thin(count: int, most: int = MOST_POINTS) -> slice:
+    """Return what leaves at most `most` of `count` rows."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def clock_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
+
+    A pause is a step of more than five usual ones, or a clock that starts again.
+    """
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    jump = (steps <= 0) | (steps > 5 * usual)
+    return np.concatenate([[0.0], np.cumsum(np.where(jump, PAUSE, steps))]), np.flatnonzero(jump) + 1

@@ -1,0 +1,168 @@
+"""Tables of an identification for the terminal: parameters old and new with intervals, links, prediction errors."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from r2s.identification.link_inertia import LINK, inertia_scale
+from r2s.identification.parameters import UNITS, WHOLE_ARM, Estimate, ParameterSpace
+from r2s.identification.uncertainty import SHARPER, Identified
+from r2s.physics.friction import BRISTLE
+from r2s.physics.robot import Robot
+from r2s.reporting.document import UNSEEN
+from r2s.reporting.tables import number, print_table
+
+LEGEND = (
+    f"[ ]: 95 % interval; ?: it is wider than {2 / SHARPER:g} standard deviations of the belief before; "
+    f"{UNSEEN}: kept, the data hardly speak of it"
+)
+
+
+class Value(NamedTuple):
+    """One number of a table: nominal, identified, 95 % interval, whether the data could tell or were silent."""
+
+    old: float
+    new: float
+    low: float
+    high: float
+    known: bool = True
+    unseen: bool = False
+
+    def times(self, factor: float) -> "Value":
+        """Return the value in another unit."""
+        old, new, low, high = (factor * x for x in self[:4])
+        return Value(old, new, low, high, self.known, self.unseen)
+
+    @property
+    def cell(self) -> str:
+        """Return "old → new" over "[low, high]"; "?" where it is not identifiable."""
+        if self.unseen:
+            return f"{number(self.old)}\n{UNSEEN}"
+        return f"{number(self.old)} → {self.found}\n{self.interval}"
+
+    @property
+    def found(self) -> str:
+        """Return the new value, with "?" where it is not identifiable."""
+        return number(self.new) + ("" if self.known else " ?")
+
+    @property
+    def interval(self) -> str:
+        """Return "[low, high]"."""
+        return UNSEEN if self.unseen else f"[{number(self.low)}, {number(self.high)}]"
+
+
+def values(space: ParameterSpace, found: Estimate, block: str, unseen: Sequence[str] = ()) -> list[Value]:
+    """Return what is known of a block: a `Value` per joint or link, or one of the whole arm."""
+    silent = np.isin(space.names, list(unseen))
+    parts = (space.start, found.x, found.low, found.high, found.identifiable, silent)
+    return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
+
+
+def named(block: str) -> str:
+    """Return the title of a block's column, with its unit."""
+    return block if UNITS[block] == "1" else f"{block}\n{UNITS[block]}"
+
+
+def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
+    """Return a table of n cells a column, a row per joint or link."""
+    return pd.DataFrame(dict(columns), index=pd.Index([str(j + 1) for j in range(robot.n)], name=index))
+
+
+def identification_tables(robot: Robot, identified: Identified, summary: Mapping) -> dict[str, pd.DataFrame]:
+    """Return {title: table} for the terminal: parameters and, where `summary` (summary.json) has them, errors."""
+    space, found, tables = identified.space, identified.found, {}
+    own = [b for b in space.blocks if b not in WHOLE_ARM and b not in LINK]
+    cells = {named(b): [v.cell for v in values(space, found, b, identified.unseen)] for b in own}
+    blocks = per_joint(robot, cells)
+    for i in range(0, blocks.shape[1], 5):
+        tables[f"parameters, nominal → identified{' (continued)' * (i > 0)}"] = blocks.iloc[:, i : i + 5]
+    arm = {b: values(space, found, b, identified.unseen)[0].times(1e3).cell for b in space.blocks if b in WHOLE_ARM}
+    if arm:
+        index = pd.Index([f"{b}, ms" for b in arm], name="whole arm")
+        tables["actuation"] = pd.DataFrame({"nominal → identified": list(arm.values())}, index=index)
+    if set(LINK) & set(space.blocks):
+        tables["links, nominal → identified"] = _links(robot, identified)
+    edges = identified.dynamics.breakaway
+    if np.any(edges) and identified.dynamics.family != BRISTLE:  # bristles hold without a dead zone
+        shown = {f"joint {j + 1}": [number(edge) for edge in edges[j]] for j in range(robot.n)}
+        tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(["negative", "positive"], name="edge"))
+    return tables | error_tables(robot, summary)
+
+
+def _links(robot: Robot, identified: Identified) -> pd.DataFrame:
+    """Return one line per link: mass, how far its centre moved, and the scale of its tensor's trace."""
+    space = identified.space
+    before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
+
+    def each(d):
+        mass = robot.mass if d.mass is None else d.mass
+        com = robot.com if d.com is None else d.com
+        shift = 1e3 * np.linalg.norm(com - (robot.com if before.com is None else before.com), axis=-1)
+        return mass, shift, inertia_scale(d.inertia, before.inertia)
+
+    (mass, _, _), found = each(before), each(after)
+    spans = [np.quantile(part, [0.025, 0.975], axis=0) for part in each(draws)]
+    intervals = [[f"[{number(low)}, {number(high)}]" for low, high in span.T] for span in spans]
+    known = dict(zip(space.names, identified.found.identifiable, strict=True))
+    doubt = ["" if known.get(f"link_alpha[{j + 1}]", True) else " ?" for j in range(robot.n)]  # mass: alpha alone
+    columns = {
+        "mass, kg": [f"{number(a)} → {number(b)}{k}" for a, b, k in zip(mass, found[0], doubt, strict=True)],
+        "95 %": intervals[0],
+        "centre moved\nmm": [number(x, "{:.2f}") for x in found[1]],
+        "tensor's trace\nof nominal": [number(x) for x in found[2]],
+        "95 % ": intervals[2],
+    }
+    return per_joint(robot, columns, "link")
+
+
+def error_tables(robot: Robot, summary: Mapping) -> dict[str, pd.DataFrame]:
+    """Return {title: table} of the prediction errors in `summary` (summary.json): nominal, identified, ratio."""
+    joints, tables = [str(j + 1) for j in range(robot.n)], {}
+    sides = {side: summary[side] for side in ("train", "validation") if side in summary}
+    for key, title in (
+        ("torque_rmse_Nm", "torque RMSE, Nm"),
+        ("position_rmse_mrad", "replayed position RMSE, mrad"),
+    ):
+        columns = {side: _pair(errors, key) for side, errors in sides.items() if key in errors}
+        if columns:
+            tables[title] = _before_after(columns, pd.Index([*joints, "mean"], name="joint"))
+    reached = {side: e["ee_error_mm"] for side, e in sides.items() if e.get("ee_error_mm")}
+    if reached:
+        horizons = sorted({h for errors in reached.values() for h in errors}, key=float)
+        columns = {}
+        for side, errors in reached.items():
+            before = sides[side].get("nominal_ee_error_mm", {})
+            columns[side] = (
+                [before.get(h, np.nan) for h in horizons],
+                [errors.get(h, np.nan) for h in horizons],
+            )
+        index = pd.Index([f"{h} s" for h in horizons], name="open loop for")
+        tables["end-effector error, mm"] = _before_after(columns, index)
+    return tables
+
+
+def _pair(errors: Mapping, key: str) -> tuple[list[float], list[float]]:
+    """Return (nominal, identified), their means appended."""
+    before, after = errors.get(f"nominal_{key}", [np.nan] * len(errors[key])), errors[key]
+    return [*before, float(np.mean(before))], [*after, float(np.mean(after))]
+
+
+def _before_after(columns: Mapping[str, tuple[Sequence[float], Sequence[float]]], index: pd.Index) -> pd.DataFrame:
+    """Return nominal, identified and their ratio, for each side of the split."""
+    table = {}
+    for side, (before, after) in columns.items():
+        table[f"{side}\nnominal"] = [number(b) for b in before]
+        table[f"{side}\nidentified"] = [number(a) for a in after]
+        table[f"{side}\nratio"] = [
+            number(a / b if b else np.nan, "{:.2f}") for b, a in zip(before, after, strict=True)
+        ]
+    return pd.DataFrame(table, index=index)
+
+
+def identification_table(console: Console, robot: Robot, identified: Identified, summary: Mapping) -> None:
+    """Print what `identification_tables` returns."""
+    for title, table in identification_tables(robot, identified, summary).items():
+        print_table(console, table, title, LEGEND if title.startswith("parameters") else None)

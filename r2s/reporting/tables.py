@@ -1,0 +1,99 @@
+"""What a person reads: tables for the terminal, and the same in report.md and report.html.
+
+A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
+identification has is in r2s/reporting/identification_page.py, figures are in r2s/reporting/figures.py.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from r2s.reporting.document import _doubtful
+
+SUCCESS = {
+    "success_5cm": "5 cm, %",
+    "success_2cm": "2 cm, %",
+    "success_1cm": "1 cm, %",
+    "success_5mm": "5 mm, %",
+}
+
+
+def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Return one row of strings per group: interquartile mean [95 % interval] of each measure."""
+    names = {m: title for m, title in SUCCESS.items() if m in set(table["measure"])}
+    names |= {"distance_median_m": "median distance, mm", "return_paper": "return"}
+    out: dict[str, dict[str, str]] = {}
+    for r in table.to_dict("records"):
+        scale = 100 if r["measure"] in SUCCESS else 1e3 if r["measure"] == "distance_median_m" else 1
+        cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
+        middle, low, high = (scale * r[k] for k in ("iqm", "low", "high"))
+        cells[names[r["measure"]]] = f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+    return pd.DataFrame.from_dict(out, orient="index").rename_axis("success within")
+
+
+def number(value: float | None, form: str = "{:.3g}") -> str:
+    """Return a number as tables show it; "-" where there is none."""
+    return "-" if value is None or not np.isfinite(value) else form.format(value)
+
+
+def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
+    """Return one row per label from dicts with the keys of evaluations.csv (success from 0 to 1)."""
+    table = {}
+    for label, row in rows.items():
+        cells = {
+            title: number(100 * row[key] if row.get(key) is not None else None, "{:.1f}")
+            for key, title in SUCCESS.items()
+        }
+        distance = row.get("distance_median_m")
+        cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
+        cells["return"] = number(row.get("return_paper"), "{:.1f}")
+        table[label] = cells
+    return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
+
+
+def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
+    """Return one row per label: how far from the simulation that the policy was trained in, and how it moved."""
+    columns = {
+        "path from simulation, mm": ("ee_path_rmse_mm", 1, "{:.2g}"),
+        "torque from simulation, Nm": ("tau_rmse_Nm", 1, "{:.2g}"),
+        "time to reach, s": ("time_to_reach_s", 1, "{:.2f}"),
+        "overshoot, mm": ("overshoot_m", 1e3, "{:.1f}"),
+        "stops": ("stops", 1, "{:.0f}"),
+    }
+    table = {
+        label: {
+            title: number(None if row.get(key) is None else scale * row[key], form)
+            for title, (key, scale, form) in columns.items()
+        }
+        for label, row in rows.items()
+    }
+    return pd.DataFrame.from_dict(table, orient="index").rename_axis("")
+
+
+def reach_table(console: Console, rows: Mapping[str, Mapping], title: str) -> None:
+    """Print what `reach_rows` returns."""
+    print_table(console, reach_rows(rows), title)
+
+
+def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str | None = None) -> None:
+    """Print a table of strings; what is uncertain is dimmed."""
+    table = Table(
+        title=title,
+        caption=caption,
+        title_justify="left",
+        caption_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column(str(frame.index.name or ""))
+    for column in frame.columns:
+        table.add_column(str(column), justify="right")
+    for label, row in frame.iterrows():
+        cells = [escape(str(cell)) for cell in row]
+        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if _doubtful(c) else c for c in cells))
+    console.print(table)

@@ -1,0 +1,1 @@
+"""What is asked of an arm, and how it is judged."""

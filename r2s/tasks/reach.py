@@ -1,0 +1,143 @@
+"""Reach a point and stay there: the region of goals, what a policy observes, and its scale."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numba import njit
+
+from r2s.errors import UserError, check_number
+from r2s.physics.robot import SIM_DT, Robot
+
+FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
+FINE_RAD = 0.015
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked of the arm; conf/task/reach.yaml.
+
+    Attributes:
+        ctrl_hz: policy rate. episode_s: length of an episode, s.
+        torque_fraction: an action of 1 asks for this much of tau_max; one for all joints, or one each.
+        cutoff_hz: low-pass on the torque.
+        start_spread: rad, episodes start at q_home + U(-spread, spread).
+        reach: (low, high) m, distance of goals from the shoulder (the second joint).
+        height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
+    """
+
+    ctrl_hz: int = 50
+    episode_s: float = 4.0
+    torque_fraction: float | tuple[float, ...] = 0.3
+    cutoff_hz: float = 100.0
+    start_spread: float = 0.1
+    reach: tuple[float, float] = (0.3, 0.75)
+    height: float = 0.1
+    azimuth: float = 1.57
+
+    def __post_init__(self):
+        cycles = round(1 / SIM_DT)
+        if not isinstance(self.ctrl_hz, int) or self.ctrl_hz < 1 or cycles % self.ctrl_hz:
+            raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; what divides {cycles} is, such as 50")
+        check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, inf)")
+        check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
+        check_number("task.start_spread", self.start_spread, "[0, inf)")
+
+    def torque(self, robot: Robot) -> np.ndarray:
+        """(n,) Nm that an action of 1 asks for."""
+        share = np.array(self.torque_fraction, dtype=float)
+        if share.ndim and share.shape != (robot.n,):
+            raise UserError(f"task.torque_fraction: {share.size} values for the {robot.n} joints of {robot.name}")
+        return share * robot.tau_max
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+        return round(self.episode_s * self.ctrl_hz)
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of a control step."""
+        return round(1.0 / (self.ctrl_hz * SIM_DT))
+
+
+def sample_goals(robot: Robot, task: Task, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return (count, 3) m: end-effector positions of random joint angles, so that every goal can be reached.
+
+    Raises:
+        UserError: hardly any position of the arm lies within the task's region.
+    """
+    model = robot.model(gravity=False)
+    data = mujoco.MjData(model)
+    site = model.site(robot.ee_site).id
+    data.qpos = robot.q_home
+    mujoco.mj_kinematics(model, data)
+    shoulder = data.xanchor[min(1, robot.n - 1)].copy()
+    middle, half = 0.5 * (robot.q_min + robot.q_max), 0.45 * (robot.q_max - robot.q_min)
+    goals: list[np.ndarray] = []
+    for tried in range(1, 1000 * count + 1001):
+        data.qpos = middle + half * rng.uniform(-1, 1, robot.n)
+        mujoco.mj_kinematics(model, data)
+        p = data.site_xpos[site]
+        away = np.linalg.norm(p - shoulder)
+        if (
+            task.reach[0] <= away <= task.reach[1]
+            and p[2] >= task.height
+            and abs(np.arctan2(p[1], p[0])) <= task.azimuth
+        ):
+            goals.append(p.copy())
+            if len(goals) == count:
+                return np.array(goals)
+        if tried == 2000 and len(goals) < 2:
+            break
+    raise UserError(
+        f"task.reach {task.reach[0]:g} to {task.reach[1]:g} m, task.height {task.height:g} m: {robot.name} hardly "
+        "ever gets there; widen them"
+    )
+
+
+@njit(cache=True)
+def observe(
+    q: np.ndarray, dq: np.ndarray, ee: np.ndarray, goal: np.ndarray, jacobian: np.ndarray, effort: np.ndarray
+) -> np.ndarray:
+    """Return the observation (m, 5 n + 12) float32 in SI units; the same on the arm as in simulation.
+
+    q, dq, ee, goal, error, effort, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm): the last three
+    tell a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is
+    state, because the rate limit lets a torque change by 1 Nm per ms only.
+
+    Args:
+        q, dq: (m, n) rad, rad/s.
+        ee, goal: (m, 3) m.
+        jacobian: (m, 3, n) m/rad.
+        effort: (m, n) the last command (tau_J_d) over what an action of 1 asks for.
+    """
+    m, n = q.shape
+    out = np.empty((m, 5 * n + 12), np.float32)
+    for i in range(m):
+        for j in range(n):
+            pull = 0.0
+            for k in range(3):
+                pull += jacobian[i, k, j] * (goal[i, k] - ee[i, k])
+            out[i, j], out[i, n + j], out[i, 2 * n + 9 + j] = q[i, j], dq[i, j], effort[i, j]
+            out[i, 3 * n + 12 + j], out[i, 4 * n + 12 + j] = pull, np.tanh(pull / FINE_RAD)
+        for k in range(3):
+            error = goal[i, k] - ee[i, k]
+            out[i, 2 * n + k], out[i, 2 * n + 3 + k], out[i, 2 * n + 6 + k] = ee[i, k], goal[i, k], error
+            out[i, 3 * n + 9 + k] = np.tanh(error / FINE_M)
+    return out
+
+
+def observation_scale(robot: Robot, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation (5 n + 12,) to normalise `observe` by: the task's own scales.
+
+    Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
+    decide about stopping at a goal vanish.
+    """
+    n, far = robot.n, task.reach[1]
+    centre = np.zeros(5 * n + 12)
+    centre[:n] = 0.5 * (robot.q_min + robot.q_max)
+    places = [np.full(3, 0.5 * far)] * 3
+    scale = [0.3 * (robot.q_max - robot.q_min), np.full(n, 0.5), *places, np.full(n, 0.5)]
+    scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(n)]
+    return centre, np.concatenate(scale)
