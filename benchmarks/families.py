@@ -43,7 +43,7 @@ def main() -> None:
     for family in (SIGMOID, COULOMB, STRIBECK):
         picks[family.name] = []
         for seed in range(seeds):
-            truth = draw(family, np.random.default_rng([family.code, seed]))
+            truth = draw(family, np.random.default_rng([FAMILIES.index(family), seed]))
             arm = SimulatedArm(ROBOT, truth, **NOISE, seed=seed)
             motion = record(arm, fourier(ROBOT, duration=15.0, seed=seed))
             chosen = compare_families(ROBOT, OLD, motion, *given, {"cutoff_hz": 10.0}, lambda row: None)

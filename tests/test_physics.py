@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from r2s.errors import UserError
-from r2s.physics.dynamics import Dynamics
+from r2s.physics.dynamics import AXES, Dynamics
 from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
 from r2s.physics.limits import SoftLimits
 from r2s.physics.robot import load_robot
@@ -64,7 +64,6 @@ RANGES = {
     "asymmetry": (-0.5, 0.5), "rise": (0.0, 1.0), "stribeck_velocity": (0.02, 0.3), "presliding": (2e-4, 5e-3),
 }  # fmt: skip
 THREE = (SIGMOID, COULOMB, STRIBECK)
-OF_ARMS = ("phi", "offset", "breakaway", "inertia", "mass", "com", "load", "drag")
 
 
 def named(f):
@@ -81,8 +80,9 @@ def some_dynamics(robot, nsim, seed=0, law=SIGMOID):
     rng = np.random.default_rng(seed)
     shape = (nsim, robot.n)
     breakaway = np.stack([-rng.uniform(0.2, 1.5, shape), rng.uniform(0.2, 1.5, shape)], -1)
+    arms = Dynamics.of(robot, some_phi(law, shape, rng), law, dq_min=0.02)
     inertia = np.broadcast_to(robot.inertia, (*shape, 3, 3))
-    return Dynamics(some_phi(law, shape, rng), rng.uniform(-0.6, 0.6, shape), breakaway, 0.02, inertia, family=law)
+    return replace(arms, offset=rng.uniform(-0.6, 0.6, shape), breakaway=breakaway, inertia=inertia)
 
 
 def with_everything(robot, d, seed=7):
@@ -101,7 +101,7 @@ def with_everything(robot, d, seed=7):
 
 def arms_of(d, at):
     """Return the dynamics of some of the arms."""
-    return replace(d, **{name: value[at] for name in OF_ARMS if (value := getattr(d, name)) is not None})
+    return replace(d, **{k: v[at] for k, axes in AXES.items() if np.ndim(v := getattr(d, k)) > axes})
 
 
 def set_links(model, mass, com, inertia):
@@ -139,22 +139,19 @@ def some_motion(robot, nsim, steps, seed=1):
 def oracle(robot, dynamics, k, q, dq, tau, soft=None):
     """Return (steps, n) angles and velocities of simulation k, and how often a joint was held, in a Python loop."""
     model, d = robot.model(gravity=False), arms_of(dynamics, k)
-    mass, com = robot.mass if d.mass is None else d.mass, robot.com if d.com is None else d.com
-    set_links(model, mass, com, d.inertia)
+    set_links(model, d.mass, d.com, d.inertia)
     data = mujoco.MjData(model)
     base = model.dof_damping.copy()
     data.qpos[:], data.qvel[:] = q[k], dq[k]
     qs, dqs, held = [], [], 0
     for torque in tau[k]:
-        v, pull, turn = data.qvel.copy(), d.offset.copy(), np.tanh(data.qvel / WIDTH_DQ)
+        v, sign = data.qvel.copy(), np.tanh(data.qvel / WIDTH_DQ)
         friction, slope = d.friction(v), d.family.slope(v, d.phi)
-        if d.drag is not None:
-            pull += d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos)
-        if d.mass is not None:
-            nominal = weight(model, data, robot.mass, robot.com)
-            pull += weight(model, data, mass, com) - nominal
-            friction = friction + d.load * np.abs(nominal) * turn
-            slope = slope + d.load * np.abs(nominal) * (1 - turn**2) / WIDTH_DQ
+        nominal = weight(model, data, robot.mass, robot.com)
+        pull = d.offset + d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos)
+        pull = pull + weight(model, data, d.mass, d.com) - nominal
+        friction = friction + d.load * np.abs(nominal) * sign
+        slope = slope + d.load * np.abs(nominal) * (1 - sign**2) / WIDTH_DQ
         slope = np.maximum(slope, 0.0)
         passive = passive_torque(v, torque, friction, pull, d.breakaway, d.dq_min)
         held += int(np.sum(np.isclose(passive + friction, -torque, atol=1e-12)))
@@ -216,7 +213,7 @@ def test_what_gravity_compensation_misses(which, request):
     """
     robot, nsim = request.getfixturevalue(which), 4
     d = with_everything(robot, some_dynamics(robot, nsim))
-    d = replace(d, phi=0 * d.phi, offset=0 * d.offset, breakaway=0 * d.breakaway, load=None, drag=None)
+    d = replace(d, phi=0 * d.phi, offset=0 * d.offset, breakaway=0 * d.breakaway, load=0 * d.load, drag=0 * d.drag)
     q, dq, _ = some_motion(robot, nsim, 1, seed=3)
     sim = Simulator(robot, d, nsim, 1)
     sim.reset(q, dq)
@@ -298,7 +295,7 @@ def test_a_stiff_light_joint_comes_to_rest_without_chatter(light):
     """10 Nm s/rad on 0.005 kg m^2 at 1 kHz: the velocity only decays, where the explicit form chatters."""
     phi = np.array([[1.0, 40.0, 0.0]])
     assert SIGMOID.slope(np.zeros(1), phi) == pytest.approx(10.0)
-    still = Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia)
+    still = Dynamics.of(light, phi)
     sim = Simulator(light, still, 1, 1)
     sim.reset(np.zeros((1, 1)), np.full((1, 1), 0.3))
     dq = sim.rollout(np.zeros((1, 200, 1)), record=("qvel",))["qvel"][0, :, 0]
@@ -420,7 +417,7 @@ def test_levels_are_what_the_parameters_say(law, at_rest):
         rtol=1e-4,
     )  # fmt: skip
     np.testing.assert_allclose(law.torque(np.array([1.0, -1.0]), phi), [1.5, -1.1], rtol=1e-9)
-    np.testing.assert_allclose(law.torque(np.zeros(2), phi, turn=np.array([1.0, -1.0])), [at_rest, -at_rest / 1.5])
+    np.testing.assert_allclose(law.torque(np.zeros(2), phi, bristle=np.array([1.0, -1.0])), [at_rest, -at_rest / 1.5])
 
 
 def test_presliding_goes_by_the_distance():
@@ -451,7 +448,7 @@ def test_the_law_is_finite_at_any_speed(light, law):
     for v in (-1e6, 1e6):
         assert np.isfinite(law.torque(np.array([v]), phi)).all()
         assert np.isfinite(law.slope(np.array([v]), phi)).all()
-    sim = Simulator(light, Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia, family=law), 1, 1)
+    sim = Simulator(light, Dynamics.of(light, phi, law), 1, 1)
     sim.reset(np.zeros((1, 1)), np.full((1, 1), 1e6))
     assert np.isfinite(sim.rollout(np.zeros((1, 1, 1)), record=("qvel",))["qvel"]).all()
 
@@ -463,7 +460,7 @@ def test_a_pushed_joint_reaches_the_speed_at_which_friction_balances(light, law)
         name, 0.5 * sum(RANGES[name])) for name in law.names]])  # fmt: skip
     speed = np.array([[1.0], [-1.0]])
     push = law.torque(speed, np.broadcast_to(phi, (2, 1, phi.shape[-1])))
-    sim = Simulator(light, Dynamics(phi, np.zeros(1), np.zeros((1, 2)), 0.01, light.inertia, family=law), 2, 1)
+    sim = Simulator(light, Dynamics.of(light, phi, law), 2, 1)
     sim.reset(np.zeros((2, 1)), 0.9 * speed)
     dq = sim.rollout(np.repeat(push[:, None], 400, 1), record=("qvel",))["qvel"]
     np.testing.assert_allclose(dq[:, -1], speed, rtol=1e-6)
@@ -518,14 +515,14 @@ def test_links_of_set_dynamics_make_the_mass_matrix(panda):
     sim.set_dynamics(d)
     for k in range(nsim):
         model, q = sim.batch.get_model(k), rng.uniform(panda.q_min, panda.q_max)
-        data, place, turn = mujoco.MjData(model), np.empty((3, n)), np.empty((3, n))
+        data, place, spin = mujoco.MjData(model), np.empty((3, n)), np.empty((3, n))
         expected, found = np.zeros((n, n)), np.empty((n, n))
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
         for i, body in enumerate(model.jnt_bodyid):
             frame = data.xmat[body].reshape(3, 3)
-            mujoco.mj_jac(model, data, place, turn, data.xpos[body] + frame @ d.com[k, i], body)
-            expected += d.mass[k, i] * place.T @ place + turn.T @ frame @ d.inertia[k, i] @ frame.T @ turn
+            mujoco.mj_jac(model, data, place, spin, data.xpos[body] + frame @ d.com[k, i], body)
+            expected += d.mass[k, i] * place.T @ place + spin.T @ frame @ d.inertia[k, i] @ frame.T @ spin
         mujoco.mj_fullM(model, data, found)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
@@ -555,7 +552,7 @@ def test_dynamics_go_to_the_arms_that_are_named(panda):
 def test_a_command_excludes_gravity(panda):
     """The simulator has no gravity: at rest, without command and offset, the arm stays where it is to the bit."""
     phi = np.tile([1.0, 10.0, 0.02], (7, 1))
-    sim = Simulator(panda, Dynamics(phi, np.zeros(7), np.zeros((7, 2)), 0.01, panda.inertia), 1, 1)
+    sim = Simulator(panda, Dynamics.of(panda, phi), 1, 1)
     assert np.array_equal(sim.model.opt.gravity, np.zeros(3))
     sim.reset(panda.q_home[None], np.zeros((1, 7)))
     sim.rollout(np.zeros((1, 500, 7)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r2s.identification.link_inertia import links
-from r2s.physics.rigid_body import GRAVITY, Links, kinematics, regressor, rigid_body, six
+from r2s.physics.rigid_body import GRAVITY, LinkInertia, kinematics, regressor, rigid_body, six
 from r2s.physics.robot import load_robot
 
 
@@ -71,7 +71,7 @@ def inverse(model, q, dq, ddq):
 
 
 def nominal(robot):
-    return Links(robot.mass, robot.com, robot.inertia).standard()
+    return LinkInertia(robot.mass, robot.com, robot.inertia).standard()
 
 
 def torque(y, standard):
@@ -120,7 +120,7 @@ def test_the_rest_is_what_no_link_of_a_joint_adds(tmp_path, seed, gravity):
             model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = mass[i], com[i], moments
             mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
         expected = inverse(model, q, dq, ddq)
-        np.testing.assert_allclose(rest + torque(y, Links(mass, com, inertia).standard()), expected, atol=1e-9)
+        np.testing.assert_allclose(rest + torque(y, LinkInertia(mass, com, inertia).standard()), expected, atol=1e-9)
 
 
 def test_the_rest_does_not_know_the_joints_limits(tmp_path):
@@ -187,6 +187,6 @@ def test_standard_parameters_are_about_the_links_origin():
             "abk,abkij->abij", m, (p**2).sum(-1)[..., None, None] * np.eye(3) - p[..., None] * p[..., None, :]
         )
 
-    out = Links(m.sum(-1), com, tensor(points - com[:, :, None])).standard()
+    out = LinkInertia(m.sum(-1), com, tensor(points - com[:, :, None])).standard()
     expected = [m.sum(-1)[..., None], np.einsum("abk,abki->abi", m, points), six(tensor(points))]
     np.testing.assert_allclose(out, np.concatenate(expected, -1), atol=1e-12)

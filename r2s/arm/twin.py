@@ -20,7 +20,7 @@ from numba import njit
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.engines.dart import DartEngine
 from r2s.errors import check_number
-from r2s.physics.description import Links
+from r2s.physics.description import Bodies
 from r2s.physics.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
@@ -183,7 +183,7 @@ def _carry(
     """Return the links with a point mass of `payload` kg at the end effector."""
     model = robot.model(gravity=True)
     site = model.site(robot.ee_site).id
-    _, pose = Links(model).moving_parent(model.site_bodyid[site])
+    _, pose = Bodies(model).moving_parent(model.site_bodyid[site])
     hand = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
     total = masses[-1] + payload
     centre = (masses[-1] * coms[-1] + payload * hand) / total

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.physics.description import Links, about, make_pose, shaped
+from r2s.physics.description import Bodies, about, make_pose, shaped
 from r2s.physics.robot import SIM_DT, Robot
 
 
@@ -46,7 +46,7 @@ class DartEngine:
         model = robot.model(gravity=gravity, dt=dt)
         n = robot.n
         bodies = model.jnt_bodyid
-        links = Links(model)
+        links = Bodies(model)
         links.override(bodies, shaped("masses", masses, (n,)), shaped("coms", coms, (n, 3)), inertias, n)
         self.robot = robot
         # DART has no armature. Damping A/h with the torque (A/h) v put back is the same thing exactly: the
@@ -75,7 +75,7 @@ class DartEngine:
         self._world.addSkeleton(self._skeleton)
         _as_gazebo(dart, self._world)
 
-    def _add_link(self, dart: ModuleType, model: mujoco.MjModel, links: "Links", i: int, parent):
+    def _add_link(self, dart: ModuleType, model: mujoco.MjModel, links: Bodies, i: int, parent):
         body = int(model.jnt_bodyid[i])
         anchor, pose = links.moving_parent(model.body_parentid[body])
         if parent is None and anchor != 0:

@@ -26,7 +26,7 @@ from r2s.excitation.safety import (
     gravity_torque,
     torque_share,
 )
-from r2s.physics.rigid_body import Links, regressor, six
+from r2s.physics.rigid_body import LinkInertia, regressor, six
 from r2s.physics.robot import SIM_DT, Robot
 
 # the ladder of paces, 1: full speed
@@ -159,7 +159,7 @@ def _information(
         delay = np.zeros((*shape, 0))
     else:
         tensors = SCALE_PRIOR * np.einsum("btjkc,kc->btjk", y[..., 4:], six(robot.inertia))
-        torque = np.einsum("btjkc,kc->btj", y, Links(robot.mass, robot.com, robot.inertia).standard())
+        torque = np.einsum("btjkc,kc->btj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard())
         torque -= gravity_torque(robot, flat[0]).reshape(shape)
         coulomb = FRICTION_PRIOR * robot.tau_max * bump / (SLOPE * robot.dq_max) * ddq
         delay = DELAY_PRIOR * (np.gradient(torque, t, axis=1) + coulomb)[..., None]
@@ -190,11 +190,11 @@ class _Family:
         shapes = [rng.standard_normal((2 * self.harmonics, self.robot.n)) for _ in range(DRAWS)]
         full = np.ones(self.robot.n)
         if count > 1:
-            shapes = [shapes[k] for k in np.argsort(-self.worth([(x, full) for x in shapes]))]
+            shapes = [shapes[k] for k in np.argsort(-self.information([(x, full) for x in shapes]))]
         kept: list[tuple[float, np.ndarray, np.ndarray]] = []
         for x in shapes:
             if (a := self._shrunk(full, partial(self._coarse, x), 0.9, MARGIN, LEAST)) is not None:
-                kept.append((float(self.worth([(x, a)])[0]), x, a))
+                kept.append((float(self.information([(x, a)])[0]), x, a))
             if len(kept) == count:
                 break
         return max(kept, key=lambda k: k[0], default=None)
@@ -203,15 +203,15 @@ class _Family:
         self, rng: np.random.Generator, best: tuple[float, np.ndarray, np.ndarray], effort: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, a) after a local search: joint by joint a part is changed, a little or much, if that helps."""
-        worth, x, a = best
+        most, x, a = best
         for _ in range(-(-effort // TRIES)):
             tried = [self._changed(rng, x, a) for _ in range(TRIES)]
-            worths = self.worth(tried)
-            for k in np.argsort(-worths):
-                if worths[k] <= worth:
+            nats = self.information(tried)
+            for k in np.argsort(-nats):
+                if nats[k] <= most:
                     break
                 if self._safe(*tried[k]):
-                    worth, (x, a) = worths[k], tried[k]
+                    most, (x, a) = nats[k], tried[k]
                     break
         return x, a
 
@@ -235,7 +235,7 @@ class _Family:
         offset, dq, ddq = dense(less)
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
-    def worth(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    def information(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Return (B,) nats, of several (x, a) at once: that is faster."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
         return _information(self.robot, self.t, self.center + offset, dq, ddq, self.gravity)

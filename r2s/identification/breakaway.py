@@ -103,7 +103,7 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
         end = int(np.argmax(np.abs(x) >= moved)) + 1
         if x[end - 1] < moved or end < MIN_ROWS:
             continue
-        value[k], misfit[k] = _release(t[:end], x[:end], _felt(t, u, delay, lag)[:end])
+        value[k], misfit[k] = _release(t[:end], x[:end], _delayed(t, u, delay, lag)[:end])
         value[k] *= sign
     shape = r.n_joints, 2
     command, spread, count = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=np.int64)
@@ -116,17 +116,17 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
     return Breakaway(command, spread, count, value, misfit, ramps.joint, ramps.sign, ramps.pose)
 
 
-def _felt(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
+def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
     """Return what arrives of the command u (T,) Nm at t (T,) s, after rest under its first value."""
     late = np.interp(t - delay, t, u)
     if lag == 0:
         return late
-    gain = -np.expm1(-np.diff(t) / lag)
+    factor = -np.expm1(-np.diff(t) / lag)
     out = late.copy()
-    for k in range(len(gain)):
+    for k in range(len(factor)):
         # a ramp behind a lag is the ramp `lag` later: no sample is held while the next one arrives
         slope = (late[k + 1] - late[k]) / (t[k + 1] - t[k])
-        out[k + 1] = out[k] + gain[k] * (late[k] - out[k] - lag * slope) + (late[k + 1] - late[k])
+        out[k + 1] = out[k] + factor[k] * (late[k] - out[k] - lag * slope) + (late[k + 1] - late[k])
     return out
 
 

@@ -26,7 +26,7 @@ from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
 from r2s.physics.dynamics import Dynamics, of_family
-from r2s.physics.friction import BRISTLE, FAMILIES
+from r2s.physics.friction import FAMILIES
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
@@ -120,7 +120,7 @@ def identify(
     data: ReplayResidual | TorqueResidual = quick
     if recording.torque == "commanded":
         batch = min(len(space.start) + 1, 64)
-        slowest = 0.0 if nominal.family == BRISTLE else CLEAR * nominal.dq_min  # bristles have no dead zone
+        slowest = 0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min  # bristles have no dead zone
         data = ReplayResidual(
             *(robot, space, recording),
             window_s=window_s,
@@ -156,7 +156,7 @@ def identify(
     if ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
         command = _reached(edges, nominal.breakaway)
-        if nominal.family != BRISTLE:
+        if not nominal.family.has_memory:
             dynamics = replace(dynamics, breakaway=command + dynamics.offset[:, None])
             found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, None)})
             command = np.asarray(found["edges"]) - dynamics.offset[:, None]

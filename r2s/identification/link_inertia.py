@@ -53,10 +53,8 @@ def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
     """Return theta (n, 10) of the links of `dynamics`: the inverse of `links`."""
-    mass = robot.mass if dynamics.mass is None else dynamics.mass
-    com = robot.com if dynamics.com is None else dynamics.com
     base = _upper(pseudo_inertia(robot.mass, robot.com, robot.inertia))
-    v = np.linalg.solve(base, _upper(pseudo_inertia(mass, com, dynamics.inertia)))
+    v = np.linalg.solve(base, _upper(pseudo_inertia(dynamics.mass, dynamics.com, dynamics.inertia)))
     scale, v = v[..., 3, 3], v / v[..., 3:, 3:]
     diagonal = [np.log(v[..., i, i]) for i in range(3)]
     rest = [v[..., 0, 1], v[..., 0, 2], v[..., 1, 2], v[..., 0, 3], v[..., 1, 3], v[..., 2, 3]]

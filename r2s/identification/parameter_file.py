@@ -2,6 +2,7 @@
 
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,10 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, nearest
-from r2s.identification.parameters import LOGARITHMIC, UNITS, WHOLE_ARM, Estimate, ParameterSpace, parameter_space
+from r2s.identification.parameters import WHOLE_ARM, Estimate, ParameterSpace, logarithmic, parameter_space, units
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
+from r2s.physics.friction import spelled
 from r2s.physics.robot import Robot
 
 
@@ -38,10 +40,10 @@ def save_parameters(
         return float(f"{values[0]:.6g}") if len(values) == 1 else [float(f"{v:.6g}") for v in values]
 
     document: dict[str, Any] = {"robot": robot.name, "joints": robot.n, "source": dict(source)}
-    document["friction_family"] = fixed.family.name
+    document["friction_family"] = spelled(fixed.family)
     document["parameters"] = {}
     for name in space.blocks:
-        entry: dict[str, Any] = {"unit": UNITS[name]}
+        entry: dict[str, Any] = {"unit": units()[name]}
         rows = (found.x, space.start, space.lower, space.upper, found.low, found.high)
         keys = ("value", "nominal", "lower_bound", "upper_bound", "interval95_low", "interval95_high")
         entry |= {key: numbers(space.block(row, name)) for key, row in zip(keys, rows, strict=True)}
@@ -55,19 +57,18 @@ def save_parameters(
         "dq_min": fixed.dq_min,
         "inertia": fixed.inertia.tolist(),
     }
-    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in OPTIONAL if getattr(fixed, k) is not None}
+    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in LATER}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in WHOLE_ARM}
     d = space.dynamics(found.x)
-    if d.mass is not None and d.com is not None:  # for the reader: what loads are the parameters
-        rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))
-        document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for the reader; parameters are loaded
+    document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
     path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
     np.savez_compressed(path.with_name("posterior.npz"), names=np.array(space.names), samples=found.samples)
 
 
 FIXED = ("phi", "offset", "inertia")
-OPTIONAL = ("mass", "com", "load", "drag", "gain")
+LATER = ("mass", "com", "load", "drag", "gain")  # files of before may lack them: then they are the robot's, or 0
 
 
 def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
@@ -106,18 +107,18 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
             raise ValueError(f"{name}: not {count} finite value{'s' * (count > 1)}")
         return array
 
-    rows = [k for k in (*FIXED, *OPTIONAL) if k in FIXED or k in fixed]
+    rows = [k for k in (*FIXED, *LATER) if k in FIXED or k in fixed]
     own = {k: numbers(k, fixed[k], robot.n) for k in rows}
     edges = [numbers(k, fixed[k], robot.n) for k in ("breakaway_negative", "breakaway_positive")]
-    nominal = Dynamics(
+    family = friction_family(document["friction_family"])
+    nominal = replace(
+        Dynamics.of(robot, own["phi"], family, float(fixed["dq_min"])),
         **own,  # type: ignore[arg-type]
         breakaway=np.stack(edges, -1),
-        dq_min=float(fixed["dq_min"]),
-        family=friction_family(document["friction_family"]),
         delay=float(fixed["delay"]),
         lag=float(fixed["lag"]),
     )
-    everything = {k: [1e-12 if k in LOGARITHMIC else -np.inf, np.inf] for k in found}
+    everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}
     space = parameter_space(robot, nominal, everything)
     return space, np.concatenate([numbers(k, found[k]["value"], space.size(k)) for k in space.blocks])
 

@@ -18,16 +18,25 @@ import numpy as np
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.link_inertia import LINK, inertia_scale, links, log_cholesky
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import FAMILIES
+from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 
-UNITS = {name: unit for f in FAMILIES for name, unit in zip(f.names, f.units, strict=True)}
-UNITS |= {"offset": "Nm", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1", "inertia_scale": "1"}
-UNITS |= {name: "1" for name in LINK}
-UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
-LOGARITHMIC = ("phi1", "phi2", "coulomb", "stribeck_velocity", "presliding", "inertia_scale")
+OTHER_UNITS = {"offset": "Nm", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1", "inertia_scale": "1"}
+OTHER_UNITS |= {name: "1" for name in LINK}
+OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
 WHOLE_ARM = ("delay", "lag")
 OF_LINKS = ("inertia_scale", *LINK)
+
+
+def units() -> dict[str, str]:
+    """Return {parameter: unit} of everything that may be searched, whichever friction family is known."""
+    friction = (zip(f.names, f.units, strict=True) for f in known_families())
+    return {name: unit for pairs in friction for name, unit in pairs} | OTHER_UNITS
+
+
+def logarithmic() -> set[str]:
+    """Return the parameters that are searched by their logarithm: they are positive."""
+    return {"inertia_scale"}.union(*(f.logarithmic for f in known_families()))
 
 
 @dataclass(frozen=True)
@@ -66,9 +75,8 @@ class ParameterSpace:
         """(P,) the nominal dynamics as a vector, clipped into the bounds."""
         d = self.nominal
         values = dict(zip(d.family.names, d.phi.T, strict=False))
-        values |= {"offset": d.offset} | {k: v for k in ("load", "gain") if (v := getattr(d, k)) is not None}
-        drag = np.zeros((self.n, 2)) if d.drag is None else d.drag
-        values |= {"drag_sin": drag[:, 0], "drag_cos": drag[:, 1]}
+        values |= {"offset": d.offset, "load": d.load, "gain": d.gain}
+        values |= {"drag_sin": d.drag[:, 0], "drag_cos": d.drag[:, 1]}
         values |= {"breakaway_negative": d.breakaway[:, 0], "breakaway_positive": d.breakaway[:, 1]}
         values |= {"delay": np.array([d.delay]), "lag": np.array([d.lag])}
         values |= {"inertia_scale": inertia_scale(d.inertia, self.robot.inertia)}
@@ -97,7 +105,7 @@ class ParameterSpace:
 
     @property
     def _log(self) -> np.ndarray:
-        return self.spread_out({b: True for b in LOGARITHMIC}, False)
+        return self.spread_out(dict.fromkeys(logarithmic(), True), False)
 
     def to_unit(self, x: np.ndarray) -> np.ndarray:
         """Map x (..., P) in SI units into the unit cube."""
@@ -131,20 +139,15 @@ class ParameterSpace:
         columns = [d.phi[..., k] for k in range(d.phi.shape[-1])]
         columns += [zero] * (max([0, *(k + 1 for k, f in enumerate(d.family.names) if f in blocks)]) - len(columns))
         phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
-        out = replace(d, phi=np.stack(phi, -1), offset=value("offset", d.offset))
+        drag = [value(name, d.drag[:, i]) for i, name in enumerate(("drag_sin", "drag_cos"))]
+        out = replace(d, phi=np.stack(phi, -1), drag=np.stack(drag, -1))
+        out = replace(out, offset=value("offset", d.offset), load=value("load", d.load), gain=value("gain", d.gain))
         edges = d.breakaway
         if self.break_command is not None:
             edges = self.break_command + out.offset[..., None]
             edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
         pair = [value(f"breakaway_{side}", edges[..., i]) for i, side in enumerate(("negative", "positive"))]
         out = replace(out, breakaway=np.stack(pair, -1))
-        if "load" in blocks:
-            out = replace(out, load=self.block(x, "load"))
-        if "gain" in blocks:
-            out = replace(out, gain=self.block(x, "gain"))
-        if blocks & {"drag_sin", "drag_cos"}:
-            drag = np.zeros((self.n, 2)) if d.drag is None else d.drag
-            out = replace(out, drag=np.stack([value("drag_sin", drag[:, 0]), value("drag_cos", drag[:, 1])], -1))
         if "delay" in blocks:
             out = replace(out, delay=self.block(x, "delay")[..., 0])
         if "lag" in blocks:
@@ -161,9 +164,10 @@ class ParameterSpace:
 
 def check_parameters(where: str, names: Iterable[str]) -> None:
     """Raise UserError if one of the names is no parameter."""
+    known = units()
     for name in names:
-        if name not in UNITS:
-            raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(UNITS)}{nearest(name, UNITS)}")
+        if name not in known:
+            raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(known)}{nearest(name, known)}")
 
 
 def parameter_space(
@@ -179,12 +183,12 @@ def parameter_space(
             that are not two rising numbers (positive where logarithmic).
     """
     if not bounds:
-        raise UserError(f"bounds: no parameter is named; allowed: {choices(UNITS)}")
+        raise UserError(f"bounds: no parameter is named; allowed: {choices(units())}")
     check_parameters("bounds", bounds)
     for name, pair in bounds.items():
-        if len(pair) != 2 or not pair[0] < pair[1] or (name in LOGARITHMIC and pair[0] <= 0):
+        if len(pair) != 2 or not pair[0] < pair[1] or (name in logarithmic() and pair[0] <= 0):
             raise UserError(f"bounds.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
-        others = {k for f in FAMILIES for k in f.names} - set(nominal.family.names)
+        others = {k for f in known_families() for k in f.names} - set(nominal.family.names)
         if name in others:
             raise UserError(
                 f"bounds.{name}: friction family '{nominal.family.name}' has {choices(nominal.family.names)}"

@@ -15,25 +15,32 @@ from r2s.identification.parameters import ParameterSpace, check_parameters, para
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import FAMILIES
+from r2s.physics.friction import family as friction_family
+from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
-TERMS = ("viscous", "offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
+TERMS = ("offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
 Report = Callable[[dict], None]
 
 
 def check_choices(family: str, terms: Sequence[str]) -> None:
     """Raise UserError if there is no such friction family, or no such term to search."""
-    for what, seen, known in (
-        ("friction.family: no family", [family], [*(f.name for f in FAMILIES), "auto"]),
-        ("identify.terms: unknown term", terms, TERMS),
-    ):
-        for name in seen:
-            if name not in known:
-                raise UserError(f"{what} '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
+    if family != "auto":
+        friction_family(family)
+    known = (*optional_friction(), *TERMS)
+    for name in terms:
+        if name not in known:
+            raise UserError(
+                f"identify.terms: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}"
+            )
+
+
+def optional_friction() -> list[str]:
+    """Return the friction parameters that are searched only where terms name them, of whichever family."""
+    return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
 def check_prior(prior: Mapping[str, float]) -> None:
@@ -59,12 +66,11 @@ def searched(
     Raises:
         UserError: a term without bounds.
     """
-    names = [name for name in nominal.family.names if name in bounds]
-    if nominal.family.name == "sigmoid" and "viscous" not in terms:
-        names = [name for name in names if name != "viscous"]
+    own, left_out = nominal.family.names, set(nominal.family.optional) - set(terms)
+    names = [name for name in own if name in bounds and name not in left_out]
+    elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
     for term in terms:
-        elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
-        if term == "viscous" or term in elsewhere:
+        if term in elsewhere or term in optional_friction():
             continue
         names += LINK if term == "link" else [term]
     if missing := [name for name in names if name not in bounds]:

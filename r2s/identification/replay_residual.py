@@ -32,8 +32,6 @@ class ReplayResidual:
     Calling it with x (C, P) returns (C, R); `clusters` (R,) says which window a row belongs to.
     """
 
-    unit = "mrad"
-
     def __init__(
         self,
         robot: Robot,
@@ -77,19 +75,19 @@ class ReplayResidual:
         w, d = self.windows, self.space.dynamics(x)
         timing = np.stack(np.broadcast_arrays(d.delay, d.lag, np.zeros(len(x)))[:2], -1)
         kinds, kind = np.unique(timing, axis=0, return_inverse=True)
-        felt = np.stack([w.felt(*pair) for pair in kinds])
-        return self._simulate(d, felt[kind.ravel()], w.q0, w.dq0)
+        delayed = np.stack([w.delayed(*pair) for pair in kinds])
+        return self._simulate(d, delayed[kind.ravel()], w.q0, w.dq0)
 
-    def _simulate(self, d: Dynamics, felt: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
-        """Return `error` of C candidates for torques felt (C, W, S, n) and starts (C, W, n) or (W, n)."""
-        count = len(felt)
+    def _simulate(self, d: Dynamics, tau: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
+        """Return `error` of C candidates for joint torques tau (C, W, S, n) and starts (C, W, n) or (W, n)."""
+        count = len(tau)
         ids = np.arange(count * self.count)
         shape = (count, *self.windows.q0.shape)
         self._sim.set_dynamics(d, ids, repeat=self.count)
         n = q0.shape[-1]
-        q0, dq0, turn = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.turn))
-        self._sim.reset(q0, dq0, ids, turn)
-        q = self._sim.rollout(felt.reshape(-1, *felt.shape[2:]), ids=ids)["qpos"]
+        q0, dq0, bristle = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.bristle))
+        self._sim.reset(q0, dq0, ids, bristle)
+        q = self._sim.rollout(tau.reshape(-1, *tau.shape[2:]), ids=ids)["qpos"]
         error = (self._means(q).reshape(count, *self._target.shape) - self._target) * self._seen
         return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
 
@@ -103,7 +101,7 @@ class ReplayResidual:
         """Find Z about x (P,) and the whitening; with `fitted`, d and s as well, from what x leaves unexplained."""
         w, n = self.windows, self.space.n
         d = self.space.dynamics(x)
-        felt, eye = w.felt(d.delay, d.lag), np.eye(n)[:, None]
+        delayed, eye = w.delayed(d.delay, d.lag), np.eye(n)[:, None]
         zero = np.zeros((n, 1, n))
         q0 = np.concatenate([w.q0[None], w.q0 + Q_STEP * eye, w.q0 + zero, w.q0 + zero])
         dq0 = np.concatenate([w.dq0[None], w.dq0 + zero, w.dq0 + DQ_STEP * eye, w.dq0 + zero])
@@ -111,7 +109,7 @@ class ReplayResidual:
         parts, count = [], len(q0)
         for i in range(0, count, self._batch):
             at = slice(i, i + self._batch)
-            parts.append(self._simulate(d, felt + push[at], q0[at], dq0[at]))
+            parts.append(self._simulate(d, delayed + push[at], q0[at], dq0[at]))
         at_x = np.concatenate(parts)
         self.candidates += count
         steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
@@ -146,11 +144,6 @@ class ReplayResidual:
         effect = z * self._spread / np.tile(self._noise, self._target.shape[1])[:, None]
         self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
         self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
-
-    @property
-    def unexplained(self) -> np.ndarray:
-        """(n,) Nm, one standard deviation of the torque over a window that no candidate explains."""
-        return self._spread[2 * self.space.n :]
 
     def joint_error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, n) mrad^2: the mean square error of each joint."""

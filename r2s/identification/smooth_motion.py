@@ -16,13 +16,13 @@ FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over tha
 
 
 @dataclass(frozen=True)
-class Motion:
+class SmoothMotion:
     """A recording made smooth enough to differentiate, on T moments.
 
     Attributes:
         t: (T,) s. q, dq, ddq, tau: (T, n), low-passed both ways.
-        fast: (F, n) rad/s at FRICTION_HZ, less smoothed. turn: (F, n), its presliding sign. low_pass: (T, F), sparse:
-            what `filtered` multiplies with.
+        fast: (F, n) rad/s at FRICTION_HZ, less smoothed. bristle: (F, n), its presliding sign.
+        low_pass: (T, F), sparse: what `filtered` multiplies with.
         late: (T, L, n) Nm, tau at the moment and each ms before it.
     """
 
@@ -32,12 +32,14 @@ class Motion:
     ddq: np.ndarray
     tau: np.ndarray
     fast: np.ndarray
-    turn: np.ndarray
+    bristle: np.ndarray
     low_pass: csr_array
     late: np.ndarray
 
     @staticmethod
-    def of(recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: float = PRESLIDING) -> "Motion":
+    def of(
+        recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: float = PRESLIDING
+    ) -> "SmoothMotion":
         """Resample on logged time, low-pass both ways, differentiate, keep `rate_hz`; edges are dropped.
 
         Raises:
@@ -47,7 +49,7 @@ class Motion:
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
         kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
         every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
-        ddq, keep, rows, fast, turn = smooth.acceleration(), [], [], [], []
+        ddq, keep, rows, fast, bristle = smooth.acceleration(), [], [], [], []
         step, edge, base = round(1 / (rate_hz * SIM_DT)), round(0.05 / SIM_DT), 0
         for s in smooth.stretches:
             some = np.arange(s.start + edge, s.stop - edge, step)
@@ -56,7 +58,7 @@ class Motion:
             keep.append(some)
             rows.append(base + near)
             fast.append(quick.dq[at])
-            turn.append(presliding(quick.dq[s], SIM_DT, presliding_rad)[::every])
+            bristle.append(presliding(quick.dq[s], SIM_DT, presliding_rad)[::every])
             base += len(at)
         kept = np.concatenate(keep)
         if not len(kept):
@@ -65,9 +67,9 @@ class Motion:
         ends = len(kernel) * np.arange(len(kept) + 1)
         low_pass = csr_array((np.tile(kernel, len(kept)), columns.ravel(), ends), shape=(len(kept), base))
         late = np.stack([smooth.tau[np.maximum(kept - k, 0)] for k in range(edge)], 1)
-        return Motion(
+        return SmoothMotion(
             smooth.t[kept], smooth.q[kept], smooth.dq[kept], ddq[kept], smooth.tau[kept],
-            np.concatenate(fast), np.concatenate(turn), low_pass, late,
+            np.concatenate(fast), np.concatenate(bristle), low_pass, late,
         )  # fmt: skip
 
     def filtered(self, x: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from copy import copy
 import numpy as np
 
 from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
-from r2s.identification.smooth_motion import Motion
+from r2s.identification.smooth_motion import SmoothMotion
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import BRISTLE, PRESLIDING, WIDTH_DQ
-from r2s.physics.rigid_body import GRAVITY, Links, regressor, rigid_body
+from r2s.physics.friction import PRESLIDING, WIDTH_DQ
+from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor, rigid_body
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
@@ -28,8 +28,6 @@ class TorqueResidual:
     filtered as the torque was, because a filter rounds the step of friction at a reversal.
     """
 
-    unit = "Nm"
-
     def __init__(
         self,
         robot: Robot,
@@ -42,7 +40,7 @@ class TorqueResidual:
         presliding_rad: float = PRESLIDING,
     ):
         self.space = space
-        self.motion = m = Motion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+        self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
         self.commanded = recording.torque == "commanded"
         gravity = None if self.commanded else GRAVITY
         self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
@@ -50,8 +48,10 @@ class TorqueResidual:
         still = np.zeros_like(m.q)
         y = regressor(robot, m.q, still, still, GRAVITY)
         self._gravity = y.reshape(*m.q.shape, -1)
-        self._nominal = Links(robot.mass, robot.com, robot.inertia).standard().ravel()
+        self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(self._gravity @ self._nominal)
+        self._sin, self._cos = np.sin(m.q), np.cos(m.q)
+        self._sign = {False: m.filtered(np.tanh(m.fast / WIDTH_DQ)), True: m.filtered(m.bristle)}  # by has_memory
         block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
         self.candidates = 0
@@ -70,17 +70,13 @@ class TorqueResidual:
         d, m = dynamics, self.motion
         standard = self._standard(d).ravel()
         out = self._rest + self._y @ standard
-        if d.gain is not None and not self.commanded:
+        if not self.commanded:
             out = out * (1.0 + d.gain)
-        turn = m.turn if d.family == BRISTLE else None
-        out += m.filtered(d.friction(m.fast, turn)) - d.offset
-        if self.commanded and (d.mass is not None or d.com is not None):  # what the compensation leaves
+        out += m.filtered(d.friction(m.fast, m.bristle if d.family.has_memory else None)) - d.offset
+        if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
-        if d.drag is not None:
-            out -= d.drag[:, 0] * np.sin(m.q) + d.drag[:, 1] * np.cos(m.q)
-        if d.load is not None:
-            out += d.load * self._load * m.filtered(np.tanh(m.fast / WIDTH_DQ) if turn is None else turn)
-        return out
+        out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
+        return out + d.load * self._load * self._sign[d.family.has_memory]
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
@@ -109,8 +105,7 @@ class TorqueResidual:
         space, n = self.space, self.space.n
         d = space.dynamics(x)
         base, out = self.off(d), np.zeros((*self.motion.q.shape, len(x)))
-        reach = self._y * (np.ones(n) if d.gain is None or self.commanded else 1.0 + d.gain)[:, None]
-        reach = reach + self._gravity if self.commanded else reach
+        reach = self._y + self._gravity if self.commanded else self._y * (1.0 + d.gain)[:, None]
         before = self._standard(d).ravel()
         for block in space.blocks:
             at = space.where(block)
@@ -131,9 +126,7 @@ class TorqueResidual:
 
     def _standard(self, d: Dynamics) -> np.ndarray:
         """Return (..., n, 10) standard parameters."""
-        robot = self.space.robot
-        mass = robot.mass if d.mass is None else d.mass
-        return Links(mass, robot.com if d.com is None else d.com, d.inertia).standard()
+        return LinkInertia(d.mass, d.com, d.inertia).standard()
 
     def adapt(self, x: np.ndarray, fitted: bool) -> None:
         """Set what counts as one standard deviation of an independent row, per joint.

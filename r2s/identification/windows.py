@@ -33,8 +33,8 @@ class Windows:
 
     Attributes:
         t: (W,) s, start. q0, dq0: (W, n) rad, rad/s. tau: (W, S, n) Nm, one row per 1 ms step.
-        before: (W, HISTORY, n) Nm, the commands before the start. turn: (W, n), how far the motion before it bent the
-            bristles of friction with a memory.
+        before: (W, HISTORY, n) Nm, the commands before the start. bristle: (W, n), how far the motion before it bent
+            the bristles of friction with a memory.
         q: (W, S, n) rad, after each step.
         length: (W,) steps that count; what comes after them fills the array up.
     """
@@ -45,10 +45,10 @@ class Windows:
     tau: np.ndarray
     before: np.ndarray
     q: np.ndarray
-    turn: np.ndarray
+    bristle: np.ndarray
     length: np.ndarray
 
-    def felt(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
+    def delayed(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
         """Return (W, S, n) Nm, what the joints feel of the commands after `delay` and `lag`, s."""
         motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
         motors.reset(tau=self.before[:, 0])
@@ -83,7 +83,7 @@ def cut_windows(
             f"no trajectory is as long as a window of {seconds:g} s; the longest is {longest * SIM_DT:g} s"
         )
     still = np.ptp(grid.q, axis=0) < MOVED
-    dq, turn, local = np.empty_like(grid.q), np.empty_like(grid.q), Local.of(grid)
+    dq, bristle, local = np.empty_like(grid.q), np.empty_like(grid.q), Local.of(grid)
     first = np.empty(len(grid.t), dtype=int)
     starts: list[int] = []
     lengths: list[int] = []
@@ -92,7 +92,7 @@ def cut_windows(
         if s.stop - s.start <= STATE_SAMPLES:
             continue
         dq[s] = savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
-        turn[s] = presliding(dq[s], SIM_DT, PRESLIDING)
+        bristle[s] = presliding(dq[s], SIM_DT, PRESLIDING)
         if not slowest:
             whole = list(range(s.start + half, s.stop - max(steps, half), steps))
             starts += whole
@@ -129,7 +129,7 @@ def cut_windows(
         tau=grid.tau[rows],
         before=grid.tau[earlier],
         q=grid.q[rows + 1],
-        turn=turn[at],
+        bristle=bristle[at],
         length=length,
     )
 
@@ -172,10 +172,10 @@ class Local:
         off = np.maximum(np.sqrt(((lead + late * ddq) ** 2).mean(0)), 1e-5)
         t, k = SIM_DT * (np.arange(STATE_SAMPLES) - STATE_SAMPLES // 2)[:, None], np.arange(4)
         speeds = k * t ** np.maximum(k - 1, 0)
-        gains = k * (k - 1) * t ** np.maximum(k - 2, 0)
+        accelerations = k * (k - 1) * t ** np.maximum(k - 2, 0)
         size = np.repeat(np.stack([noise, off], 1), STATE_SAMPLES, axis=1)  # (n, 2 S)
         angles = np.broadcast_to(t**k, (n, STATE_SAMPLES, 4))
-        both = np.concatenate([angles, speeds - late[:, None, None] * gains], 1) / size[..., None]
+        both = np.concatenate([angles, speeds - late[:, None, None] * accelerations], 1) / size[..., None]
         cubic = np.linalg.pinv(both) / size[:, None]
         # MuJoCo moves by the velocity that a step ends with: q(t) = q0 + v t + a t^2 / 2 starts from v - a h / 2
         kernel = np.stack([cubic[:, 0], cubic[:, 1] - SIM_DT * cubic[:, 2]], 1)
@@ -192,5 +192,5 @@ class Local:
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
     """Return q (W, S, n) rad that an arm with these dynamics does in each window."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)
-    sim.reset(windows.q0, windows.dq0, turn=windows.turn)
-    return sim.rollout(windows.felt(dynamics.delay, dynamics.lag))["qpos"]
+    sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
+    return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]

@@ -33,10 +33,8 @@ class Oracle:
     def __init__(self, robot: Robot, task: Task, dynamics: Dynamics, move_s: float = 0.6):
         self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
         self._model = robot.model(gravity=False)
-        mass = robot.mass if dynamics.mass is None else dynamics.mass
-        com = robot.com if dynamics.com is None else dynamics.com
         bodies = self._model.jnt_bodyid
-        for body, m, c, inertia in zip(bodies, mass, com, dynamics.inertia, strict=True):
+        for body, m, c, inertia in zip(bodies, dynamics.mass, dynamics.com, dynamics.inertia, strict=True):
             moments, axes = np.linalg.eigh(inertia)
             axes[:, 0] *= np.sign(np.linalg.det(axes))
             self._model.body_mass[body], self._model.body_ipos[body] = m, c

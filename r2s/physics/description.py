@@ -49,20 +49,20 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
         friction: add it as Coulomb and viscous terms that match it at 30 % and 100 % of the largest velocities.
     """
     model = robot.model(gravity=True)
-    links, bodies = Links(model), model.jnt_bodyid
-    links.override(bodies, dynamics.mass, dynamics.com, dynamics.inertia, robot.n)
+    bodies, moving = Bodies(model), model.jnt_bodyid
+    bodies.override(moving, dynamics.mass, dynamics.com, dynamics.inertia, robot.n)
     coulomb, viscous = coulomb_viscous(robot, dynamics) if friction else np.zeros((2, robot.n))
     out, before = [], np.eye(4)
-    for i, body in enumerate(bodies):
-        _, fixed = links.moving_parent(model.body_parentid[body])
+    for i, body in enumerate(moving):
+        _, fixed = bodies.moving_parent(model.body_parentid[body])
         joint = make_pose(model.jnt_pos[i], None)
         zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))
-        mass, com, inertia = links.lumped(body)
+        mass, com, inertia = bodies.lumped(body)
         out.append(
             Link(
                 name=model.body(body).name or f"link{i + 1}",
                 joint=model.joint(i).name or f"joint{i + 1}",
-                origin=np.linalg.inv(before) @ fixed @ links.local[body] @ joint @ zero,
+                origin=np.linalg.inv(before) @ fixed @ bodies.local[body] @ joint @ zero,
                 axis=model.jnt_axis[i],
                 mass=mass,
                 com=com - model.jnt_pos[i],
@@ -74,7 +74,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
         )
         before = joint
     site = model.site(robot.ee_site).id
-    _, fixed = links.moving_parent(model.site_bodyid[site])
+    _, fixed = bodies.moving_parent(model.site_bodyid[site])
     hand = fixed @ make_pose(model.site_pos[site], rotation(model.site_quat[site]))
     return out, np.linalg.inv(before) @ hand
 
@@ -198,7 +198,7 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
     _write(path, root)
 
 
-class Links:
+class Bodies:
     """Masses, centres and tensors of all bodies, and where welded bodies sit on the moving ones."""
 
     def __init__(self, model: mujoco.MjModel):

@@ -8,7 +8,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
-from r2s.physics.robot import Robot
+from r2s.physics.robot import Robot, per_joint
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class Dynamics:
         offset: (..., n) Nm, added to every command.
         breakaway: (..., n, 2) Nm, negative and positive edge of the dead zone, of command and offset together.
         dq_min: rad/s, speed below which the dead zone may hold.
+        mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
-        mass: (..., n) kg, com: (..., n, 3) m, link frame; None: the robot's.
+        load: (..., n), friction per torque that gravity loads the joint with.
+        drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's.
+        gain: (..., n), relative error of the link-side torque sensor. Only a measured torque knows it.
         family: of the friction.
-        load: (..., n), friction per torque that gravity loads the joint with; None: 0.
-        drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's; None: 0.
-        gain: (..., n), relative error of the link-side torque sensor; None: 0. Only a measured torque knows it.
         delay, lag: (...) s, of the actuation: pure, and first order. The simulator does not apply them: whoever
             makes the commands does (`Motors` of r2s/physics/actuation.py).
     """
@@ -34,40 +34,47 @@ class Dynamics:
     offset: np.ndarray
     breakaway: np.ndarray
     dq_min: float
+    mass: np.ndarray
+    com: np.ndarray
     inertia: np.ndarray
-    mass: np.ndarray | None = None
-    com: np.ndarray | None = None
+    load: np.ndarray
+    drag: np.ndarray
+    gain: np.ndarray
     family: Family = SIGMOID
-    load: np.ndarray | None = None
-    drag: np.ndarray | None = None
-    gain: np.ndarray | None = None
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
 
-    def friction(self, dq: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
-        """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `turn`: Family.torque."""
-        return self.family.torque(dq, self.phi, turn)
+    @staticmethod
+    def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
+        """Return the robot's own links with friction phi (..., n, K) of a family, and nothing else."""
+        n = robot.n
+        return Dynamics(
+            phi=phi,
+            offset=np.zeros(n),
+            breakaway=np.zeros((n, 2)),
+            dq_min=dq_min,
+            mass=robot.mass,
+            com=robot.com,
+            inertia=robot.inertia,
+            load=np.zeros(n),
+            drag=np.zeros((n, 2)),
+            gain=np.zeros(n),
+            family=family,
+        )
+
+    def friction(self, dq: np.ndarray, bristle: np.ndarray | None = None) -> np.ndarray:
+        """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `bristle`: Family.torque."""
+        return self.family.torque(dq, self.phi, bristle)
 
     def one(self, k: int) -> "Dynamics":
         """Return the k-th of a batch (m, ...); fields that all arms share stay as they are."""
-        single = {
-            "phi": 2,
-            "offset": 1,
-            "breakaway": 2,
-            "inertia": 3,
-            "mass": 1,
-            "com": 2,
-            "load": 1,
-            "drag": 2,
-            "gain": 1,
-        }
-        single |= {"delay": 0, "lag": 0}
-        values = {name: getattr(self, name) for name in single}
-        return replace(self, **{n: v[k] for n, v in values.items() if v is not None and np.ndim(v) > single[n]})
+        values = {name: (getattr(self, name), axes) for name, axes in AXES.items()}
+        return replace(self, **{name: v[k] for name, (v, axes) in values.items() if np.ndim(v) > axes})
 
-    def scaled(self, scale: np.ndarray) -> "Dynamics":
-        """Return these dynamics with link tensors times `scale` (..., n): the paper's inertia genes."""
-        return replace(self, inertia=self.inertia * np.asarray(scale)[..., None, None])
+
+# of an array that one arm has
+AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "load": 1, "drag": 2, "gain": 1}
+AXES |= {"delay": 0, "lag": 0}
 
 
 def nominal_dynamics(
@@ -91,35 +98,30 @@ def nominal_dynamics(
         UserError: a list that does not fit the arm's joints, or a value out of its physical range.
     """
 
-    def per_joint(name: str, value: Sequence[float] | float) -> np.ndarray:
-        array = np.array(value, dtype=float)
-        array = np.full(robot.n, float(array)) if array.ndim == 0 else array
-        if array.shape != (robot.n,):
-            raise UserError(f"{name}: {array.size} values for the {robot.n} joints of {robot.name}")
+    def joints(name: str, value: Sequence[float] | float) -> np.ndarray:
+        array = per_joint(name, value, robot.n, robot.name)
         if not np.all(np.isfinite(array)):
             raise UserError(f"{name}: {array.tolist()} has a value that is not finite")
         return array
 
-    phi = np.stack([per_joint("friction.phi1", phi1), per_joint("friction.phi2", phi2)], -1)
-    scale = per_joint("inertia.scale", inertia_scale)
+    phi = np.stack([joints("friction.phi1", phi1), joints("friction.phi2", phi2)], -1)
+    scale = joints("inertia.scale", inertia_scale)
     for name, values in (("friction.phi1", phi[:, 0]), ("friction.phi2", phi[:, 1])):
         if np.any(values < 0):
             raise UserError(f"{name}: {values.min():g} is negative; friction must take energy out")
     if np.any(scale <= 0):
         raise UserError(f"inertia.scale: {scale.min():g} is not positive")
-    low = per_joint("friction.breakaway_negative", breakaway_negative)
-    high = per_joint("friction.breakaway_positive", breakaway_positive)
+    low = joints("friction.breakaway_negative", breakaway_negative)
+    high = joints("friction.breakaway_positive", breakaway_positive)
     if np.any(low > 0) or np.any(high < 0):
         raise UserError("friction.breakaway: the negative edges must be <= 0 and the positive ones >= 0")
     named = SIGMOID if family == "auto" else friction_family(family)
-    phi = np.concatenate([phi, per_joint("friction.phi3", phi3)[:, None]], -1)
-    return Dynamics(
-        phi=named.like(SIGMOID, phi),
-        offset=per_joint("friction.offset", offset),
+    phi = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1)
+    return replace(
+        Dynamics.of(robot, named.like(SIGMOID, phi), named, float(dq_min)),
+        offset=joints("friction.offset", offset),
         breakaway=np.stack([low, high], -1),
-        dq_min=float(dq_min),
         inertia=robot.inertia * scale[:, None, None],
-        family=named,
     )
 
 

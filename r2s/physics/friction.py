@@ -1,9 +1,13 @@
-"""Joint friction: families of one interface, breakaway (eq. 6) and offsets, in NumPy, for readers and tests.
+"""Joint friction: families of one interface, breakaway (eq. 6) and offsets.
 
-native_friction.py has the same laws, compiled, inside the physics step.
+A family is one record: its law in NumPy, for readers, residuals and tests, and the same law compiled, which
+native_friction.py puts inside the physics step. `friction.family=` names one of the four below, or, by a dotted path
+such as my_module.MY_FAMILY, a record of your own.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 from numba import njit
@@ -12,64 +16,83 @@ from r2s.errors import UserError, choices, nearest
 
 WIDTH_DQ = 0.01  # rad/s, over which the sign of Coulomb friction turns: inside the dead zone
 PRESLIDING = 1e-3  # rad, over which friction turns, where it is not searched
-
-
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    """Return the logistic function, without overflow at any finite x."""
-    e = np.exp(-np.abs(x))
-    return np.where(x >= 0, 1.0, e) / (1.0 + e)
+MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
+PHI = 8  # most parameters of a family
 
 
 @dataclass(frozen=True)
 class Family:
-    """A friction law of one joint with K parameters; `code` is what the native form calls it.
+    """A friction law of one joint with K parameters, all that the house knows of it.
 
-    sigmoid, eq. (5) of the paper and a viscous term that may be left out (K = 3):
-        tau_f = phi1 (s(phi2 (v + phi3)) - s(phi2 phi3)) + viscous v,  s the logistic function
-    coulomb, level and viscous term, asymmetric:
-        tau_f = coulomb (1 +- asymmetry) tanh(v / 0.01) + viscous v,  + for v > 0
-    stribeck, falling from rest over stribeck_velocity:
-        the same with coulomb (1 + rise exp(-(v / stribeck_velocity)^2)) as its level
-    bristle, Stribeck's with a memory (Dahl 1968; LuGre without its own damping term): z in place of the tanh,
-        dz/dt = (v - |v| z) / presliding: the sign turns over a distance, and a joint at rest is held by a spring.
-        It needs no dead zone: what it holds is its level at rest.
+    Torque is zero at rest and positive for positive velocity.
+
+    Attributes:
+        name: in tables.
+        names: of the K parameters. units: of each. logarithmic: those whose values span decades: they are positive
+            and searched by their logarithm.
+        optional: the last of the names, those that are 0 and not searched unless `identify.terms` names them.
+        formula: the law in one line of text.
+        law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign (..., n); p is a
+            list of K arrays (..., n). `sign` goes from -1 to 1 with the velocity: tanh(dq / 0.01), or for a family
+            with a memory how far the bristles are bent.
+        native: the law for one joint and one step of h seconds, compiled by numba.njit:
+            (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's own, 0 after a reset.
+        start: level (..., n) Nm at 1 rad/s -> the K parameters that are not optional, in a list.
+        held: phi (..., n, K) -> (..., n, 2) Nm, the negative and the positive torque that the law holds at rest,
+            which takes a memory. None: it holds nothing, and the dead zone of `passive_torque` does.
+
+    Raises:
+        UserError: the parts do not fit each other.
     """
 
     name: str
-    code: int
     names: tuple[str, ...]
     units: tuple[str, ...]
+    formula: str
+    law: Callable[..., np.ndarray]
+    law_slope: Callable[..., np.ndarray]
+    native: Callable[..., tuple[float, float]]
+    start: Callable[[np.ndarray], list[np.ndarray]]
+    logarithmic: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+    held: Callable[[np.ndarray], np.ndarray] | None = None
 
-    def torque(self, dq: np.ndarray, phi: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
+    def __post_init__(self) -> None:
+        where, k = f"friction family '{self.name}'", len(self.names)
+        if not 1 <= k <= PHI or len(set(self.names)) < k or len(self.units) != k:
+            raise UserError(f"{where}: {k} names and {len(self.units)} units; allowed are 1 to {PHI}, each name once")
+        for name in (*self.logarithmic, *self.optional):
+            if name not in self.names:
+                raise UserError(f"{where}: no parameter '{name}'; it has {choices(self.names)}")
+        if self.optional != self.names[k - len(self.optional) :]:
+            raise UserError(f"{where}: optional parameters must be the last of {choices(self.names)}")
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the law holds a joint at rest by itself; then it needs no dead zone."""
+        return self.held is not None
+
+    def scale(self, name: str) -> tuple[str, str]:
+        """Return how a parameter is measured and searched: its unit, and "logarithmic" or "linear"."""
+        return self.units[self.names.index(name)], "logarithmic" if name in self.logarithmic else "linear"
+
+    def torque(self, dq: np.ndarray, phi: np.ndarray, bristle: np.ndarray | None = None) -> np.ndarray:
         """Return the friction torque, Nm; zero at rest, positive for positive velocity.
 
         Args:
             dq: (..., n) rad/s.
-            phi: (..., n, K), in the order of `names`.
-            turn: (..., n), in place of tanh(v / 0.01) where it is known better (`presliding`); the sigmoid has none.
+            phi: (..., n, K), in the order of `names`; optional ones may be left out.
+            bristle: (..., n) in [-1, 1], in place of tanh(dq / 0.01) where it is known better (`presliding`).
         """
-        p = [phi[..., i] for i in range(phi.shape[-1])]
-        if self.name == "sigmoid":
-            viscous = p[3] * dq if len(p) > 3 else 0.0
-            return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + viscous
-        turn = np.tanh(dq / WIDTH_DQ) if turn is None else turn
-        level = p[0] * (1 + np.sign(turn) * p[1])
-        if self.name in ("stribeck", "bristle"):
-            level = level * (1 + p[3] * np.exp(-((dq / p[4]) ** 2)))
-        return level * turn + p[2] * dq
+        return self.law(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
 
     def slope(self, dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """Return d torque / d dq, Nm s/rad, for the arguments of `torque`."""
-        p = [phi[..., i] for i in range(phi.shape[-1])]
-        if self.name == "sigmoid":
-            s = sigmoid(p[1] * (dq + p[2]))
-            return p[0] * p[1] * s * (1.0 - s) + (p[3] if len(p) > 3 else 0.0)
-        turn = np.tanh(dq / WIDTH_DQ)
-        level, fall = p[0] * (1 + np.sign(dq) * p[1]), np.zeros_like(dq)
-        if self.name in ("stribeck", "bristle"):
-            bump = p[3] * np.exp(-((dq / p[4]) ** 2))
-            level, fall = level * (1 + bump), level * bump * -2 * dq / p[4] ** 2
-        return level * (1 - turn**2) / WIDTH_DQ + fall * turn + p[2]
+        return self.law_slope(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ))
+
+    def _columns(self, phi: np.ndarray) -> list[np.ndarray]:
+        left_out = [np.zeros(())] * (len(self.names) - phi.shape[-1])
+        return [phi[..., k] for k in range(phi.shape[-1])] + left_out
 
     def level(self, phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
         """Return (..., n) Nm: the mean magnitude of friction at plus and minus `dq_max` (..., n) rad/s."""
@@ -79,12 +102,205 @@ class Family:
         """Return (..., n, K) parameters of this family with the level at 1 rad/s of `other` (..., n, K')."""
         if other == self:
             return phi
-        one = np.ones(phi.shape[:-1])
-        level, zero = other.level(phi, one), np.zeros(phi.shape[:-1])
-        if self.name == "sigmoid":
-            return np.stack([2 * level, 20 * one, zero], -1)
-        phi = np.stack([level, zero, zero, 0.1 * one, 0.1 * one, 1e-3 * one], -1)
-        return phi[..., : len(self.names)]
+        return np.stack(self.start(other.level(phi, np.ones(phi.shape[:-1]))), -1)
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """Return the logistic function, without overflow at any finite x."""
+    e = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, e) / (1.0 + e)
+
+
+def _sigmoid_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    """Return eq. (5) of the paper, and a viscous term."""
+    return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + p[3] * dq
+
+
+def _sigmoid_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    s = sigmoid(p[1] * (dq + p[2]))
+    return p[0] * p[1] * s * (1.0 - s) + p[3]
+
+
+@njit
+def _sigmoid_native(p, v, h, memory):
+    x = p[1] * (v + p[2])
+    e = np.exp(-abs(x))
+    s = (1.0 if x >= 0 else e) / (1.0 + e)
+    x = p[1] * p[2]
+    e = np.exp(-abs(x))
+    s0 = (1.0 if x >= 0 else e) / (1.0 + e)
+    return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
+
+
+def _sigmoid_start(level: np.ndarray) -> list[np.ndarray]:
+    return [2 * level, np.full_like(level, 20.0), np.zeros_like(level)]
+
+
+SIGMOID = Family(
+    name="sigmoid",
+    names=("phi1", "phi2", "phi3", "viscous"),
+    units=("Nm", "s/rad", "rad/s", "Nm s/rad"),
+    logarithmic=("phi1", "phi2"),
+    optional=("viscous",),
+    formula="phi1 (s(phi2 (v + phi3)) - s(phi2 phi3)) + viscous v, s the logistic function: eq. (5)",
+    law=_sigmoid_law,
+    law_slope=_sigmoid_slope,
+    native=_sigmoid_native,
+    start=_sigmoid_start,
+)
+
+
+def _coulomb_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    return p[0] * (1 + np.sign(sign) * p[1]) * sign + p[2] * dq
+
+
+def _coulomb_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    return p[0] * (1 + np.sign(dq) * p[1]) * (1 - sign**2) / WIDTH_DQ + p[2]
+
+
+@njit
+def _coulomb_native(p, v, h, memory):
+    sign = np.tanh(v / WIDTH_DQ)
+    level = p[0] * (1.0 + np.sign(v) * p[1])
+    return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + p[2]
+
+
+def _coulomb_start(level: np.ndarray) -> list[np.ndarray]:
+    return [level, np.zeros_like(level), np.zeros_like(level)]
+
+
+COULOMB = Family(
+    name="coulomb",
+    names=("coulomb", "asymmetry", "viscous"),
+    units=("Nm", "1", "Nm s/rad"),
+    logarithmic=("coulomb",),
+    formula="coulomb (1 ± asymmetry) sign(v) + viscous v",
+    law=_coulomb_law,
+    law_slope=_coulomb_slope,
+    native=_coulomb_native,
+    start=_coulomb_start,
+)
+
+
+def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    level = p[0] * (1 + np.sign(sign) * p[1]) * (1 + p[3] * np.exp(-((dq / p[4]) ** 2)))
+    return level * sign + p[2] * dq
+
+
+def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    level, bump = p[0] * (1 + np.sign(dq) * p[1]), p[3] * np.exp(-((dq / p[4]) ** 2))
+    fall = level * bump * -2 * dq / p[4] ** 2
+    return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2]
+
+
+@njit
+def _stribeck_native(p, v, h, memory):
+    sign = np.tanh(v / WIDTH_DQ)
+    level = p[0] * (1.0 + np.sign(v) * p[1])
+    bump = p[3] * np.exp(-((v / p[4]) ** 2))
+    fall = level * bump * -2.0 * v / p[4] ** 2
+    level *= 1.0 + bump
+    return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + p[2]
+
+
+def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
+    return [*_coulomb_start(level), np.full_like(level, 0.1), np.full_like(level, 0.1)]
+
+
+STRIBECK = Family(
+    name="stribeck",
+    names=(*COULOMB.names, "rise", "stribeck_velocity"),
+    units=(*COULOMB.units, "1", "rad/s"),
+    logarithmic=("coulomb", "stribeck_velocity"),
+    formula="coulomb (1 ± asymmetry) (1 + rise exp(-(v / stribeck_velocity)²)) sign(v) + viscous v",
+    law=_stribeck_law,
+    law_slope=_stribeck_slope,
+    native=_stribeck_native,
+    start=_stribeck_start,
+)
+
+
+@njit
+def _bristle_native(p, v, h, memory):
+    """Dahl 1968; LuGre without its own damping term: dz/dt = (v - |v| z) / presliding in place of the sign."""
+    s = 1.0 if v > 0 else -1.0
+    z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
+    memory[0] = z
+    level = p[0] * (1.0 + p[1] if z > 0 else 1.0 - p[1]) * (1.0 + p[3] * np.exp(-((v / p[4]) ** 2)))
+    stiff = level / p[5]
+    rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
+    # what the coming step will do to it, at the present velocity
+    return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
+
+
+def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
+    return [*_stribeck_start(level), np.full_like(level, PRESLIDING)]
+
+
+def _bristle_held(phi: np.ndarray) -> np.ndarray:
+    level, asymmetry, rise = (phi[..., k] for k in (0, 1, 3))
+    return np.stack([-level * (1 - asymmetry), level * (1 + asymmetry)], -1) * (1 + rise[..., None])
+
+
+BRISTLE = Family(
+    name="bristle",
+    names=(*STRIBECK.names, "presliding"),
+    units=(*STRIBECK.units, "rad"),
+    logarithmic=(*STRIBECK.logarithmic, "presliding"),
+    formula="Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
+    law=_stribeck_law,
+    law_slope=_stribeck_slope,
+    native=_bristle_native,
+    start=_bristle_start,
+    held=_bristle_held,
+)
+FAMILIES = (SIGMOID, COULOMB, STRIBECK, BRISTLE)  # what friction.family=auto compares
+_plugged: dict[str, Family] = {}  # by their dotted paths
+
+
+def known_families() -> tuple[Family, ...]:
+    """Return the built-in families and those that `family` has imported."""
+    return (*FAMILIES, *_plugged.values())
+
+
+def family(name: str) -> Family:
+    """Return the built-in family of that name, or import one by its dotted path.
+
+    Raises:
+        UserError: there is none, it is no Family, or one of its parameters has another unit or scale elsewhere.
+    """
+    name, names = str(name), [f.name for f in FAMILIES]
+    if name in names:
+        return FAMILIES[names.index(name)]
+    if name in _plugged:
+        return _plugged[name]
+    module, _, attribute = name.rpartition(".")
+    if not module:
+        raise UserError(
+            f"friction.family: no family '{name}'; allowed: {choices(names)}, auto, or my_module.MY_FAMILY for a "
+            f"Family of your own{nearest(name, [*names, 'auto'])}"
+        )
+    try:
+        found = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, SyntaxError, ValueError) as error:
+        raise UserError(f"friction.family: cannot import '{name}' ({error})") from None
+    if not isinstance(found, Family):
+        raise UserError(f"friction.family: '{name}' is of type {type(found).__name__}; a Family is asked for")
+    for other in known_families():
+        for own in set(found.names) & set(other.names):
+            scales = [" ".join(f.scale(own)) for f in (found, other)]
+            if scales[0] != scales[1]:
+                raise UserError(
+                    f"friction.family: '{own}' of '{name}' is {scales[0]}, that of '{other.name}' is {scales[1]}; "
+                    "give it another name"
+                )
+    _plugged[name] = found
+    return found
+
+
+def spelled(one: Family) -> str:
+    """Return what `family` finds this family by: its name, or the dotted path that it was imported by."""
+    return next((path for path, f in _plugged.items() if f is one), one.name)
 
 
 @njit(cache=True)
@@ -104,26 +320,6 @@ def presliding(dq: np.ndarray, dt: float, distance: float) -> np.ndarray:
             z[j] = s + (z[j] - s) * np.exp(-abs(dq[k, j]) * dt / distance)
             out[k, j] = z[j]
     return out
-
-
-SIGMOID = Family("sigmoid", 0, ("phi1", "phi2", "phi3", "viscous"), ("Nm", "s/rad", "rad/s", "Nm s/rad"))
-COULOMB = Family("coulomb", 1, ("coulomb", "asymmetry", "viscous"), ("Nm", "1", "Nm s/rad"))
-STRIBECK = Family(
-    "stribeck",
-    2,
-    ("coulomb", "asymmetry", "viscous", "rise", "stribeck_velocity"),
-    ("Nm", "1", "Nm s/rad", "1", "rad/s"),
-)
-BRISTLE = Family("bristle", 3, (*STRIBECK.names, "presliding"), (*STRIBECK.units, "rad"))
-FAMILIES = (SIGMOID, COULOMB, STRIBECK, BRISTLE)
-
-
-def family(name: str) -> Family:
-    """Return the family of that name; UserError if there is none."""
-    names = [f.name for f in FAMILIES]
-    if name not in names:
-        raise UserError(f"friction.family: no family '{name}'; allowed: {choices(names)}{nearest(str(name), names)}")
-    return FAMILIES[names.index(name)]
 
 
 def passive_torque(

@@ -1,6 +1,6 @@
-"""The friction law inside MuJoCo's physics step: a compiled passive force that reads `jnt_user`.
+"""Friction inside MuJoCo's physics step: a compiled passive force that reads `jnt_user`.
 
-`install()` puts the law of friction.py into MuJoCo as a native passive force: `mujoco.batch.Batch` then gives every
+`install()` puts the laws of friction.py into MuJoCo as a native passive force: `mujoco.batch.Batch` then gives every
 simulation its own arm at full speed. The same callback holds the driver's soft limits (limits.py), which need
 feedback every millisecond.
 
@@ -10,71 +10,73 @@ where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 
 """
 
 import ctypes
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import mujoco
 import numpy as np
 from numba import njit
+from numba.extending import is_jitted
 
-from r2s.physics.friction import WIDTH_DQ
+from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 
 GRAVITY = 9.81  # m/s^2, of an upright base
-PHI = 6  # most parameters of a family
-MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
-
 
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-Q_LOW, Q_HIGH, Q_GAIN, DQ_SOFT, DQ_GAIN = range(MOMENT + 3, MOMENT + 8)  # soft limits; gains of 0: none
-WIDTH = DQ_GAIN + 1
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(MOMENT + 3, MOMENT + 8)  # soft limits; of 0: none
+WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 
 
+_laws: list[Family] = list(FAMILIES)  # the place of a family is its number in `jnt_user`
+
+
+def number(family: Family) -> int:
+    """Return what `jnt_user` calls a family; one that is new is compiled into the physics step first (seconds)."""
+    if family not in _laws:
+        _laws.append(family)
+        install()
+    return _laws.index(family)
+
+
 def install() -> None:
-    """Put the native law into MuJoCo, once per process. Models without our marker in `jnt_user` are untouched."""
-    _callback()
+    """Put the native laws into MuJoCo, once per process. Models without our marker in `jnt_user` are untouched."""
+    _callback(tuple(f.native for f in _laws))
 
 
-@njit(inline="always")
-def _law(code, p, v, h, memory):
-    """Return friction torque and slope of one joint; p (PHI,) of its family. `memory` (1,), z, moves on by v h."""
-    if code == 0:
-        x = p[1] * (v + p[2])
-        e = np.exp(-abs(x))
-        s = (1.0 if x >= 0 else e) / (1.0 + e)
-        x = p[1] * p[2]
-        e = np.exp(-abs(x))
-        s0 = (1.0 if x >= 0 else e) / (1.0 + e)
-        return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
-    if code == 3:
-        s = 1.0 if v > 0 else -1.0
-        z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
-        memory[0] = z
-        level = p[0] * (1.0 + p[1] if z > 0 else 1.0 - p[1]) * (1.0 + p[3] * np.exp(-((v / p[4]) ** 2)))
-        stiff = level / p[5]
-        rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-        # what the coming step will do to it, at the present velocity
-        return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
-    turn = np.tanh(v / WIDTH_DQ)
-    level = p[0] * (1.0 + np.sign(v) * p[1])
-    fall = 0.0
-    if code == 2:
-        bump = p[3] * np.exp(-((v / p[4]) ** 2))
-        fall = level * bump * -2.0 * v / p[4] ** 2
-        level *= 1.0 + bump
-    return level * turn + p[2] * v, level * (1.0 - turn * turn) / WIDTH_DQ + fall * turn + p[2]
+def _either(number: int, own: Callable, others: Callable) -> Callable:
+    """Return the compiled law that is `own` where it is asked for by its number, else `others`."""
+    own = own if is_jitted(own) else njit(own)
+
+    @njit
+    def law(asked, p, v, h, memory):
+        if asked == number:
+            return own(p, v, h, memory)
+        return others(asked, p, v, h, memory)
+
+    return law
+
+
+@njit
+def _no_law(asked, p, v, h, memory):
+    return 0.0, 0.0
 
 
 @cache
-def _callback() -> Any:
+def _callback(laws: tuple[Callable, ...]) -> Any:
+    """Compile the passive force of these laws, in the order of their numbers, and put it into MuJoCo."""
     from llvmlite import ir
     from numba import carray, cfunc, types
     from numba.extending import intrinsic
 
+    law: Callable = _no_law
+    for k in reversed(range(len(laws))):
+        law = _either(k, laws[k], law)
     at = _struct_offsets()
     nv_at, nuser_at = at["nv"] // 8, at["nuser_jnt"] // 8
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
@@ -119,7 +121,7 @@ def _callback() -> Any:
             if user[j, MARK] != MARKER:
                 return
             v = qvel[j]
-            friction, slope = _law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
+            friction, slope = law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
             pull = user[j, OFFSET]
             if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
                 pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
@@ -140,22 +142,20 @@ def _callback() -> Any:
                 lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
                 load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
-                turn = np.tanh(v / WIDTH_DQ)
-                friction += user[j, LOAD] * abs(load) * turn
-                slope += user[j, LOAD] * abs(load) * (1.0 - turn * turn) / WIDTH_DQ
+                sign = np.tanh(v / WIDTH_DQ)
+                friction += user[j, LOAD] * abs(load) * sign
+                slope += user[j, LOAD] * abs(load) * (1.0 - sign * sign) / WIDTH_DQ
             slope = max(slope, 0.0)  # an implicit falling branch would take inertia away
             # mj_passive has already subtracted dof_damping * v with the slope of the step before: put it right
             force = (damping[j] - user[j, DAMPING]) * v - friction
             damping[j] = user[j, DAMPING] + slope
             drive = applied[j] + pull
-            held = (
-                user[j, FAMILY] != 3 and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
-            )
-            if user[j, DQ_GAIN] > 0.0 and abs(v) > user[j, DQ_SOFT]:
-                damping[j] += user[j, DQ_GAIN]
-                force -= user[j, DQ_GAIN] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
+            held = abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            if user[j, DQ_DAMPING] > 0.0 and abs(v) > user[j, DQ_SOFT]:
+                damping[j] += user[j, DQ_DAMPING]
+                force -= user[j, DQ_DAMPING] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
             beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
-            force -= user[j, Q_GAIN] * beyond
+            force -= user[j, Q_STIFFNESS] * beyond
             qfrc_passive[j] += force + (-applied[j] if held else pull)
 
     mujoco.set_mjcb_passive(passive.ctypes)

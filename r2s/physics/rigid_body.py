@@ -16,7 +16,7 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
-class Links:
+class LinkInertia:
     """Mass, centre and tensor of n links; any leading batch shape.
 
     Attributes:
@@ -122,7 +122,25 @@ def rigid_body(
         mujoco.mj_inverse(model, data)
         whole[t] = data.qfrc_inverse
     y = regressor(robot, q, dq, ddq, gravity)
-    return whole - np.einsum("tjkc,kc->tj", y, Links(robot.mass, robot.com, robot.inertia).standard()), y
+    return whole - np.einsum("tjkc,kc->tj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard()), y
+
+
+def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return moments (..., 3) kg m^2 and their axes as a quaternion (..., 4) w x y z of tensors (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    moments, axes = np.linalg.eigh(inertia)
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
+    quaternions = Rotation.from_matrix(axes.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    return moments, quaternions.reshape(*axes.shape[:-2], 4)
+
+
+def put_links(model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> None:
+    """Give the moving links of a compiled arm mass (n,) kg, centre (n, 3) m and tensor about it (n, 3, 3)."""
+    at = model.jnt_bodyid
+    model.body_mass[at], model.body_ipos[at] = mass, com
+    model.body_inertia[at], model.body_iquat[at] = principal_axes(inertia)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 class Kinematics:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 
@@ -80,6 +81,19 @@ class Robot:
         return spec.compile()
 
 
+def per_joint(name: str, value: ArrayLike, n: int, arm: str) -> np.ndarray:
+    """Return (n,) floats: a value per joint of `arm`, or one for all.
+
+    Raises:
+        UserError: `name` has another number of values.
+    """
+    array = np.array(value, dtype=float)
+    array = np.full(n, float(array)) if array.ndim == 0 else array
+    if array.shape != (n,):
+        raise UserError(f"{name}: {array.size} values for the {n} joints of {arm}")
+    return array
+
+
 def load_robot(
     mjcf: str | None = None,
     *,
@@ -113,23 +127,19 @@ def load_robot(
     n = model.njnt
     site = _end_effector(model, ee_site, path)
 
-    def per_joint(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
-        array = np.array(fallback if value is None else value, dtype=float)
-        array = np.full(n, float(array)) if array.ndim == 0 else array
-        if array.shape != (n,):
-            raise UserError(f"robot.{name}: {array.size} values for the {n} joints of {path.name}")
-        return array
+    def each(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
+        return per_joint(f"robot.{name}", fallback if value is None else value, n, path.name)
 
     limited = model.jnt_limited.astype(bool)
-    low = per_joint("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.pi))
-    high = per_joint("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.pi))
-    torque = per_joint("tau_max", tau_max, _torque_limits(model))
+    low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.pi))
+    high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.pi))
+    torque = each("tau_max", tau_max, _torque_limits(model))
     if not np.all(torque > 0):
         joints = [model.joint(i).name or f"joint {i + 1}" for i in np.flatnonzero(~(torque > 0))]
         raise UserError(
             f"robot.tau_max: {path.name} gives no torque limit for {choices(joints)}; set robot.tau_max=[...]"
         )
-    home = per_joint("q_home", q_home, np.clip(model.qpos0, 0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high))
+    home = each("q_home", q_home, np.clip(model.qpos0, 0.9 * low + 0.1 * high, 0.1 * low + 0.9 * high))
     if np.any(home < low) or np.any(home > high):
         joint = int(np.argmax(np.maximum(low - home, home - high)))
         raise UserError(
@@ -144,10 +154,10 @@ def load_robot(
         mjcf=path.resolve(),
         q_min=low,
         q_max=high,
-        dq_max=per_joint("dq_max", dq_max, np.ones(n)),
-        ddq_max=per_joint("ddq_max", ddq_max, np.ones(n)),
+        dq_max=each("dq_max", dq_max, np.ones(n)),
+        ddq_max=each("ddq_max", ddq_max, np.ones(n)),
         tau_max=torque,
-        dtau_max=per_joint("dtau_max", dtau_max, np.ones(n)),
+        dtau_max=each("dtau_max", dtau_max, np.ones(n)),
         q_home=home,
         ee_site=site,
         mass=model.body_mass[model.jnt_bodyid].copy(),

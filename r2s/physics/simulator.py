@@ -15,6 +15,7 @@ from numba import njit
 from r2s.physics import native_friction as native
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import SoftLimits
+from r2s.physics.rigid_body import principal_axes, put_links
 from r2s.physics.robot import SIM_DT, Robot
 
 
@@ -50,10 +51,7 @@ class Simulator:
         With repeat > 1 each of the given dynamics goes to that many consecutive arms.
         """
         arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
-        moments, axes = np.linalg.eigh(dynamics.inertia)
-        axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]  # a rotation, not a reflection
-        mass = self.robot.mass if dynamics.mass is None else dynamics.mass
-        com = self.robot.com if dynamics.com is None else dynamics.com
+        moments, axes = principal_axes(dynamics.inertia)
 
         def spread(a: np.ndarray, without: int) -> np.ndarray:
             return np.repeat(a, repeat, axis=0) if a.ndim > without and repeat > 1 else a
@@ -62,9 +60,9 @@ class Simulator:
         self._user[arms, :, : native.Q_LOW] = spread(_law_columns(self.robot, self.model, dynamics), 2)
         self._damping[arms] = self.model.dof_damping
         self._inertia[at] = spread(moments, 2)
-        self._iquat[at] = spread(_quaternions(axes), 2)
-        self._mass[at] = spread(mass, 1)
-        self._com[at] = spread(com, 2)
+        self._iquat[at] = spread(axes, 2)
+        self._mass[at] = spread(dynamics.mass, 1)
+        self._com[at] = spread(dynamics.com, 2)
         self.batch.set_const(ids)
 
     def set_soft_limits(self, limits: SoftLimits) -> None:
@@ -72,17 +70,17 @@ class Simulator:
         self._user[:, :, native.Q_LOW :] = _soft_columns(limits)
 
     def reset(
-        self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, turn: np.ndarray | float = 0.0
+        self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, bristle: np.ndarray | float = 0.0
     ) -> None:
         """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics.
 
-        turn (m, n) in [-1, 1] is what friction with a memory remembers: how far its bristles are bent.
+        bristle (m, n) in [-1, 1] is what friction with a memory remembers: how far its bristles are bent.
         """
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         at = slice(None) if ids is None else ids
         self.q[at] = q
         self.dq[at] = dq
-        self._memory[at] = turn
+        self._memory[at] = bristle
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 
@@ -139,52 +137,38 @@ def single_arm(robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None)
     """Return one arm's model with its links, its friction law and the driver's soft limits in it, without gravity."""
     native.install()
     model = robot.model(gravity=False, user=native.WIDTH)
-    moments, axes = np.linalg.eigh(dynamics.inertia)
-    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
-    at = model.jnt_bodyid
-    model.body_inertia[at], model.body_iquat[at] = moments, _quaternions(axes)
-    model.body_mass[at] = robot.mass if dynamics.mass is None else dynamics.mass
-    model.body_ipos[at] = robot.com if dynamics.com is None else dynamics.com
     model.jnt_user[:, : native.Q_LOW] = _law_columns(robot, model, dynamics)
     if soft is not None:
         model.jnt_user[:, native.Q_LOW :] = _soft_columns(soft)
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    put_links(model, dynamics.mass, dynamics.com, dynamics.inertia)
     return model
 
 
 def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
     """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
     f = native
-    mass = robot.mass if d.mass is None else d.mass
-    moment = mass[..., None] * (robot.com if d.com is None else d.com)
-    load = np.zeros(robot.n) if d.load is None else d.load
-    drag = np.zeros((robot.n, 2)) if d.drag is None else d.drag
-    arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], load, drag[..., 0])
+    moment, nominal = d.mass[..., None] * d.com, robot.mass[:, None] * robot.com
+    errors = d.mass - robot.mass, moment - nominal
+    arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
     rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
-    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, d.family.code
+    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family)
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
     rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
-    rows[..., f.DQ_MIN], rows[..., f.DAMPING] = d.dq_min, model.dof_damping
-    rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = drag
-    rows[..., f.LOAD], rows[..., f.BODY] = load, model.jnt_bodyid
+    rows[..., f.DQ_MIN] = 0.0 if d.family.has_memory else d.dq_min  # which holds by itself: no dead zone
+    rows[..., f.DAMPING] = model.dof_damping
+    rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = d.drag
+    rows[..., f.LOAD], rows[..., f.BODY] = d.load, model.jnt_bodyid
     rows[..., f.STEP] = model.opt.timestep
-    nominal = robot.mass[:, None] * robot.com
-    rows[..., f.MASS_ERROR] = mass - robot.mass
-    rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = moment - nominal
+    rows[..., f.MASS_ERROR] = errors[0]
+    rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = errors[1]
     rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
-    rows[..., f.LINK] = d.load is not None or d.mass is not None or d.com is not None
+    # an arm in which links differ from nominal, or load counts, sums them up at every step; others are spared that
+    differs = (d.load != 0) | (errors[0] != 0) | (errors[1] != 0).any(-1)
+    rows[..., f.LINK] = differs.any(-1, keepdims=True)
     return rows
 
 
 def _soft_columns(limits: SoftLimits) -> np.ndarray:
     """Return the columns of `jnt_user` that are soft limits, (n, WIDTH - Q_LOW)."""
     return np.stack([limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain], -1)
-
-
-def _quaternions(rotation: np.ndarray) -> np.ndarray:
-    """Return (..., 4) w x y z for rotation matrices (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(scalar_first=True)
-    return flat.reshape(*rotation.shape[:-2], 4)

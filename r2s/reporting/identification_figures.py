@@ -9,7 +9,6 @@ import pandas as pd
 from scipy.signal import butter, freqz_sos
 
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import SIM_DT
 from r2s.reporting.colours import colours
 from r2s.reporting.figures import clock_of, joint_panels, log_axis, panels, thin
@@ -105,7 +104,7 @@ def friction_figure(
                 curve = d.friction(speed)[:, j]
                 axis.plot(speed[:, j], curve, color=colour[label], label=label)
                 seen.append(curve)
-                if np.any(d.breakaway[j]) and d.family != BRISTLE:
+                if np.any(d.breakaway[j]) and not d.family.has_memory:
                     mark = {"marker": "_", "markersize": 14, "markeredgewidth": 2, "linewidth": 1, "linestyle": ":"}
                     axis.plot([0, 0], d.breakaway[j], color=colour[label], label=f"breakaway, {label}", **mark)
                     seen.append(d.breakaway[j])

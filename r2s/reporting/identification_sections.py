@@ -1,6 +1,6 @@
 """Tables of an identification's report: the paper's tables I to IV for this arm, other terms, families."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -9,18 +9,11 @@ from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import WHOLE_ARM
 from r2s.identification.uncertainty import Identified
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
 from r2s.reporting.identification_tables import Value, named, per_joint, values
 from r2s.reporting.tables import number
 
-FORMULAS = {
-    "sigmoid": "phi1 (s(phi2 (v + phi3)) - s(phi2 phi3)) + viscous v, s the logistic function: eq. (5)",
-    "coulomb": "coulomb (1 ± asymmetry) sign(v) + viscous v",
-    "stribeck": "coulomb (1 ± asymmetry) (1 + rise exp(-(v / stribeck_velocity)²)) sign(v) + viscous v",
-    "bristle": "Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
-}
 TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2), "Iyz": (1, 2)}
 
 
@@ -44,8 +37,8 @@ def offset_table(robot: Robot, found: Identified) -> list[Item]:
 def breakaway_table(robot: Robot, nominal: Dynamics, found: Identified, commanded: bool) -> list[Item]:
     """Return the paper's Table II: edges of the dead zone, of command and offset together."""
     d = found.dynamics
-    if d.family == BRISTLE:
-        return _held_by_bristles(robot, found)
+    if d.family.held is not None:
+        return _held_by_bristles(robot, found, d.family.held)
     if not commanded:
         return ["Nominal: a link-side sensor does not feel at which torque of the motor a joint lets go."]
     old = nominal.breakaway
@@ -75,16 +68,11 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: Identified, commande
     return [how, per_joint(robot, columns)] if np.any(old) or np.any(d.breakaway) else [how]
 
 
-def _held_by_bristles(robot: Robot, found: Identified) -> list[Item]:
-    """Return Table II of the family that needs no dead zone: its level at rest."""
-
-    def edges(d: Dynamics) -> np.ndarray:
-        level, asymmetry, rise = (d.phi[..., k] for k in (0, 1, 3))
-        return np.stack([-level * (1 - asymmetry), level * (1 + asymmetry)], -1) * (1 + rise[..., None])
-
+def _held_by_bristles(robot: Robot, found: Identified, held: Callable[[np.ndarray], np.ndarray]) -> list[Item]:
+    """Return Table II of a family that needs no dead zone: what it `held` at rest."""
     space = found.space
-    low, high = np.quantile(edges(space.dynamics(found.found.samples)), [0.025, 0.975], axis=0)
-    old, new = edges(space.dynamics(space.start)), edges(found.dynamics)
+    low, high = np.quantile(held(space.dynamics(found.found.samples).phi), [0.025, 0.975], axis=0)
+    old, new = held(space.dynamics(space.start).phi), held(found.dynamics.phi)
     columns: dict[str, list[str]] = {}
     for side, word in enumerate(("negative", "positive")):
         rows = [Value(*v) for v in zip(old[:, side], new[:, side], low[:, side], high[:, side], strict=True)]
@@ -118,24 +106,23 @@ def inertia_tables(robot: Robot, found: Identified) -> list[Item]:
     words = "Tensor about each link's centre of mass, link axes, 10⁻³ kg m², old → new."
     items: list[Item] = [words, per_joint(robot, tensors, "link")]
     if full:
-        columns = {"mass, kg": cells(lambda x: robot.mass if x.mass is None else x.mass, LINK[:1])}
+        columns = {"mass, kg": cells(lambda x: x.mass, LINK[:1])}
         for k, axis in enumerate("xyz"):
-            get = lambda x, k=k: 1e3 * (robot.com if x.com is None else x.com)[..., k]  # noqa: E731
-            columns[f"centre {axis}, mm"] = cells(get, LINK[7 + k :])  # t is seen through an upper triangle
+            # t is seen through an upper triangle
+            columns[f"centre {axis}, mm"] = cells(lambda x, k=k: 1e3 * x.com[..., k], LINK[7 + k :])
         words = (
             "Mass and centre of mass in the link's frame, old → new. A value is known (no ?) where all of the "
             "parameters behind it are."
         )
-        return [words, per_joint(robot, columns, "link"), *items, _physical(d, robot)]
+        return [words, per_joint(robot, columns, "link"), *items, _physical(d)]
     scales = per_joint(robot, _listed(values(space, found.found, "inertia_scale", found.unseen)), "link")
-    return ["Scale of each link's published tensor.", scales, *items, _physical(d, robot)]
+    return ["Scale of each link's published tensor.", scales, *items, _physical(d)]
 
 
-def _physical(d: Dynamics, robot: Robot) -> str:
+def _physical(d: Dynamics) -> str:
     """Return a sentence: which links are none that mass could have (Wensing, Kim and Slotine, RA-L 3(1), 2018)."""
     second = 0.5 * np.trace(d.inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - d.inertia
-    mass = robot.mass if d.mass is None else d.mass
-    wrong = np.flatnonzero((np.linalg.eigvalsh(second).min(-1) < 0) | (mass <= 0)) + 1
+    wrong = np.flatnonzero((np.linalg.eigvalsh(second).min(-1) < 0) | (d.mass <= 0)) + 1
     if not len(wrong):
         return (
             "Every link is physical: positive mass, and a tensor of positive moments within the triangle inequality."
@@ -156,7 +143,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: Identified, fastest: 
     columns["level at the\nfastest, Nm"] = [Value(*v).cell for v in rows]
     columns["fastest\nrad/s"] = [number(v) for v in fastest]
     words = (
-        f"Family {d.family.name}: {FORMULAS.get(d.family.name, '')}. Its parameters trade off against each other; "
+        f"Family {d.family.name}: {d.family.formula}. Its parameters trade off against each other; "
         "the level is what they make together, at the fastest speed of the held-out motion."
     )
     if nominal.family != d.family:

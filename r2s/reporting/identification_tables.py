@@ -8,9 +8,8 @@ import pandas as pd
 from rich.console import Console
 
 from r2s.identification.link_inertia import LINK, inertia_scale
-from r2s.identification.parameters import UNITS, WHOLE_ARM, Estimate, ParameterSpace
+from r2s.identification.parameters import WHOLE_ARM, Estimate, ParameterSpace, units
 from r2s.identification.uncertainty import SHARPER, Identified
-from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import Robot
 from r2s.reporting.document import UNSEEN
 from r2s.reporting.tables import number, print_table
@@ -63,7 +62,8 @@ def values(space: ParameterSpace, found: Estimate, block: str, unseen: Sequence[
 
 def named(block: str) -> str:
     """Return the title of a block's column, with its unit."""
-    return block if UNITS[block] == "1" else f"{block}\n{UNITS[block]}"
+    unit = units()[block]
+    return block if unit == "1" else f"{block}\n{unit}"
 
 
 def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
@@ -86,7 +86,7 @@ def identification_tables(robot: Robot, identified: Identified, summary: Mapping
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, identified)
     edges = identified.dynamics.breakaway
-    if np.any(edges) and identified.dynamics.family != BRISTLE:  # bristles hold without a dead zone
+    if np.any(edges) and not identified.dynamics.family.has_memory:  # bristles hold without a dead zone
         shown = {f"joint {j + 1}": [number(edge) for edge in edges[j]] for j in range(robot.n)}
         tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(["negative", "positive"], name="edge"))
     return tables | error_tables(robot, summary)
@@ -98,10 +98,8 @@ def _links(robot: Robot, identified: Identified) -> pd.DataFrame:
     before, after, draws = (space.dynamics(x) for x in (space.start, identified.x, identified.found.samples))
 
     def each(d):
-        mass = robot.mass if d.mass is None else d.mass
-        com = robot.com if d.com is None else d.com
-        shift = 1e3 * np.linalg.norm(com - (robot.com if before.com is None else before.com), axis=-1)
-        return mass, shift, inertia_scale(d.inertia, before.inertia)
+        shift = 1e3 * np.linalg.norm(d.com - before.com, axis=-1)
+        return d.mass, shift, inertia_scale(d.inertia, before.inertia)
 
     (mass, _, _), found = each(before), each(after)
     spans = [np.quantile(part, [0.025, 0.975], axis=0) for part in each(draws)]
