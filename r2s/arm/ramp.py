@@ -11,7 +11,7 @@ import numpy as np
 from r2s.arm.interface import Arm, ArmState
 from r2s.errors import UserError
 from r2s.identification.breakaway import MOVED
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.robot import SIM_DT, Robot, per_joint
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
@@ -68,8 +68,8 @@ def ramp(
     robot = arm.robot
     places = _poses(robot, poses)
     small = np.minimum(1.0, robot.tau_max / 12)
-    rising = _per_joint("rate", rate, np.where(robot.tau_max >= BIG, 2.2, 4.0 * small), 0.1 * robot.dtau_max)
-    limit = _per_joint("largest", largest, 0.2 * robot.tau_max, robot.tau_max)
+    rising = _positive("rate", rate, np.where(robot.tau_max >= BIG, 2.2, 4.0 * small), 0.1 * robot.dtau_max)
+    limit = _positive("largest", largest, 0.2 * robot.tau_max, robot.tau_max)
     if not 1e-4 <= moved <= 0.02:
         raise UserError(f"ramp.moved={moved} rad, allowed 0.0001 to 0.02")
     # a joint rests while the others are ramped one way, before its turn comes the other way
@@ -203,15 +203,10 @@ def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.nd
     return places
 
 
-def _per_joint(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
+def _positive(name: str, value, default: np.ndarray, most: np.ndarray) -> np.ndarray:
     """Return (n,) numbers above 0 and up to `most` (n,)."""
-    try:
-        array = np.array(default if value is None else value, dtype=float)
-    except (TypeError, ValueError):
-        raise UserError(f"ramp.{name} is not a number, nor one for each of {len(default)} joints") from None
-    array = np.full(len(default), float(array)) if array.ndim == 0 else array
-    if array.shape != default.shape:
-        raise UserError(f"ramp.{name}: {array.size} values for {len(default)} joints")
+    n = len(default)
+    array = per_joint(f"ramp.{name}", default if value is None else value, n, f"{n} joints")
     good = (array > 0) & (array <= most)
     if not good.all():
         i = int(np.argmin(good))

@@ -66,8 +66,11 @@ def searched(
     Raises:
         UserError: a term without bounds.
     """
-    own, left_out = nominal.family.names, set(nominal.family.optional) - set(terms)
-    names = [name for name in own if name in bounds and name not in left_out]
+    left_out = set(nominal.family.optional) - set(terms)
+    own = [name for name in nominal.family.names if name not in left_out]
+    if not set(own) & set(bounds):
+        raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
+    names = [name for name in own if name in bounds]
     elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
     for term in terms:
         if term in elsewhere or term in optional_friction():

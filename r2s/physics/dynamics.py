@@ -99,7 +99,7 @@ def nominal_dynamics(
     """
 
     def joints(name: str, value: Sequence[float] | float) -> np.ndarray:
-        array = per_joint(name, value, robot.n, robot.name)
+        array = per_joint(name, value, robot.n, f"the {robot.n} joints of {robot.name}")
         if not np.all(np.isfinite(array)):
             raise UserError(f"{name}: {array.tolist()} has a value that is not finite")
         return array

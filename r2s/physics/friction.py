@@ -121,7 +121,7 @@ def _sigmoid_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.
     return p[0] * p[1] * s * (1.0 - s) + p[3]
 
 
-@njit
+@njit(cache=True)
 def _sigmoid_native(p, v, h, memory):
     x = p[1] * (v + p[2])
     e = np.exp(-abs(x))
@@ -158,7 +158,7 @@ def _coulomb_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.
     return p[0] * (1 + np.sign(dq) * p[1]) * (1 - sign**2) / WIDTH_DQ + p[2]
 
 
-@njit
+@njit(cache=True)
 def _coulomb_native(p, v, h, memory):
     sign = np.tanh(v / WIDTH_DQ)
     level = p[0] * (1.0 + np.sign(v) * p[1])
@@ -193,7 +193,7 @@ def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np
     return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2]
 
 
-@njit
+@njit(cache=True)
 def _stribeck_native(p, v, h, memory):
     sign = np.tanh(v / WIDTH_DQ)
     level = p[0] * (1.0 + np.sign(v) * p[1])
@@ -220,7 +220,7 @@ STRIBECK = Family(
 )
 
 
-@njit
+@njit(cache=True)
 def _bristle_native(p, v, h, memory):
     """Dahl 1968; LuGre without its own damping term: dz/dt = (v - |v| z) / presliding in place of the sign."""
     s = 1.0 if v > 0 else -1.0

@@ -53,7 +53,7 @@ def _either(number: int, own: Callable, others: Callable) -> Callable:
     """Return the compiled law that is `own` where it is asked for by its number, else `others`."""
     own = own if is_jitted(own) else njit(own)
 
-    @njit
+    @njit(inline="always")
     def law(asked, p, v, h, memory):
         if asked == number:
             return own(p, v, h, memory)

@@ -81,16 +81,19 @@ class Robot:
         return spec.compile()
 
 
-def per_joint(name: str, value: ArrayLike, n: int, arm: str) -> np.ndarray:
-    """Return (n,) floats: a value per joint of `arm`, or one for all.
+def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
+    """Return (n,) floats: a value per joint, or one for all.
 
     Raises:
-        UserError: `name` has another number of values.
+        UserError: `name` has another number of values, or none; `joints` says of what, as in "the 7 joints of panda".
     """
-    array = np.array(value, dtype=float)
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} is not a number, nor one for each of {joints}") from None
     array = np.full(n, float(array)) if array.ndim == 0 else array
     if array.shape != (n,):
-        raise UserError(f"{name}: {array.size} values for the {n} joints of {arm}")
+        raise UserError(f"{name}: {array.size} values for {joints}")
     return array
 
 
@@ -128,7 +131,7 @@ def load_robot(
     site = _end_effector(model, ee_site, path)
 
     def each(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
-        return per_joint(f"robot.{name}", fallback if value is None else value, n, path.name)
+        return per_joint(f"robot.{name}", fallback if value is None else value, n, f"the {n} joints of {path.name}")
 
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.pi))
