@@ -12,6 +12,7 @@ from torch import Tensor
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import SoftLimits
+from r2s.physics.rigid_body import put_links
 from r2s.physics.robot import Robot
 from r2s.tasks.reach import Task
 
@@ -33,15 +34,8 @@ class Oracle:
     def __init__(self, robot: Robot, task: Task, dynamics: Dynamics, move_s: float = 0.6):
         self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
         self._model = robot.model(gravity=False)
-        bodies = self._model.jnt_bodyid
-        for body, m, c, inertia in zip(bodies, dynamics.mass, dynamics.com, dynamics.inertia, strict=True):
-            moments, axes = np.linalg.eigh(inertia)
-            axes[:, 0] *= np.sign(np.linalg.det(axes))
-            self._model.body_mass[body], self._model.body_ipos[body] = m, c
-            self._model.body_inertia[body] = moments
-            mujoco.mju_mat2Quat(self._model.body_iquat[body], axes.ravel())
+        put_links(self._model, dynamics.mass, dynamics.com, dynamics.inertia)
         self._data = mujoco.MjData(self._model)
-        mujoco.mj_setConst(self._model, self._data)
         self._site = self._model.site(robot.ee_site).id
         self._torque = task.torque(robot)
         self._soft = SoftLimits.of(robot, self._torque)
