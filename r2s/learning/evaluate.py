@@ -10,7 +10,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.tasks.episode import Acts, Episodes
 from r2s.tasks.reach import Task, sample_goals
-from r2s.tasks.rewards import PAPER
+from r2s.tasks.rewards import PAPER, terms
 
 GOAL_SEED = 7_000_000  # goals, starts and draws of every evaluation; trainings use their own seeds
 
@@ -39,15 +39,18 @@ def make_evaluation(
         env.place(starts, goals)
         state = env.read()
         rows: dict[str, list[np.ndarray]] = {k: [] for k in ("q", "dq", "ee", "tau", "distance", "reward")}
+        before, distance0 = env.sim.dq.copy(), np.maximum(np.linalg.norm(goals - env.sim.ee, axis=-1), 1e-3)
         for _ in range(task.steps):
             state["action"] = policy.action(state["observation"])
             state = env._step(state)
+            dq, distance = env.sim.dq.copy(), np.linalg.norm(goals - env.sim.ee, axis=-1)
             rows["q"].append(env.sim.q.copy())
-            rows["dq"].append(env.sim.dq.copy())
+            rows["dq"].append(dq)
             rows["ee"].append(env.sim.ee.copy())
             rows["tau"].append(env.actuation.last.copy())
-            rows["distance"].append(state["distance"].numpy()[:, 0].astype(float))
-            rows["reward"].append(state["reward_terms"].numpy() @ PAPER)
+            rows["distance"].append(distance)
+            rows["reward"].append(terms(distance, distance0, dq, (dq - before) * task.ctrl_hz) @ PAPER)
+            before = dq
         t = (1 + np.arange(task.steps)) / task.ctrl_hz
         return Episodes(t=t, goal=goals, **{k: np.stack(v, 1) for k, v in rows.items()})
 
