@@ -23,12 +23,12 @@ from rich.table import Table
 
 from r2s.arm.twin import Twin
 from r2s.learning import randomization
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.learning.tqc import TQC
 from r2s.learning.train import keep_memory, products
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
-from r2s.tasks.reach import Task, observation_scale
+from r2s.tasks.reach import ReachTask
 
 REPEATS = 15
 
@@ -67,14 +67,14 @@ def friction(robot, dynamics, threads: int) -> tuple[float, float]:
 
 def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
-    arms, steps, task = 32, 50, Task(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
+    arms, steps, task = 32, 50, ReachTask(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
 
     spread = {k: v for k, v in conf("dr/paper").items() if k != "name"}
 
     def draw(rng, m):
         return randomization.draw(rng, dynamics, m, **spread)
 
-    env = ReachEnv(robot, task, draw, arms, nthread=threads, stagger=True)
+    env = TaskEnv(robot, task, draw, arms, nthread=threads, stagger=True)
     state = env.reset()
     action = env.action_spec.rand()
     bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)
@@ -106,7 +106,7 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     from torchrl.objectives import SoftUpdate, TQCLoss
 
     torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, b = len(mean), robot.n, 256
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
     with products(matmul):
@@ -194,7 +194,7 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
     torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, count = len(mean), robot.n, 50
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
     with products(matmul):

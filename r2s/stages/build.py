@@ -30,10 +30,10 @@ def make_dynamics(cfg, robot):
 
 def make_task(cfg):
     """Return conf/task."""
-    from r2s.tasks.reach import Task
+    from r2s.tasks.reach import ReachTask
 
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items()}
-    return Task(**settings)  # type: ignore[arg-type]
+    return ReachTask(**settings)  # type: ignore[arg-type]
 
 
 def make_draw(cfg, robot, center):

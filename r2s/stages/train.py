@@ -27,15 +27,14 @@ def train(cfg, overrides):
 
     from r2s.errors import UserError
     from r2s.learning.checkpoint import Checkpoint
-    from r2s.learning.env import ReachEnv
-    from r2s.learning.evaluate import make_evaluation
+    from r2s.learning.env import TaskEnv
+    from r2s.learning.evaluate import make_evaluation, selection_score
     from r2s.learning.policy import export_onnx, load_policy, save_policy
     from r2s.learning.train import Budget, check_loop
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.reach import observation_scale
     from r2s.tasks.rewards import curriculum
 
     if cfg.algo.name == "oracle":
@@ -50,10 +49,10 @@ def train(cfg, overrides):
     loop = {k: settings.pop(k) for k in LOOP}
     check_loop(**loop)
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
-    env = ReachEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
+    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
     torque = torch.from_numpy(task.torque(robot))
-    mean, std = (torch.from_numpy(s) for s in observation_scale(robot, task))
+    mean, std = (torch.from_numpy(s) for s in task.observation_scale(robot))
     algo = learner(name)((mean, std), torque, **settings).to(device(cfg))
     weights = partial(curriculum, **plain(cfg.reward))
     best: dict = {}
@@ -62,7 +61,7 @@ def train(cfg, overrides):
     def is_best(row):
         nonlocal best, last
         last = row
-        better = not best or worth(row) >= worth(best)
+        better = not best or selection_score(row) >= selection_score(best)
         best = row if better else best
         return better
 
@@ -110,24 +109,18 @@ def train(cfg, overrides):
     print(f"written: {run.folder}")
 
 
-def worth(row):
-    """Return what makes one evaluation better than another: 1 % more within 1 cm is worth 1 of the return."""
-    return 100 * row["success_1cm"] + row["return_paper"]
-
-
 def reference(cfg, overrides):
     """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.episode import measures
 
     robot, task = make_robot(cfg), make_task(cfg)
     draw = make_draw(cfg, robot, make_dynamics(cfg, robot))
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
         done = evaluate(oracle(cfg, robot, task))
-        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(done)
+        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | task.measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
         pages.transfer(run, robot, {"oracle": done}, {"oracle": row}, task.torque(robot))
