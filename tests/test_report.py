@@ -31,7 +31,7 @@ from r2s.reporting import pages, viewer
 from r2s.reporting.colours import colours
 from r2s.reporting.document import UNSEEN, report_html, report_markdown
 from r2s.reporting.doubts import _grouped
-from r2s.reporting.figures import clock_of
+from r2s.reporting.figures import without_pauses
 from r2s.reporting.identification_figures import (
     _running,
     autocorrelation,
@@ -433,7 +433,7 @@ def test_seconds_of_a_resumed_run_go_on():
 
 
 def test_pauses_are_cut_short():
-    clock, pauses = clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
+    clock, pauses = without_pauses(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
     assert pauses.tolist() == [3, 5]
 

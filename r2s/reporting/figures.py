@@ -57,7 +57,7 @@ def thin(count: int, most: int = MOST_POINTS) -> slice:
     return slice(None, None, max(1, -(-count // most)))
 
 
-def clock_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
 
     A pause is a step of more than five usual ones, or a clock that starts again.
