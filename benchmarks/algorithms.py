@@ -16,8 +16,10 @@ import numpy as np
 import pandas as pd
 from common import MACHINE, ROOT, markdown, side_by_side
 
-from r2s.reporting.comparison import groups, improvement_table, read_runs, sensitivity_table, summary_table
+from r2s.reporting.comparison import improvement_table, sensitivity_table, summary_table
+from r2s.reporting.grouping import group
 from r2s.reporting.tables import scores_rows
+from r2s.reporting.trainings import read_trainings
 
 ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
 SEEDS = range(20, 25)
@@ -105,7 +107,7 @@ def sensitivity() -> list[str]:
     folders = [str(train / name) for name in trial_jobs() if name.startswith("trial") and (train / name).is_dir()]
     if not folders:
         return ["Not run."]
-    grouped, out, least = groups(read_runs(folders)), [], {}
+    grouped, out, least = group(read_trainings(folders)[0]).members, [], {}
     for measure, title, scale in (("success_1cm", "< 1 cm, %", 100), ("return_paper", "return", 1)):
         table = sensitivity_table(grouped, measure).set_index("algo")
         least[title] = table["spread"].idxmin()
@@ -156,8 +158,8 @@ def main() -> None:
     shutil.rmtree(ROOT / "runs" / "compare" / "algorithms", ignore_errors=True)
     subprocess.run([sys.executable, "run.py", "stage=compare", "runs=runs/train/algo_*", name], cwd=ROOT, check=True)
     shutil.copy(ROOT / "runs/compare/algorithms/figures/learning.png", ROOT / "docs/algorithms.png")
-    by_algorithm = {g[0].algo: g for g in groups(read_runs(folders)).values()}
-    by_reward = {"tqc, reward=paper": read_runs(paper)} if paper else {}
+    by_algorithm = {g[0].algo: g for g in group(read_trainings(folders)[0]).members.values()}
+    by_reward = {"tqc, reward=paper": read_trainings(paper)[0]} if paper else {}
     times = {
         label: {mark: reached(runs, *what) for mark, what in MARKS.items()}
         for label, runs in (by_algorithm | by_reward).items()

@@ -70,7 +70,7 @@ def markdown(table: pd.DataFrame) -> str:
         ["---"] * len(head),
         *([str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)),
     ]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(line).replace("\n", " ") + " |" for line in lines)
 
 
 __all__ = [

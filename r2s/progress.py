@@ -1,37 +1,60 @@
-"""A line that says how far, how fast and how long still."""
+"""How far long work is, how long it took and how long it still takes."""
 
-import sys
+import atexit
 import time
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from rich.table import Column
 
 
 class Progress:
-    """A line that says how far, how fast, how long still; rewritten on a terminal, now and then elsewhere."""
+    """On a terminal a bar in one line; elsewhere a plain line every `every_s` seconds."""
 
     def __init__(self, label: str, every_s: float = 10.0):
-        self._label, self._began, self._shown = label, time.perf_counter(), 0.0
-        self._live = sys.stderr.isatty()
-        self._every = 0.2 if self._live else every_s
-        self._width = 0
+        self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
+        self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+        self._bar: Bar | None = None
+        if self._console.is_terminal:
+            text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=True, ratio=1))
+            times = TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left")
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(20),
+                TaskProgressColumn(),
+                *times,
+                text,
+            )
+            # drawn by calls alone: a question to the operator stands while nothing moves
+            quiet = {"auto_refresh": False, "redirect_stdout": False, "transient": True}
+            self._bar = Bar(*columns, console=self._console, expand=True, **quiet)  # type: ignore[arg-type]
+            self._task = self._bar.add_task(label, total=1.0, text="")
+            self._bar.start()
+            atexit.register(self._bar.stop)  # work that fails leaves its error and the cursor
 
     def __call__(self, share: float, text: str = "") -> None:
-        """Show that `share` of the work is done, with a rate or result in `text`."""
+        """Show that `share` (0 to 1) of the work is done, with a rate or result in `text`."""
         now = time.perf_counter()
-        if now - self._shown < self._every:
+        if now - self._shown < (0.2 if self._bar else self._every):
             return
         self._shown = now
-        elapsed = now - self._began
-        left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
-        line = f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}".rstrip()
-        if self._live:
-            self._width = max(self._width, len(line))
-            print("\r" + line.ljust(self._width)[:180], end="", file=sys.stderr, flush=True)
+        if self._bar:
+            self._bar.update(self._task, completed=share, text=text, refresh=True)
         else:
-            print(line, file=sys.stderr, flush=True)
+            elapsed = now - self._began
+            left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
+            self._say(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:
-        """End the line with what came of it."""
-        line = f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}".rstrip()
-        print(("\r" + line.ljust(self._width)) if self._live else line, file=sys.stderr, flush=True)
+        """End with what came of it."""
+        if self._bar:
+            self._bar.stop()
+            atexit.unregister(self._bar.stop)
+        self._say(f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}")
+
+    def _say(self, line: str) -> None:
+        self._console.print(line.rstrip())
 
 
 def clock(seconds: float) -> str:

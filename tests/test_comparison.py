@@ -1,54 +1,212 @@
 """What can be said of several trainings, against hand calculations and known distributions."""
 
 import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from hydra import compose, initialize_config_dir
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+from omegaconf import OmegaConf
 
 from r2s.errors import UserError
-from r2s.reporting.comparison import band, groups, improvement_table, read_runs, sensitivity_table, summary_table
+from r2s.reporting.colours import KNOWN, OTHERS, colours
+from r2s.reporting.comparison import (
+    band,
+    improvement_matrix,
+    improvement_table,
+    sensitivity_table,
+    summary_table,
+)
+from r2s.reporting.grouping import LONGEST, group
 from r2s.reporting.statistics import improvement, interquartile_mean, interval
+from r2s.reporting.trainings import comparable, in_words, read_trainings
+from r2s.stages.build import CONF
+
+ROOT = Path(__file__).parent.parent
 
 
-def write_run(folder, seed, lr, score, algo="tqc", status="done", extra=""):
-    """Write a run folder with three evaluations that end at a return of `score`."""
+@cache
+def composed(*overrides):
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def write_run(folder, *overrides, score=-90.0, status="done", env_steps=600_000, stage="train"):
+    """Write a run folder of the real config with three evaluations that end at a return of `score`."""
     folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(
-        f"seed: {seed}\nname: {folder.name}\nalgo: {{name: {algo}, lr: {lr}{extra}}}\ndr: {{name: around}}\n"
-    )
-    (folder / "meta.json").write_text(json.dumps({"status": status}))
+    cfg = composed(*(o for o in overrides if not o.startswith("seed=")))
+    cfg.seed = next((int(o.removeprefix("seed=")) for o in overrides if o.startswith("seed=")), 0)
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    (folder / "overrides.yaml").write_text("".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n")
+    (folder / "meta.json").write_text(json.dumps({"status": status, "stage": stage}))
     (folder / "summary.json").write_text("{}")
-    table = {"env_steps": [10, 20, 30], "updates": [1, 2, 3], "wall_clock_s": [5.0, 10.0, 15.0 + seed]}
-    table |= {k: [0.0, 0.5, 1.0] for k in ("success_2cm", "success_1cm", "success_5mm")}
-    table |= {"distance_median_m": [0.1, 0.05, 0.01], "return_paper": [score - 20.0, score - 10.0, score]}
+    rows = [1, 2, 3] if env_steps else [1]
+    at = np.array([env_steps // 3 * k for k in rows])
+    table = {"env_steps": at, "updates": at // 32, "wall_clock_s": [5.0 * k + cfg.seed * (k == 3) for k in rows]}
+    table |= {k: [0.0, 0.5, 1.0][-len(rows) :] for k in ("success_2cm", "success_1cm", "success_5mm")}
+    table |= {"distance_median_m": 0.1 / np.array(rows), "return_paper": [score + 10 * (k - rows[-1]) for k in rows]}
     pd.DataFrame(table).to_csv(folder / "evaluations.csv", index=False)
 
 
-@pytest.fixture
-def runs(tmp_path):
-    """Two settings of tqc, one of td3 with a setting of its own, three seeds each, and what must not count."""
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two settings of tqc, one of td3, three seeds each, and what must not count."""
+    root = tmp_path_factory.mktemp("few")
     for seed in range(3):
-        write_run(tmp_path / f"a{seed}", seed, 1e-3, -80.0 - seed)
-        write_run(tmp_path / f"b{seed}", seed, 1e-4, -100.0 - seed)
-        write_run(tmp_path / f"c{seed}", seed, 5e-4, -90.0 - seed, "td3", extra=", policy_delay: 2")
-    write_run(tmp_path / "stopped", 0, 1e-3, 0.0, status="running")
-    (tmp_path / "other").mkdir()
-    return read_runs(sorted(tmp_path.iterdir()))
+        write_run(root / f"a{seed}", f"seed={seed}", "algo.lr=1e-3", score=-80.0 - seed)
+        write_run(root / f"b{seed}", f"seed={seed}", "algo.lr=1e-4", score=-100.0 - seed)
+        write_run(root / f"c{seed}", f"seed={seed}", "algo=td3", score=-90.0 - seed)
+    write_run(root / "killed", status="running")
+    (root / "other").mkdir()
+    return root
 
 
-def test_groups_are_what_runs_differ_in(runs):
+@pytest.fixture(scope="module")
+def runs(folder):
+    return read_trainings(sorted(folder.iterdir()))[0]
+
+
+@pytest.fixture(scope="module")
+def grouped(runs):
+    return group(runs).members
+
+
+@pytest.fixture(scope="module")
+def user_folder(tmp_path_factory):
+    """What a user has after make run, a sweep, two identified trainings, a toy, an oracle and some accidents."""
+    root = tmp_path_factory.mktemp("user") / "runs" / "train"
+    own = [f"root={root.parent}", "stage=train", "threads=1", "budget.minutes=3.0"]
+    write_run(root / "2026-01-01_12-00-00_identified", *own, "calibration=runs/identify/2026-01-01_12-00-00")
+    write_run(root / "2026-01-01_12-00-00_nominal", *own, "friction=gaz2019", "inertia=nominal")
+    for k, algo in enumerate(("ddpg", "sac", "td3", "tqc")):
+        for seed in (0, 1):
+            write_run(root / f"{algo}{seed}", f"algo={algo}", f"seed={seed}", score=-100.0 + 10 * k + seed)
+    for k in (1, 2):
+        how = ("device=cpu", "compile=false", "identify.window_s=0.2", "data.seconds=5")
+        write_run(root / f"judge{k}", "algo=tqc", f"calibration=runs/identify/judge-{k}", "dr=identified", *how)
+    write_run(root / "paper", "dr=paper", "seed=2")
+    write_run(root / "certain", "dr=none")
+    write_run(root / "oracle", "algo=oracle", env_steps=0)
+    for name, more in {"toy": "+experiment=toy", "toy2": "+experiment=toy", "long": "budget.minutes=60"}.items():
+        write_run(root / name, more)
+    for name, more in {"quick": "task.episode_s=2", "fr3": "robot=fr3", "few": "evaluation.episodes=12"}.items():
+        write_run(root / name, more)
+    write_run(root / "died", status="failed")
+    write_run(root / "going", status="running")
+    write_run(root / "found", stage="identify")
+    (root / "notes").mkdir()
+    (root / "readme.txt").write_text("mine")
+    return root
+
+
+def test_groups_are_what_runs_differ_in(runs, grouped):
     """Seeds, names and unfinished runs make no group; settings that differ within an algorithm name it."""
     assert len(runs) == 9
-    found = groups(runs)
-    assert {k: len(v) for k, v in found.items()} == {"tqc, lr 0.001": 3, "tqc, lr 0.0001": 3, "td3, lr 0.0005": 3}
-    assert list(groups([r for r in runs if r.settings["algo.lr"] != 1e-4])) == ["tqc", "td3"]
+    assert {k: len(v) for k, v in grouped.items()} == {"tqc, lr=1e-3": 3, "tqc, lr=1e-4": 3, "td3": 3}
+    assert list(group([r for r in runs if r.settings["algo.lr"] != 1e-4]).members) == ["tqc", "td3"]
+    assert list(group([r for r in runs if r.settings["algo.lr"] == 1e-4]).members) == ["tqc"]
+
+
+def test_what_a_training_does_not_read_names_no_group(user_folder):
+    """Labels are short, made of what was typed and matters; defaults typed or not are one group."""
+    trained, _ = read_trainings(sorted(user_folder.iterdir()))
+    found = group(comparable(trained)[0])
+    names = {found.key.get(label, label): {r.folder.name for r in seeds} for label, seeds in found.members.items()}
+    assert names == {
+        "tqc, minutes=3.0, calibration=2026-01-01_12-00-00": {"2026-01-01_12-00-00_identified"},
+        "tqc, minutes=3.0, friction=gaz2019, inertia=nominal": {"2026-01-01_12-00-00_nominal"},
+        **{algo: {f"{algo}0", f"{algo}1"} for algo in ("ddpg", "sac", "td3")},
+        "tqc, dr=paper": {"tqc0", "tqc1", "paper"},
+        "tqc, calibration=judge-1, dr=identified": {"judge1"},
+        "tqc, calibration=judge-2, dr=identified": {"judge2"},
+        "tqc, dr=none": {"certain"},
+        "oracle": {"oracle"},
+    }
+    assert max(map(len, found.members)) <= LONGEST
+    assert set(found.key) == {"tqc #1", "tqc #2"}
+
+
+def test_settings_that_an_experiment_changed_name_a_group(tmp_path):
+    """Nothing was typed of them, and yet two groups never share a name."""
+    for k, lr in enumerate((1e-3, 1e-4)):
+        write_run(tmp_path / str(k), f"algo.lr={lr}")
+        (tmp_path / str(k) / "overrides.yaml").write_text("[]\n")
+    assert list(group(read_trainings(sorted(tmp_path.iterdir()))[0]).members) == ["tqc, lr=0.001", "tqc, lr=0.0001"]
+
+
+def test_runs_that_cannot_be_compared_are_set_apart_and_why_is_said(user_folder):
+    """Of several sets the largest is taken; what is no finished training is named as well."""
+    trained, others = read_trainings(sorted(user_folder.iterdir()))
+    runs, apart = comparable(trained)
+    assert len(runs) == 15
+    assert apart == {
+        "few": "another evaluation: evaluation.episodes is 12, not 200",
+        "fr3": "another robot: robot.q_min differs",
+        "long": "another budget: 60 min, not 3",
+        "quick": "another task: task.episode_s is 2, not 4.0",
+        "toy": "+experiment=toy",
+        "toy2": "+experiment=toy",
+    }
+    assert others["died"] == "failed"
+    assert others["going"] == "unfinished"
+    assert others["found"] == "stage=identify"
+    assert others["notes"] == others["readme.txt"] == "no run folder"
+    assert comparable([r for r in trained if r.toy])[1] == {}
+
+
+def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
+    """Table, key, what was set apart and left out; the legend leaves the figures room."""
+    command = [sys.executable, "run.py", "stage=compare", f"runs={user_folder}/*", f"root={tmp_path}", "name=all"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    *lines, written = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 110
+    assert "last evaluation" in lines[0]
+    text = " ".join(done.stdout.split())
+    for expected in (
+        "tqc #1 = tqc, minutes=3.0, calibration=2026-01-01_12-00-00",
+        "set apart, not comparable with these: toy, toy2 (+experiment=toy)",
+        "set apart, not comparable with these: long (another budget: 60 min, not 3)",
+        "left out, no finished trainings: died (failed); found (stage=identify); going (unfinished); "
+        "notes, readme.txt (no run folder)",
+    ):
+        assert expected in text
+    assert written.startswith("written:")
+    folder = tmp_path / "compare" / "all"
+    assert "_target_" not in (folder / "report.md").read_text()
+    scores = pd.read_csv(folder / "scores.csv")
+    assert scores["group"].nunique() == 10
+    for name in ("learning", "scores"):
+        height, width, _ = imread(folder / "figures" / f"{name}.png").shape
+        assert height < 0.7 * width, f"{name}: more legend than figure"
+
+
+def test_twelve_colours_differ_and_are_seen_on_white_and_black():
+    """Contrast of at least 2.4 by WCAG's formula; no two colours closer than 0.08 in OKLab."""
+    rgb = np.array([to_rgb(c) for c in (*KNOWN.values(), *OTHERS)])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    bright = linear @ (0.2126, 0.7152, 0.0722) + 0.05
+    assert np.all(1.05 / bright > 2.4)
+    assert np.all(bright / 0.05 > 2.4)
+    lms = linear @ np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]).T
+    lab = np.cbrt(lms) @ np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]).T
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1)
+    assert np.min(apart[np.triu_indices(len(lab), 1)]) > 0.08
+    assert len(set(colours([f"tqc, identified {k}" for k in range(12)]).values())) == 12
 
 
 def test_nothing_finished_is_one_line(tmp_path):
     """Folders without a finished training are a user's mistake."""
-    with pytest.raises(UserError, match=r"^runs: no finished run"):
-        read_runs([tmp_path])
+    write_run(tmp_path / "died", status="failed")
+    with pytest.raises(UserError, match=r"^runs: no finished run.*seen: died \(failed\)$"):
+        read_trainings([tmp_path / "died"])
+    assert in_words({f"{k}": "failed" for k in range(9)}) == ["0, 1, 2, 3 and 5 more (failed)"]
 
 
 def test_the_interquartile_mean_leaves_a_quarter_out_on_each_side():
@@ -78,18 +236,20 @@ def test_the_probability_of_improvement():
     assert improvement(x[0] + 1.0, x[1]) == pytest.approx(0.760, abs=0.02)  # Phi(1 / sqrt 2)
 
 
-def test_tables_say_what_was_put_in(runs):
+def test_tables_say_what_was_put_in(grouped):
     """Scores, their intervals within the seeds' range, who is better, and who depends on its settings."""
-    grouped = groups(runs)
     table = summary_table(grouped).set_index(["group", "measure"])
-    row = table.loc[("tqc, lr 0.001", "return_paper")]
+    row = table.loc[("tqc, lr=1e-3", "return_paper")]
     assert row["seeds"] == 3
     assert row["iqm"] == pytest.approx(-81.0)
     assert -82.001 <= row["low"] <= row["iqm"] <= row["high"] <= -79.999
-    better = improvement_table(grouped).set_index(["better", "than", "measure"])["probability"]
-    assert better["tqc, lr 0.001", "tqc, lr 0.0001", "return_paper"] == 1.0
-    assert better["tqc, lr 0.0001", "tqc, lr 0.001", "return_paper"] == 0.0
-    assert better["tqc, lr 0.001", "td3, lr 0.0005", "success_1cm"] == 0.5
+    pairs = improvement_table(grouped)
+    better = pairs.set_index(["better", "than", "measure"])["probability"]
+    square = improvement_matrix(pairs, "return_paper")
+    assert square.loc["1: tqc, lr=1e-3"].tolist() == ["-", "1.00", "1.00"]
+    assert better["tqc, lr=1e-3", "tqc, lr=1e-4", "return_paper"] == 1.0
+    assert better["tqc, lr=1e-4", "tqc, lr=1e-3", "return_paper"] == 0.0
+    assert better["tqc, lr=1e-3", "td3", "success_1cm"] == 0.5
     sensitivity = sensitivity_table(grouped).set_index("algo")
     assert list(sensitivity.index) == ["tqc"]
     assert sensitivity.loc["tqc", "best"] == pytest.approx(-81.0)
@@ -97,9 +257,9 @@ def test_tables_say_what_was_put_in(runs):
     assert sensitivity.loc["tqc", "spread"] == pytest.approx(10.0)
 
 
-def test_a_band_is_over_what_all_seeds_have(runs):
+def test_a_band_is_over_what_all_seeds_have(grouped):
     """The mean of the seeds' curves, between their lowest and highest, up to the end of the shortest."""
-    group = groups(runs)["tqc, lr 0.001"]
+    group = grouped["tqc, lr=1e-3"]
     at, (middle, low, high) = band(group, "wall_clock_s", "return_paper", points=5)
     assert (at[0], at[-1]) == (5.0, 15.0)
     assert low[0] == -102.0

@@ -1,6 +1,7 @@
 """What people read: figures that show something, tables that hold the numbers given, a recording to open."""
 
 import base64
+import os
 import re
 import subprocess
 import sys
@@ -31,7 +32,7 @@ from r2s.reporting import pages, viewer
 from r2s.reporting.colours import colours
 from r2s.reporting.document import UNSEEN, report_html, report_markdown
 from r2s.reporting.doubts import _grouped
-from r2s.reporting.figures import clock_of
+from r2s.reporting.figures import without_pauses
 from r2s.reporting.identification_figures import (
     _running,
     autocorrelation,
@@ -433,9 +434,41 @@ def test_seconds_of_a_resumed_run_go_on():
 
 
 def test_pauses_are_cut_short():
-    clock, pauses = clock_of(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
+    clock, pauses = without_pauses(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
     assert pauses.tolist() == [3, 5]
+
+
+PROGRESS = """
+from r2s.progress import Progress
+progress = Progress("train [tqc]")
+progress(0.25, "12k env steps, 50 % < 1 cm")
+"""
+
+
+def test_progress_is_plain_lines_where_nobody_watches():
+    """Share, elapsed and text; nothing that only a terminal understands."""
+    done = subprocess.run([sys.executable, "-c", PROGRESS + "progress.close('9 s')"], capture_output=True, text=True)
+    first, last = done.stderr.splitlines()
+    assert first.startswith("train [tqc]  25 %  0:00")
+    assert first.endswith("left  12k env steps, 50 % < 1 cm")
+    assert last == "train [tqc] done in 0:00  9 s"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+@pytest.mark.parametrize("end", ["progress.close('9 s')", "raise SystemExit(2)"])
+def test_progress_is_a_bar_on_a_terminal_and_gives_the_cursor_back(end):
+    """Also where the work fails."""
+    ours, theirs = os.openpty()
+    environment = os.environ | {"COLUMNS": "100", "TERM": "xterm"}
+    subprocess.run([sys.executable, "-c", PROGRESS + end], stderr=theirs, env=environment)
+    os.close(theirs)
+    text = os.read(ours, 100_000).decode()
+    os.close(ours)
+    assert "25%" in text
+    assert "12k env steps" in text
+    assert ("done in" in text) == ("close" in end)
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
 
 
 class Page(HTMLParser):

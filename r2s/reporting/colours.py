@@ -3,14 +3,18 @@
 from collections.abc import Iterable
 
 KNOWN = {"measured": "#9aa0a6", "nominal": "#f28e2b", "identified": "#3b8fe0"}
-OTHERS = ("#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#3fb8b0", "#b0745a")
+# twelve far apart in OKLab; WCAG's contrast to black and to white is at least 2.4
+OTHERS = (
+    "#3daa6d", "#d65f9e", "#9b7ede", "#c9a227", "#784800", "#005484",
+    "#cc0018", "#5400f0", "#007800", "#d800fc", "#607878", "#900c90",
+)  # fmt: skip
 
 
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
     measured, nominal and identified (also as a part of a label: "twin, nominal") have their own everywhere;
-    the others take theirs in order.
+    the others take theirs in order, twelve before one comes again.
     """
     found: dict[str, str] = {}
     others = 0

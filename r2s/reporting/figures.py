@@ -1,4 +1,4 @@
-"""Figures (PNG): learning, comparison of runs, transfer, and those of an identification."""
+"""What all figures (PNG) share: panels with one legend, axes, how many points a line has."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +16,10 @@ PAUSE = 0.1  # s on a figure's axis, for a pause of any length
 
 
 @contextmanager
-def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3) -> Iterator[list[Axes]]:
-    """Give `count` axes in a grid, with one legend for all, and save the figure to `path`."""
+def panels(
+    path: Path, count: int, columns: int, title: str, height: float = 2.3, key: str | None = None
+) -> Iterator[list[Axes]]:
+    """Give `count` axes in a grid, with one legend for all, headed by `key`, and save the figure to `path`."""
     rows = -(-count // columns)
     figure = Figure(figsize=(12, 0.9 + height * rows), dpi=DPI, layout="constrained")
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
@@ -31,7 +33,8 @@ def panels(path: Path, count: int, columns: int, title: str, height: float = 2.3
     if named:
         fit = max(1, LEGEND_WIDTH // (max(map(len, named)) + 6))
         columns = min(len(named), 6, fit)
-        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, frameon=False)
+        lines, labels = list(named.values()), list(named)
+        figure.legend(lines, labels, loc="outside lower center", ncols=columns, frameon=False, title=key)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
@@ -54,7 +57,7 @@ def thin(count: int, most: int = MOST_POINTS) -> slice:
     return slice(None, None, max(1, -(-count // most)))
 
 
-def clock_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
 
     A pause is a step of more than five usual ones, or a clock that starts again.

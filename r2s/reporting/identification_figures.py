@@ -11,7 +11,7 @@ from scipy.signal import butter, freqz_sos
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT
 from r2s.reporting.colours import colours
-from r2s.reporting.figures import clock_of, joint_panels, log_axis, panels, thin
+from r2s.reporting.figures import joint_panels, log_axis, panels, thin, without_pauses
 from r2s.reporting.tables import number
 
 LONGEST = 30.0  # s of torque in a figure: more is a solid band
@@ -26,7 +26,7 @@ def torque_figure(
 
     The first `LONGEST` seconds are drawn, pauses cut short; the RMSE in the titles is over everything.
     """
-    colour, (clock, pauses) = colours(["measured", *predicted]), clock_of(t)
+    colour, (clock, pauses) = colours(["measured", *predicted]), without_pauses(t)
     rows = np.flatnonzero(clock <= LONGEST)
     title += f" (the first {LONGEST:g} s of {clock[-1]:.0f} s)" if len(rows) < len(t) else ""
     rows = rows[thin(len(rows))]
@@ -193,7 +193,7 @@ def whiteness_figure(
 def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
     """Return (count, n): the correlation of x (T, n) with itself 0, 1, ... rows later, never across a pause of t."""
     x = x - x.mean(0)
-    edges = [0, *clock_of(t)[1], len(t)]
+    edges = [0, *without_pauses(t)[1], len(t)]
     total, pairs = np.zeros((count, x.shape[1])), np.zeros(count)
     for start, stop in pairwise(edges):
         own = x[start:stop]
@@ -210,7 +210,7 @@ def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.nda
     The filter is `Recording.smooth`'s. Sigma is Bartlett's (J. R. Stat. Soc. Suppl. 8(1), 1946) for far lags.
     """
     step = float(np.median(np.diff(t)))
-    edges = np.array([0, *clock_of(t)[1], len(t)])
+    edges = np.array([0, *without_pauses(t)[1], len(t)])
     longest = int(np.diff(edges).max())
     lags = np.arange(max(min(round(LAGS_S / step) + 1, longest // 2), 2))
     _, h = freqz_sos(butter(4, cutoff_hz, fs=1 / SIM_DT, output="sos"), worN=np.arange(8192) / 8192 * np.pi)

@@ -16,8 +16,9 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
-from r2s.reporting.comparison import Trained, groups, improvement_table, sensitivity_table, summary_table
+from r2s.reporting.comparison import improvement_matrix, improvement_table, sensitivity_table, summary_table
 from r2s.reporting.document import report_html, report_markdown
+from r2s.reporting.grouping import Groups
 from r2s.reporting.identification_figures import (
     convergence_figure,
     friction_figure,
@@ -133,36 +134,50 @@ def transfer(
     report_markdown(run.folder / "report.md", sections | {"Figures": [reach, *pictures.values()]})
 
 
-def compare(run: Run, robot: Robot, runs: Sequence[Trained]) -> dict[str, pd.DataFrame]:
+def compare(
+    run: Run, robot: Robot, grouped: Groups, apart: Mapping[str, str], others: Mapping[str, str]
+) -> dict[str, pd.DataFrame]:
     """Write what can be said of several trainings: tables as CSV, figures, a report and one recording.
+
+    Args:
+        run, robot: whose. grouped: what is compared. apart: {run: why it cannot be compared with these}.
+        others: {folder: why it is no finished training}.
 
     Returns:
         {"scores", "improvement", "sensitivity"}: tables of r2s/reporting/comparison.py.
     """
-    grouped = groups(runs)
-    tables = {"scores": summary_table(grouped), "improvement": improvement_table(grouped)}
-    tables["sensitivity"] = sensitivity_table(grouped)
-    last = {r.folder.name: {"group": label, "seed": r.seed} | r.last for label, g in grouped.items() for r in g}
+    groups = grouped.members
+    tables = {"scores": summary_table(groups), "improvement": improvement_table(groups)}
+    tables["sensitivity"] = sensitivity_table(groups)
+    last = {r.folder.name: {"group": label, "seed": r.seed} | r.last for label, g in groups.items() for r in g}
     pd.DataFrame.from_dict(last, orient="index").to_csv(run.folder / "last.csv", index_label="run")
     for name, table in tables.items():
         if len(table):
             table.to_csv(run.folder / f"{name}.csv", index=False)
     figures = {"learning": bands_figure(run.figure("learning"), grouped)}
     figures["scores"] = scores_figure(run.figure("scores"), tables["scores"])
-    curves = {r.folder.name: r.curve for r in runs}
+    curves = {f"{label}, seed {r.seed}": r.curve for label, g in groups.items() for r in g}
     write_recording(run.folder / "recording.rrd", robot, curves=curves, figures=figures)
     sections: dict[str, Sequence] = {
-        f"{len(runs)} runs in {len(grouped)} groups": [
-            "Interquartile mean over seeds of the last evaluation, with a 95 % bootstrap interval.",
+        f"{len(last)} runs in {len(groups)} groups, by their last evaluation": [
+            "Interquartile mean over seeds, with a 95 % bootstrap interval. A group is named by what was typed of "
+            "the settings that differ; what its name leaves out is the default.",
             scores_rows(tables["scores"]),
+            *([[f"{label}: {name}" for label, name in grouped.key.items()]] if grouped.key else []),
         ]
     }
-    if len(tables["improvement"]):
-        sections["Probability that a run of the one is better than a run of the other"] = [
-            tables["improvement"].round(3).astype(str).set_index("better")
+    if apart:
+        sections["Set apart: these cannot be compared with the runs above"] = [
+            [f"{k}: {v}" for k, v in apart.items()]
         ]
+    if others:
+        sections["No finished trainings"] = [[f"{k}: {v}" for k, v in others.items()]]
+    for measure, title in {"success_1cm": "success within 1 cm", "return_paper": "return"}.items():
+        if len(tables["improvement"]):
+            heading = f"Probability that a run of one group is better than a run of another: {title}, last evaluation"
+            sections[heading] = [improvement_matrix(tables["improvement"], measure)]
     if len(tables["sensitivity"]):
-        sections["How much the return depends on the settings (smaller spread: less to tune)"] = [
+        sections["How much the last return depends on the settings (smaller spread: less to tune)"] = [
             tables["sensitivity"].round(2).astype(str).set_index("algo")
         ]
     report_markdown(run.folder / "report.md", sections | {"Figures": list(figures.values())})

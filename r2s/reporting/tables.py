@@ -24,15 +24,20 @@ SUCCESS = {
 
 
 def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return one row of strings per group: interquartile mean [95 % interval] of each measure."""
+    """Return one row of strings per group: interquartile mean over [95 % interval] of each measure.
+
+    One seed has no interval.
+    """
     names = {m: title for m, title in SUCCESS.items() if m in set(table["measure"])}
-    names |= {"distance_median_m": "median distance, mm", "return_paper": "return"}
+    names |= {"distance_median_m": "median\ndistance, mm", "return_paper": "return"}
     out: dict[str, dict[str, str]] = {}
     for r in table.to_dict("records"):
         scale = 100 if r["measure"] in SUCCESS else 1e3 if r["measure"] == "distance_median_m" else 1
+        digits = 0 if r["measure"] in SUCCESS else 1
         cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
         middle, low, high = (scale * r[k] for k in ("iqm", "low", "high"))
-        cells[names[r["measure"]]] = f"{middle:.1f} [{low:.1f}, {high:.1f}]"
+        interval = f"\n[{low:.{digits}f}, {high:.{digits}f}]" if r["seeds"] > 1 else ""
+        cells[names[r["measure"]]] = f"{middle:.1f}{interval}"
     return pd.DataFrame.from_dict(out, orient="index").rename_axis("success within")
 
 
