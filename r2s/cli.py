@@ -187,13 +187,24 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             if {"-m", "--multirun"} & set(sys.argv[1:]):  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
-            job()
+            try:
+                job()
+            finally:
+                end_workers()
             lines = Path(folder) / "failed.txt"
             if lines.is_file():
                 count = len(lines.read_text().splitlines())
                 sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
+
+
+def end_workers():
+    """End the processes of a sweep that ran side by side: joblib would keep them for five minutes more."""
+    if "joblib" in sys.modules:
+        from joblib.externals.loky import get_reusable_executor
+
+        get_reusable_executor().shutdown(wait=True)
 
 
 def failed(error):

@@ -1,7 +1,14 @@
-"""What every test needs: the embedded Panda with the limits of conf/robot/panda.yaml, and the real recording."""
+"""What every test needs: the embedded Panda with the limits of conf/robot/panda.yaml, and the real recording.
 
+Also here: at the end of a session nothing that it started may still run.
+"""
+
+import os
+import time
+import uuid
 from pathlib import Path
 
+import psutil
 import pytest
 import yaml
 
@@ -9,6 +16,9 @@ from r2s.physics.robot import Robot, load_robot
 
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
+SESSION = "R2S_TEST_SESSION"  # every process that a session starts inherits this variable, whoever its parent is
+NAME = pytest.StashKey[str]()
+GRACE_S = 10.0  # a server that watches its parent needs a moment to see that it is gone
 
 
 def conf(path: str) -> dict:
@@ -19,3 +29,37 @@ def conf(path: str) -> dict:
 @pytest.fixture(scope="session")
 def panda() -> Robot:
     return load_robot(**conf("robot/panda"))
+
+
+def pytest_configure(config):
+    """Name the session, unless this is a worker of one or a run of pytest within a test."""
+    if SESSION not in os.environ:
+        os.environ[SESSION] = config.stash[NAME] = uuid.uuid4().hex
+
+
+def left_running(name: str) -> dict[psutil.Process, str]:
+    """Return the processes of session `name` besides this one, with their command lines."""
+    found = {}
+    for process in psutil.process_iter():
+        try:
+            if process.pid != os.getpid() and process.environ().get(SESSION) == name:
+                found[process] = " ".join(process.cmdline())
+        except psutil.Error:
+            pass  # gone meanwhile, or somebody else's
+    return found
+
+
+@pytest.hookimpl(wrapper=True, trylast=True)
+def pytest_sessionfinish(session):
+    """Fail a session that leaves processes behind, and end them."""
+    yield  # xdist ends its workers in here
+    if (name := session.config.stash.get(NAME, None)) is None:
+        return
+    deadline = time.monotonic() + GRACE_S
+    while (left := left_running(name)) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    for process, command in left.items():
+        line = f"\nstill running {GRACE_S:g} s after the last test: {process.pid} {command}"
+        session.config.get_terminal_writer().line(line, red=True)
+        process.kill()
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
