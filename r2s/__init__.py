@@ -1,7 +1,6 @@
 """r2s: from recordings of a torque-controlled arm to a policy that works on that arm.
 
-Read bottom-up: recording, robot, friction, parameters, simulator (data and physics);
-randomization, residual, identify, rewards, env (what is done with them); networks, tqc,
-train, evaluate (learning); engines, arm (the outside); runs, report, viewer (telling).
-A module imports only from floors below its own (tests/test_floors.py checks it).
+Each folder is a room; data flows through them in this order: recordings, excitation, identification, tasks, learning,
+engines, arm, reporting, with physics under all of them and stages on top. A module imports only from its own room and
+from rooms before it (tests/test_rooms.py). docs/architecture.md says what each room holds.
 """

@@ -1,1 +1,1 @@
-"""The arm itself, or what stands in for it: one protocol, a hidden twin, hardware adapters."""
+"""The arm itself or its twin behind one interface, the driver between policy and arm, and the real clients."""

@@ -1,1 +1,1 @@
-"""Other physics engines than the one trained in, behind one small interface: reset and step (interface.py)."""
+"""Other physics engines than the one trained in, behind one small interface."""

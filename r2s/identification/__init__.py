@@ -1,1 +1,1 @@
-"""Real2Sim: what the simulated arm must be to do what the recorded one did."""
+"""Real2Sim: the friction, inertia, offsets and delay with which a simulated arm moves as the recorded one did."""

@@ -1,1 +1,1 @@
-"""Policies: environment, randomization, algorithms, training, evaluation, and the model-based reference."""
+"""Policies: the training environment, randomization, one file per algorithm, the training loop, evaluation."""

@@ -1,1 +1,1 @@
-"""The arm and its physics: what it is, how it moves, what limits it. Needs no learning library."""
+"""The arm and its physics: links, friction, limits, and the simulator of many arms at once."""

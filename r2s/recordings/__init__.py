@@ -1,1 +1,1 @@
-"""Recordings of an arm, and how files of all kinds become one."""
+"""Recordings of an arm, and the readers that make one of any log file."""

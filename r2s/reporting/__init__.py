@@ -1,1 +1,1 @@
-"""What a person looks at: tables, pages, figures, the rerun recording, and the comparison of runs."""
+"""What a person looks at: tables, pages, figures, the rerun recording, the comparison of runs."""

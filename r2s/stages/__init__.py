@@ -1,1 +1,1 @@
-"""One file per stage; with build.py and the command line the only code that sees a config."""
+"""One file per stage. Stages and the command line are the only code that sees a config."""

@@ -1,1 +1,1 @@
-"""What is asked of an arm, and how it is judged."""
+"""What is asked of an arm, its reward, and how an episode is judged."""
