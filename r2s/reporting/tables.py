@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from r2s.reporting.document import _doubtful
+from r2s.reporting.document import doubtful
 
 SUCCESS = {
     "success_5cm": "5 cm, %",
@@ -100,5 +100,5 @@ def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str 
         table.add_column(str(column), justify="right")
     for label, row in frame.iterrows():
         cells = [escape(str(cell)) for cell in row]
-        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if _doubtful(c) else c for c in cells))
+        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if doubtful(c) else c for c in cells))
     console.print(table)
