@@ -1,4 +1,4 @@
-"""Tables of an identification's report: the paper's tables I to IV for this arm, other terms, families."""
+"""Tables of an identification's report: the paper's Tables I to IV for this arm, what else was searched, families."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
-from r2s.reporting.identification_tables import Value, named, per_joint, values
+from r2s.reporting.identified_values import Value, named, per_joint, values
 from r2s.reporting.tables import number
 
 FORMULAS = {
