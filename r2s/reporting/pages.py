@@ -124,7 +124,9 @@ def transfer(
     reach = reach_figure(run.figure("reach"), shown)
     traces = traces_figure(run.figure("traces"), episodes)
     pictures = {"traces": traces}
-    sections: dict[str, Sequence] = {"The same policy and goals": [reach_rows(rows), gap_rows(rows)]}
+    sections: dict[str, Sequence] = {
+        "The same policy (of the best evaluation) and goals": [reach_rows(rows), gap_rows(rows)]
+    }
     if timing:
         pictures["latency"] = latency_figure(run.figure("latency"), asdict(timing))
         cycle = pd.DataFrame(timing.table()).set_index("what").map(lambda x: f"{x:.3g}")
