@@ -1,7 +1,7 @@
 """What a person reads: tables for the terminal, and the same in report.md and report.html.
 
 A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
-identification has is in r2s/reporting/identification_page.py, figures are in r2s/reporting/figures.py.
+identification has is in identification_page.py and paper_tables.py, figures are in *_figures.py.
 """
 
 from collections.abc import Mapping
