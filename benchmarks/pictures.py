@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from r2s.reporting.colours import KNOWN
-from r2s.reporting.figures import without_pauses
+from r2s.reporting.log_rows import without_pauses
 from r2s.reporting.viewer import GOAL
 
 NAME = "overview"  # of the run folders

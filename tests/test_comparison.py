@@ -100,6 +100,10 @@ def user_folder(tmp_path_factory):
     write_run(root / "died", status="failed")
     write_run(root / "going", status="running")
     write_run(root / "found", stage="identify")
+    write_run(root / "cut")
+    (root / "cut" / "evaluations.csv").write_text("")
+    write_run(root / "edited")
+    (root / "edited" / "config.yaml").write_text("algo: [")
     (root / "notes").mkdir()
     (root / "readme.txt").write_text("mine")
     return root
@@ -156,6 +160,7 @@ def test_runs_that_cannot_be_compared_are_set_apart_and_why_is_said(user_folder)
     assert others["died"] == "failed"
     assert others["going"] == "unfinished"
     assert others["found"] == "stage=identify"
+    assert others["cut"] == others["edited"] == "unreadable"
     assert others["notes"] == others["readme.txt"] == "no run folder"
     assert comparable([r for r in trained if r.toy])[1] == {}
 
@@ -173,8 +178,8 @@ def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
         "tqc #1 = tqc, minutes=3.0, calibration=2026-01-01_12-00-00",
         "set apart, not comparable with these: toy, toy2 (+experiment=toy)",
         "set apart, not comparable with these: long (another budget: 60 min, not 3)",
-        "left out, no finished trainings: died (failed); found (stage=identify); going (unfinished); "
-        "notes, readme.txt (no run folder)",
+        "left out, no finished trainings: cut, edited (unreadable); died (failed); found (stage=identify); "
+        "going (unfinished); notes, readme.txt (no run folder)",
     ):
         assert expected in text
     assert written.startswith("written:")

@@ -32,7 +32,6 @@ from r2s.reporting import pages, viewer
 from r2s.reporting.colours import colours
 from r2s.reporting.document import UNSEEN, report_html, report_markdown
 from r2s.reporting.doubts import _grouped
-from r2s.reporting.figures import without_pauses
 from r2s.reporting.identification_figures import (
     _running,
     autocorrelation,
@@ -46,9 +45,10 @@ from r2s.reporting.identification_figures import (
 from r2s.reporting.identification_page import identification_sections
 from r2s.reporting.identification_tables import identification_table, identification_tables
 from r2s.reporting.learning_figures import learning_figure
+from r2s.reporting.log_rows import without_pauses
 from r2s.reporting.reach_figures import reach_figure
 from r2s.reporting.tables import SUCCESS, reach_table
-from r2s.reporting.viewer_layout import PAUSE, Episode, Overlay, clock_of_log, starts_of
+from r2s.reporting.viewer_layout import PAUSE, Episode, Overlay, starts_of
 
 EVERY_SHAPE = """
 <mujoco model="shapes">
@@ -244,7 +244,7 @@ def test_episodes_follow_one_another_and_all_arms_start_together(panda):
 
 
 def test_a_clock_that_stops_or_restarts_still_runs_forward():
-    clock = clock_of_log(np.array([5.0, 5.01, 9.0, 9.01, 0.0, 0.01]))
+    clock, _ = without_pauses(np.array([5.0, 5.01, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.11, 0.12, 0.22, 0.23])
 
 

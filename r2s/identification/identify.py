@@ -69,7 +69,7 @@ def identify(
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
         terms: what is searched beside friction: offset, inertia_scale or link, delay, lag, load, drag_sin,
             drag_cos, gain.
-        family: of the friction; auto fits each and keeps the one with the smallest error on motion left out of the fit.
+        family: of the friction; auto keeps the one with the smallest error on motion left out.
         ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
         window_s, stride: replay windows, s, and ms that compared angles are means of (commanded torque).
         cutoff_hz: zero-phase filter of the torque.

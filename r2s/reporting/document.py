@@ -3,17 +3,17 @@
 import os
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from html import escape as escape_html
 from pathlib import Path
 
 import pandas as pd
+from jinja2 import Environment
 
 UNSEEN = "nominal, unseen"
 Item = str | list[str] | pd.DataFrame | Path  # of a report: paragraph, bullets, table, picture
 
 
-def _doubtful(cell: str) -> bool:
-    """Whether a cell is of a value that the data tell little of."""
+def doubtful(cell: str) -> bool:
+    """Return whether a cell is of a value that the data tell little of."""
     return cell.split("\n")[0].endswith("?") or cell.endswith(UNSEEN)
 
 
@@ -59,54 +59,63 @@ nav a { margin-right: 1.2rem; white-space: nowrap; color: #0969da; text-decorati
 p, ul { max-width: 56rem; }
 .wide { overflow-x: auto; margin: .8rem 0 1.4rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e8ec; }
+th, td { padding: .3rem .8rem; text-align: right; white-space: pre; border-bottom: 1px solid #e4e8ec; }
+td { font-size: 12px; color: #59636e; }
+td::first-line { font-size: 15px; color: #1f2328; }
 th { vertical-align: bottom; border-bottom: 2px solid #afb8c1; }
 th:first-child, td:first-child { text-align: left; }
-small { color: #59636e; }
-td.doubtful, td.doubtful small { color: #8c959f; }
+td.doubtful, td.doubtful::first-line { color: #8c959f; }
 figure { margin: 1rem 0 1.6rem; }
 img { max-width: 100%; height: auto; }
 """
 
 
+PAGE = """\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>{{ sections[0][0] }}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>{{ style }}</style>
+</head>
+<body>
+{% for heading, items in sections %}
+{% if loop.first %}<h1>{{ heading }}</h1>{% else %}<h2 id="s{{ loop.index0 }}">{{ heading }}</h2>{% endif %}
+{% for item in items %}
+{% if item is string %}<p>{{ item }}</p>
+{% elif item.picture %}<figure><img alt="{{ item.name }}" src="data:image/png;base64,{{ item.picture }}"></figure>
+{% elif item.head %}
+<div class="wide"><table>
+<tr>{% for cell in item.head %}<th>{{ cell }}</th>{% endfor %}</tr>
+{% for row in item.body %}
+<tr>{% for cell in row %}<td{% if doubtful(cell) %} class="doubtful"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}
+</table></div>
+{% else %}<ul>{% for line in item %}<li>{{ line }}</li>{% endfor %}</ul>
+{% endif %}
+{% endfor %}
+{% if loop.first %}
+<nav>{% for heading, _ in sections[1:] %}<a href="#s{{ loop.index }}">{{ heading }}</a> {% endfor %}</nav>
+{% endif %}
+{% endfor %}
+</body>
+</html>
+"""
+
+
 def report_html(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
     """Write report.html: what `report_markdown` takes as one file, pictures inside; no script, nothing is loaded."""
-    title, *rest = sections
-    names = {heading: f"s{i}" for i, heading in enumerate(rest, 1)}
-    parts = [
-        f"<!DOCTYPE html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n<title>{escape_html(title)}</title>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<style>{STYLE}</style>\n</head>\n<body>",
-    ]
-    links = "\n".join(f"<a href='#{name}'>{escape_html(heading)}</a>" for heading, name in names.items())
-    for heading, items in sections.items():
-        tag = f"h2 id='{names[heading]}'" if heading in names else "h1"
-        parts.append(f"<{tag}>{escape_html(heading)}</{tag[:2]}>")
-        parts += [_html(item) for item in items]
-        if heading == title and rest:
-            parts.append(f"<nav>\n{links}\n</nav>")
-    path.write_text("\n".join([*parts, "</body>", "</html>"]) + "\n", encoding="utf-8")
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
+    parts = [(heading, [_for_template(item) for item in items]) for heading, items in sections.items()]
+    path.write_text(page.render(sections=parts, style=STYLE, doubtful=doubtful), encoding="utf-8")
     return path
 
 
-def _html(item: Item) -> str:
+def _for_template(item: Item) -> str | list[str] | dict:
     if isinstance(item, Path):
-        picture = b64encode(item.read_bytes()).decode()
-        return f"<figure><img alt='{escape_html(item.stem)}' src='data:image/png;base64,{picture}'></figure>"
-    if isinstance(item, str):
-        return f"<p>{escape_html(item)}</p>"
-    if isinstance(item, list):
-        return "<ul>\n" + "\n".join(f"<li>{escape_html(line)}</li>" for line in item) + "\n</ul>"
-    head, *body = _rows(item)
-    lines = ["<div class='wide'><table>", "<tr>" + "".join(f"<th>{_broken(c)}</th>" for c in head) + "</tr>"]
-    for row in body:
-        kinds = [" class='doubtful'" if _doubtful(c) else "" for c in row]
-        cells = (f"<td{kind}>{_broken(c, small=True)}</td>" for kind, c in zip(kinds, row, strict=True))
-        lines.append("<tr>" + "".join(cells) + "</tr>")
-    return "\n".join([*lines, "</table></div>"])
-
-
-def _broken(cell: str, small: bool = False) -> str:
-    """Return a cell's lines one below the other, those after the first in small print."""
-    first, *rest = map(escape_html, cell.split("\n"))
-    return "<br>".join([first, *(f"<small>{line}</small>" if small else line for line in rest)])
+        return {"name": item.stem, "picture": b64encode(item.read_bytes()).decode()}
+    if isinstance(item, pd.DataFrame):
+        head, *body = _rows(item)
+        return {"head": head, "body": body}
+    return item

@@ -1,18 +1,15 @@
-"""What all figures (PNG) share: panels with one legend, axes, how many points a line has."""
+"""What all figures (PNG) share: panels with one legend, and logarithmic axes."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 DPI = 120
 LEGEND_WIDTH = 160  # letters, of a figure
-MOST_POINTS = 4000  # of a line or a cloud in a figure
-PAUSE = 0.1  # s on a figure's axis, for a pause of any length
 
 
 @contextmanager
@@ -50,19 +47,3 @@ def log_axis(axis: Axes, ticks: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
     axis.yaxis.set_major_locator(LogLocator(subs=ticks))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-def thin(count: int, most: int = MOST_POINTS) -> slice:
-    """Return what leaves at most `most` of `count` rows."""
-    return slice(None, None, max(1, -(-count // most)))
-
-
-def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (T,) s from zero, in which every pause of t (T,) s lasts `PAUSE`, and the rows before which they lie.
-
-    A pause is a step of more than five usual ones, or a clock that starts again.
-    """
-    steps = np.diff(t)
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    jump = (steps <= 0) | (steps > 5 * usual)
-    return np.concatenate([[0.0], np.cumsum(np.where(jump, PAUSE, steps))]), np.flatnonzero(jump) + 1

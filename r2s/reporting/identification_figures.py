@@ -11,7 +11,8 @@ from scipy.signal import butter, freqz_sos
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT
 from r2s.reporting.colours import colours
-from r2s.reporting.figures import joint_panels, log_axis, panels, thin, without_pauses
+from r2s.reporting.figures import joint_panels, log_axis, panels
+from r2s.reporting.log_rows import thin, without_pauses
 from r2s.reporting.tables import number
 
 LONGEST = 30.0  # s of torque in a figure: more is a solid band

@@ -16,7 +16,9 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 from r2s.reporting.document import Item
 from r2s.reporting.doubts import doubts
-from r2s.reporting.identification_sections import (
+from r2s.reporting.identification_tables import error_tables
+from r2s.reporting.identified_values import LEGEND
+from r2s.reporting.paper_tables import (
     breakaway_table,
     family_table,
     friction_table,
@@ -24,7 +26,6 @@ from r2s.reporting.identification_sections import (
     offset_table,
     other_terms,
 )
-from r2s.reporting.identification_tables import LEGEND, error_tables
 from r2s.reporting.tables import number
 
 LINK_SIDE = "link-side torque, with gravity"

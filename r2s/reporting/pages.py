@@ -124,7 +124,9 @@ def transfer(
     reach = reach_figure(run.figure("reach"), shown)
     traces = traces_figure(run.figure("traces"), episodes)
     pictures = {"traces": traces}
-    sections: dict[str, Sequence] = {"The same policy and goals": [reach_rows(rows), gap_rows(rows)]}
+    sections: dict[str, Sequence] = {
+        "The same policy (of the best evaluation) and goals": [reach_rows(rows), gap_rows(rows)]
+    }
     if timing:
         pictures["latency"] = latency_figure(run.figure("latency"), asdict(timing))
         cycle = pd.DataFrame(timing.table()).set_index("what").map(lambda x: f"{x:.3g}")
@@ -156,10 +158,20 @@ def compare(
             table.to_csv(run.folder / f"{name}.csv", index=False)
     figures = {"learning": bands_figure(run.figure("learning"), grouped)}
     figures["scores"] = scores_figure(run.figure("scores"), tables["scores"])
-    curves = {f"{label}, seed {r.seed}": r.curve for label, g in groups.items() for r in g}
+    curves = {f"{label}, run {k}": r.curve for label, g in groups.items() for k, r in enumerate(g, 1)}
     write_recording(run.folder / "recording.rrd", robot, curves=curves, figures=figures)
+    sections = _comparison(grouped, tables, apart, others)
+    report_markdown(run.folder / "report.md", sections | {"Figures": list(figures.values())})
+    return tables
+
+
+def _comparison(
+    grouped: Groups, tables: Mapping[str, pd.DataFrame], apart: Mapping[str, str], others: Mapping[str, str]
+) -> dict[str, Sequence]:
+    """Return the tables of a comparison and what was not compared, in words."""
+    count = sum(map(len, grouped.members.values()))
     sections: dict[str, Sequence] = {
-        f"{len(last)} runs in {len(groups)} groups, by their last evaluation": [
+        f"{count} runs in {len(grouped.members)} groups, by their last evaluation": [
             "Interquartile mean over seeds, with a 95 % bootstrap interval. A group is named by what was typed of "
             "the settings that differ; what its name leaves out is the default.",
             scores_rows(tables["scores"]),
@@ -180,8 +192,7 @@ def compare(
         sections["How much the last return depends on the settings (smaller spread: less to tune)"] = [
             tables["sensitivity"].round(2).astype(str).set_index("algo")
         ]
-    report_markdown(run.folder / "report.md", sections | {"Figures": list(figures.values())})
-    return tables
+    return sections
 
 
 def pipeline(

@@ -1,7 +1,7 @@
 """What a person reads: tables for the terminal, and the same in report.md and report.html.
 
 A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
-identification has is in r2s/reporting/identification_page.py, figures are in r2s/reporting/figures.py.
+identification has is in identification_page.py and paper_tables.py, figures are in *_figures.py.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from r2s.reporting.document import _doubtful
+from r2s.reporting.document import doubtful
 
 SUCCESS = {
     "success_5cm": "5 cm, %",
@@ -100,5 +100,5 @@ def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str 
         table.add_column(str(column), justify="right")
     for label, row in frame.iterrows():
         cells = [escape(str(cell)) for cell in row]
-        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if _doubtful(c) else c for c in cells))
+        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if doubtful(c) else c for c in cells))
     console.print(table)

@@ -58,11 +58,13 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
     """
     trained, others = [], {}
     for folder in map(Path, folders):
-        why = _why_not(folder)
-        if why:
+        if why := _why_not(folder):
             others[folder.name] = why
-        else:
+            continue
+        try:
             trained.append(_read(folder))
+        except (KeyError, TypeError, ValueError, yaml.YAMLError):  # somebody wrote into it
+            others[folder.name] = "unreadable"
     if not trained:
         seen = f"; seen: {'; '.join(in_words(others))}" if others else ""
         raise UserError(f"runs: no finished run of stage=train among them, such as runs='runs/train/*' has{seen}")
@@ -98,6 +100,9 @@ def _read(folder: Path) -> Trained:
         if key.split(".")[0] in read | {"experiment"}:
             typed[key] = value
     budget = config.get("budget", {})
+    curve = pd.read_csv(folder / "evaluations.csv")
+    if curve.empty:
+        raise ValueError("no evaluation")
     return Trained(
         folder,
         int(config["seed"]),
@@ -108,7 +113,7 @@ def _read(folder: Path) -> Trained:
         typed,
         typed.get("experiment") == "toy",
         None if budget.get("env_steps") else budget.get("minutes"),
-        pd.read_csv(folder / "evaluations.csv"),
+        curve,
     )
 
 

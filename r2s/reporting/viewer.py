@@ -17,6 +17,7 @@ import rerun as rr
 from r2s.files import whole
 from r2s.physics.robot import Robot
 from r2s.reporting.colours import colours
+from r2s.reporting.log_rows import at_rate, without_pauses
 from r2s.reporting.viewer_layout import (
     CURVES,
     LEARNING,
@@ -24,7 +25,6 @@ from r2s.reporting.viewer_layout import (
     Episode,
     Overlay,
     blueprint,
-    clock_of_log,
     entity,
     starts_of,
 )
@@ -124,7 +124,7 @@ def _arm(
     stream.log(f"{base}/label", name, static=True)
     for body in _shown_bodies(model):
         _shapes(stream, model, body, _link(base, model, body), colour)
-    frames = [_every(e.t, FRAMES_HZ) for e in episodes]
+    frames = [at_rate(e.t, FRAMES_HZ) for e in episodes]
     clocks = [start + e.t[f] - e.t[0] for start, e, f in zip(starts, episodes, frames, strict=False)]
     _motion(stream, base, model, episodes, frames, clocks, starts, rgb)
 
@@ -163,12 +163,6 @@ def _motion(
     goals = rr.Points3D.columns(positions=np.stack([e.goal for e in episodes]))
     stream.log(f"{base}/goal", rr.Points3D.from_fields(colors=_rgb(GOAL), radii=GOAL_RADIUS), static=True)
     stream.send_columns(f"{base}/goal", indexes=[changes], columns=goals)
-
-
-def _every(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return the rows of t (T,) s that come closest to `rate` Hz, the first and the last among them."""
-    grid = np.arange(t[0], t[-1], 1 / rate)
-    return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
 
 
 def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
@@ -242,8 +236,8 @@ def _shape(model: mujoco.MjModel, geom: int, rgb: np.ndarray) -> rr.AsComponents
 
 def _overlay(stream: rr.RecordingStream, label: str, overlay: Overlay) -> None:
     """Send measured and predicted torque, one plot per joint, the measured one as a broad band beneath."""
-    clock = clock_of_log(overlay.t)
-    rows = _every(clock, OVERLAY_HZ)
+    clock, _ = without_pauses(overlay.t)
+    rows = at_rate(clock, OVERLAY_HZ)
     index = [rr.TimeColumn("time", duration=clock[rows])]
     lines = {"measured": overlay.measured, **overlay.predicted}
     palette = colours(lines)

@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from r2s.physics.robot import Robot
+from r2s.reporting.log_rows import without_pauses
 
 PAUSE = 0.5  # s between two episodes
 SPACING = 0.95  # m between two arms
@@ -72,13 +73,6 @@ def starts_of(episodes: Mapping[str, Sequence[Episode]]) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(longest)])
 
 
-def clock_of_log(t: np.ndarray) -> np.ndarray:
-    """Return (T,) s from zero; a pause in the log, or a clock that starts again, becomes a step of 0.1 s."""
-    steps = np.diff(t)
-    steps = np.where((steps <= 0) | (steps > 0.1), 0.1, steps)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def blueprint(
     robot: Robot,
     episodes: Mapping[str, Sequence[Episode]],
@@ -94,7 +88,7 @@ def blueprint(
     if curves:
         tabs.append(_learning_tab(curves, LEARNING in figures))
     for label, overlay in overlays.items():
-        until = min(OVERLAY_OPENS, float(clock_of_log(overlay.t)[-1]))
+        until = min(OVERLAY_OPENS, float(without_pauses(overlay.t)[0][-1]))
         views = _plots({f"{joint}, Nm": entity("torque", label, joint) for joint in joints}, until=until)
         tabs.append(rrb.Grid(*views, grid_columns=2, name=f"torque: {label}"))
     tabs += [_picture(name, name) for name in figures if not (curves and name == LEARNING)]

@@ -1,4 +1,4 @@
-"""Tables of an identification's report: the paper's tables I to IV for this arm, other terms, families."""
+"""Tables of an identification's report: the paper's Tables I to IV for this arm, what else was searched, families."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,7 +11,7 @@ from r2s.identification.uncertainty import Identified
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
-from r2s.reporting.identification_tables import Value, named, per_joint, values
+from r2s.reporting.identified_values import Value, named, per_joint, values
 from r2s.reporting.tables import number
 
 TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2), "Iyz": (1, 2)}
