@@ -6,9 +6,14 @@ Panda, FER) and version 10 (libfranka 0.18 and later, the FR3). All structs are 
 public headers of libfranka-common (service_types.h, rbk_types.h), checked against both client packages.
 """
 
+from dataclasses import replace
+from xml.etree import ElementTree as ET
+
 import mujoco
 import numpy as np
 
+from r2s.physics import description
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
 PORT = 1337  # libfranka cannot ask for another one: several robots are several addresses
@@ -128,48 +133,10 @@ def outside_fr3(q: np.ndarray, dq: np.ndarray) -> tuple[int, str] | None:
 
 def urdf(robot: Robot) -> str:
     """Return the arm as URDF, without shapes and with an FR3's joint limits: what GetRobotModel answers."""
-    model = robot.model(gravity=True)
-    name = [f"link{i}" for i in range(model.nbody)]
-    parts = [f'<robot name="{robot.name}">']
-    for i in range(model.nbody):
-        parts.append(f'<link name="{name[i]}">')
-        if model.body_mass[i] > 0:
-            ixx, iyy, izz = model.body_inertia[i]
-            parts.append(
-                f'<inertial>{_origin(model.body_ipos[i], model.body_iquat[i])}<mass value="{model.body_mass[i]}"/>'
-                f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>'
-            )
-        parts.append("</link>")
-    for i in range(1, model.nbody):
-        at = int(model.body_jntadr[i])
-        kind, own = ("revolute", f"joint{at + 1}") if at >= 0 else ("fixed", f"fixed{i}")
-        parts.append(
-            f'<joint name="{own}" type="{kind}">{_origin(model.body_pos[i], model.body_quat[i])}'
-            f'<parent link="{name[model.body_parentid[i]]}"/><child link="{name[i]}"/>'
-        )
-        if at >= 0:
-            x, y, z = model.jnt_axis[at]
-            parts.append(
-                f'<axis xyz="{x} {y} {z}"/><limit lower="{FR3_Q_MIN[at]}" upper="{FR3_Q_MAX[at]}" '
-                f'velocity="{FR3_DQ_MAX[at]}" effort="{robot.tau_max[at]}"/>'
-                # not URDF, but libfranka does not connect without it
-                f'<position_based_velocity_limits velocity_offset="{FR3_VELOCITY_OFFSET[at]}" '
-                f'deceleration_limit="{FR3_DECELERATION[at]}"/>'
-            )
-        parts.append("</joint>")
-    return "".join([*parts, "</robot>"])
-
-
-def _origin(position: np.ndarray, quaternion: np.ndarray) -> str:
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    m = rotation.reshape(3, 3)
-    pitch = np.arctan2(-m[2, 0], np.hypot(m[0, 0], m[1, 0]))
-    if abs(m[2, 0]) < 1 - 1e-12:
-        roll, yaw = np.arctan2(m[2, 1], m[2, 2]), np.arctan2(m[1, 0], m[0, 0])
-    else:  # straight up or down only the sum of the two counts
-        roll, yaw = 0.0, np.arctan2(-m[0, 1], m[1, 1])
-    return f'<origin xyz="{position[0]} {position[1]} {position[2]}" rpy="{roll} {pitch} {yaw}"/>'
+    slowing = FR3_DECELERATION, FR3_VELOCITY_OFFSET
+    fr3 = replace(robot, q_min=FR3_Q_MIN, q_max=FR3_Q_MAX, dq_max=FR3_DQ_MAX, slowing=slowing)
+    links, _ = description.chain(robot, Dynamics.of(robot, np.zeros((robot.n, 3))), friction=False)
+    return ET.tostring(description.urdf(fr3, links), encoding="unicode")
 
 
 class Forward:

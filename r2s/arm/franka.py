@@ -16,6 +16,7 @@ from r2s.arm import fci
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.arm.tracking import Tracker
 from r2s.errors import UserError
+from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
@@ -220,13 +221,13 @@ class Franka:
 
     def _damp(self) -> None:
         """Take speed out, and torque back, before the arm's own controller takes over."""
-        gain = REST_RATE / np.diag(self._inverse(self._state.q))
+        damping = REST_RATE / np.diag(self._inverse(self._state.q))
         most, step = REST_SHARE * self.robot.tau_max, RATE_SHARE * self.robot.dtau_max * SIM_DT
         for _ in range(round(REST_S / SIM_DT)):
             s = self._state
             if np.abs(s.dq).max() < STILL and (np.abs(s.tau_J_d) <= step).all():
                 return
-            tau = np.clip(-gain * s.dq, -most, most)
+            tau = np.clip(-damping * s.dq, -most, most)
             self._send(s.tau_J_d + np.clip(tau - s.tau_J_d, -step, step))
 
 
@@ -265,7 +266,7 @@ def _ms(state: Any) -> int:
 
 
 def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray) -> tuple[Excitation, int]:
-    """Return a minimum-jerk path (Flash and Hogan, 1985) followed by rest, and how many rows move."""
+    """Return a minimum-jerk path followed by rest, and how many rows move."""
     way = np.abs(end - start)
     # its peaks: velocity 15/8 way / T, acceleration 10/sqrt(3) way / T^2
     duration = max(
@@ -275,8 +276,4 @@ def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray) -> tuple[Excita
     )
     moving = int(np.ceil(duration / SIM_DT))
     t = SIM_DT * np.arange(moving + round(SETTLE_S / SIM_DT) + 1)
-    u = np.minimum(t / duration, 1.0)[:, None]
-    q = start + (end - start) * u**3 * (10 - 15 * u + 6 * u**2)
-    dq = (end - start) * 30 * u**2 * (1 - u) ** 2 / duration
-    ddq = (end - start) * 60 * u * (1 - u) * (1 - 2 * u) / duration**2
-    return Excitation(t, q, dq, ddq), moving
+    return Excitation(t, *minimum_jerk(start, end, duration, t[:, None])), moving

@@ -125,6 +125,17 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """
     links, hand = chain(robot, dynamics)
     _without_armature(links, "URDF")
+    root = urdf(robot, links)
+    # a link without inertia gets 1 kg and 1 kg m^2 from DART
+    inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
+    ET.SubElement(inertial, "mass", value="1e-9")
+    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(1e-12 * np.eye(3)).items()})
+    _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", hand)
+    _write(path, root)
+
+
+def urdf(robot: Robot, links: list[Link]) -> ET.Element:
+    """Return URDF's root of the arm made of `links` (`chain`), with the limits of `robot`."""
     root = ET.Element("robot", name=robot.name)
     ET.SubElement(root, "link", name="base")
     parent = "base"
@@ -143,13 +154,12 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
         }
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
         ET.SubElement(joint, "dynamics", damping=repr(link.damping), friction=repr(link.friction))
+        if robot.slowing is not None:  # Franka's own: not URDF, but libfranka does not connect without it
+            deceleration, offset = (repr(float(x[i])) for x in robot.slowing)
+            own = {"velocity_offset": offset, "deceleration_limit": deceleration}
+            ET.SubElement(joint, "position_based_velocity_limits", own)
         parent = link.name
-    # a link without inertia gets 1 kg and 1 kg m^2 from DART
-    inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
-    ET.SubElement(inertial, "mass", value="1e-9")
-    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(1e-12 * np.eye(3)).items()})
-    _urdf_joint(root, "ee_fixed", "fixed", parent, "ee", hand)
-    _write(path, root)
+    return root
 
 
 def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = False) -> None:
