@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 from r2s.errors import UserError
 from r2s.learning import randomization
 from r2s.learning.env import TaskEnv
-from r2s.physics.actuation import Actuation, low_pass_gain
+from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.tasks.reach import ReachTask, observe
@@ -198,9 +198,9 @@ def test_the_low_pass_has_its_time_constant(panda, cutoff):
     """A small step is answered as 1 - exp(-t / T) with T = 1 / (2 pi cutoff), to two cycles of 1 ms."""
     actuation = Actuation(panda, 1, cutoff_hz=cutoff)
     answer = actuation(np.full((1, 7), 0.5), 1000)[0] / 0.5
-    gain = low_pass_gain(cutoff)
+    factor = low_pass_factor(cutoff)
     k = np.arange(1, 1001)[:, None]
-    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - gain) ** k, answer.shape), atol=1e-12)
+    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - factor) ** k, answer.shape), atol=1e-12)
     constant = 1 / (2 * np.pi * cutoff)
     reached = 1e-3 * (1 + np.argmax(answer[:, 0] >= 1 - np.exp(-1)))
     assert 0 <= reached - constant <= 2e-3
