@@ -9,6 +9,7 @@ import torch
 from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from r2s.errors import UserError
@@ -123,6 +124,20 @@ def test_a_partial_reset_leaves_the_other_arms_alone(make):
         rows.append(env.step(state)["next"])
     for key in ("observation", "reward", "distance"):
         assert torch.equal(rows[0][key][keep], rows[1][key][keep])
+
+
+def test_a_step_with_its_reset_is_torchrls(make):
+    """`step_and_maybe_reset` returns what EnvBase's would: the same steps, and after them the same observations."""
+    ours, theirs = make(8, stagger=True), make(8, stagger=True)
+    one, other = ours.reset(), theirs.reset()
+    for action in actions(2 * ours.task.steps, 8):
+        one["action"] = other["action"] = action
+        step, one = ours.step_and_maybe_reset(one)
+        expected, other = EnvBase.step_and_maybe_reset(theirs, other)
+        for key in ("observation", "reward_terms", "distance", "reward", "done", "terminated", "truncated"):
+            assert torch.equal(step["next", key], expected["next", key]), key
+        assert torch.equal(one["observation"], other["observation"])
+        assert not one["done"].any()
 
 
 def test_staggered_episodes_end_at_different_times(make):
