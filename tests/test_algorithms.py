@@ -42,7 +42,7 @@ def make(kind, seed=0, **change):
     algo = kind(scale, torch.tensor([3.0, 2.0, 1.0]), **{"hidden": HIDDEN} | change)
     with torch.no_grad():
         for name, parameter in algo.named_parameters():
-            if "target" in name or "critics.gain" in name or "critics.shift" in name:
+            if "target" in name or "critics.norm_scale" in name or "critics.norm_shift" in name:
                 parameter.add_(0.1 * torch.randn_like(parameter))
     return algo
 
@@ -191,14 +191,14 @@ def test_sac_is_torchrls(settings):
 
 
 def test_judging_leaves_the_critics_alone():
-    """`judge` has the values and the action's gradient of `forward`, of as many critics as asked, and no other."""
+    """`frozen` has the values and the action's gradient of `forward`, of as many critics as asked, and no other."""
     torch.manual_seed(0)
     critics, seen, action = Critics(D, N, HIDDEN, 3, 2), torch.randn(5, D), torch.randn(5, N, requires_grad=True)
-    torch.testing.assert_close(critics.judge(seen, action), critics(seen, action))
-    judged = critics.judge(seen, action, 2)
-    torch.testing.assert_close(judged, critics(seen, action)[:2])
+    torch.testing.assert_close(critics.frozen(seen, action), critics(seen, action))
+    frozen = critics.frozen(seen, action, 2)
+    torch.testing.assert_close(frozen, critics(seen, action)[:2])
     (expected,) = torch.autograd.grad(critics(seen, action)[:2].sum(), action)
-    judged.sum().backward()
+    frozen.sum().backward()
     torch.testing.assert_close(action.grad, expected)
     assert all(p.grad is None for p in critics.parameters())
 

@@ -18,7 +18,7 @@ from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import draw
 from r2s.learning.tqc import TQC
-from r2s.learning.train import Budget, replay, train
+from r2s.learning.train import Budget, Loop, replay_dump, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
@@ -138,12 +138,26 @@ def train_until_it_breaks(env, algo, dump):
             algo,
             make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
             lambda spent: rewards.PAPER,
-            budget=Budget(None, 4000),
-            batch_size=16,
-            learning_starts=80,
+            Loop(batch_size=16, learning_starts=80),
+            Budget(None, 4000),
             dump=dump,
         )
     return str(caught.value)
+
+
+def break_goal(env, step):
+    """Return the environment, which loses a goal in its step number `step`."""
+    inner, count = env._step, 0
+
+    def broken(state):
+        nonlocal count
+        count += 1
+        if count == step:
+            env.goal[2, 1] = np.nan
+        return inner(state)
+
+    env._step = broken
+    return env
 
 
 def never(policy):
@@ -152,26 +166,16 @@ def never(policy):
 
 def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
     """NaN in the physics: the line names what, which arm and when, and the dump leads to it again."""
-    env = make_env(panda)
+    env = break_goal(make_env(panda), 250)
     algo = make_algo(env)
-    inner, count = env._step, 0
-
-    def broken(state):
-        nonlocal count
-        count += 1
-        if count == 50:
-            env.goal[2, 1] = np.nan
-        return inner(state)
-
-    env._step = broken  # type: ignore[method-assign]
     said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
     assert "observation of arm 2 is nan" in said
-    assert "after 196 env steps" in said
-    saved = torch.load(tmp_path / "dump.pt", weights_only=True)
-    saved["env"]["goal"][2, 1] = float("nan")  # the injection came after the state was kept
-    torch.save(saved, tmp_path / "dump.pt")
-    with pytest.raises(FloatingPointError, match="observation of arm 2 is nan"):
-        replay(tmp_path / "dump.pt", make_env(panda, seed=3), algo, never)
+    assert "after 996 env steps" in said
+    left = 250 - 200  # steps since the state that the dump begins with
+    with pytest.raises(FloatingPointError) as caught:
+        replay_dump(tmp_path / "dump.pt", break_goal(make_env(panda, seed=3), left), algo, never)
+    assert said.startswith(str(caught.value))
+    assert len(torch.load(tmp_path / "dump.pt", weights_only=True)["actions"]) == left
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
@@ -189,9 +193,9 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
     said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
     assert said.startswith("the loss of update 41 is nan, after ")
     with pytest.raises(FloatingPointError, match=r"^the loss of update 41 is nan$"):
-        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env), never)
+        replay_dump(tmp_path / "dump.pt", make_env(panda), make_algo(env), never)
     with pytest.raises(UserError, match="is no dump"):
-        replay(tmp_path / "nothing.pt", make_env(panda), algo, never)
+        replay_dump(tmp_path / "nothing.pt", make_env(panda), algo, never)
 
 
 def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
@@ -208,10 +212,9 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
             algo,
             evaluate,
             lambda spent: rewards.PAPER,
-            budget=Budget(None, 4000),
-            batch_size=16,
-            learning_starts=4000,
+            Loop(batch_size=16, learning_starts=4000),
+            Budget(None, 4000),
             dump=tmp_path / "dump.pt",
         )
     with pytest.raises(FloatingPointError, match=r"^action of arm 0 is nan at step 0 of its episode$"):
-        replay(tmp_path / "dump.pt", make_env(panda), make_algo(env), evaluate)
+        replay_dump(tmp_path / "dump.pt", make_env(panda), make_algo(env), evaluate)

@@ -9,12 +9,13 @@ import torch
 from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from r2s.errors import UserError
 from r2s.learning import randomization
 from r2s.learning.env import TaskEnv
-from r2s.physics.actuation import Actuation, low_pass_gain
+from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.tasks.reach import ReachTask, observe
@@ -125,6 +126,20 @@ def test_a_partial_reset_leaves_the_other_arms_alone(make):
         assert torch.equal(rows[0][key][keep], rows[1][key][keep])
 
 
+def test_a_step_with_its_reset_is_torchrls(make):
+    """`step_and_maybe_reset` returns what EnvBase's would: the same steps, and after them the same observations."""
+    ours, theirs = make(8, stagger=True), make(8, stagger=True)
+    one, other = ours.reset(), theirs.reset()
+    for action in actions(2 * ours.task.steps, 8):
+        one["action"] = other["action"] = action
+        step, one = ours.step_and_maybe_reset(one)
+        expected, other = EnvBase.step_and_maybe_reset(theirs, other)
+        for key in ("observation", "reward_terms", "distance", "reward", "done", "terminated", "truncated"):
+            assert torch.equal(step["next", key], expected["next", key]), key
+        assert torch.equal(one["observation"], other["observation"])
+        assert not one["done"].any()
+
+
 def test_staggered_episodes_end_at_different_times(make):
     """With `stagger` the first episodes are cut off one by one, later ones last their full length."""
     env = make(8, stagger=True)
@@ -198,9 +213,9 @@ def test_the_low_pass_has_its_time_constant(panda, cutoff):
     """A small step is answered as 1 - exp(-t / T) with T = 1 / (2 pi cutoff), to two cycles of 1 ms."""
     actuation = Actuation(panda, 1, cutoff_hz=cutoff)
     answer = actuation(np.full((1, 7), 0.5), 1000)[0] / 0.5
-    gain = low_pass_gain(cutoff)
+    factor = low_pass_factor(cutoff)
     k = np.arange(1, 1001)[:, None]
-    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - gain) ** k, answer.shape), atol=1e-12)
+    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - factor) ** k, answer.shape), atol=1e-12)
     constant = 1 / (2 * np.pi * cutoff)
     reached = 1e-3 * (1 + np.argmax(answer[:, 0] >= 1 - np.exp(-1)))
     assert 0 <= reached - constant <= 2e-3

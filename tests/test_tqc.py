@@ -25,7 +25,7 @@ def make(seed=0, **change):
     scale = torch.linspace(-1, 1, D), torch.linspace(0.5, 2, D)
     algo = TQC(scale, torch.tensor([3.0, 2.0, 1.0]), hidden=HIDDEN, **change)
     with torch.no_grad():
-        for parameter in [*algo.targets.parameters(), *algo.critics.gain, *algo.critics.shift]:
+        for parameter in [*algo.targets.parameters(), *algo.critics.norm_scale, *algo.critics.norm_shift]:
             parameter.add_(0.1 * torch.randn_like(parameter))
     return algo
 
@@ -45,9 +45,9 @@ def critic_parts(critics, k):
     for i, (weight, bias) in enumerate(zip(critics.weight, critics.bias, strict=True)):
         yield weight, k, lambda w: w.T
         yield bias, k, lambda b: b[0]
-        if i < len(critics.gain):
-            yield critics.gain[i], k, lambda g: g[0]
-            yield critics.shift[i], k, lambda s: s[0]
+        if i < len(critics.norm_scale):
+            yield critics.norm_scale[i], k, lambda g: g[0]
+            yield critics.norm_shift[i], k, lambda s: s[0]
 
 
 def unbatch(critics):

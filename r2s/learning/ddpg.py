@@ -64,7 +64,7 @@ class DDPG(Learner):
         critic = (self.critics(batch["observation"], batch["action"])[0, :, 0] - target).square().mean()
 
         action = self.actor.mode(batch["observation"])
-        value = self.critics.judge(batch["observation"], action)[0, :, 0]
+        value = self.critics.frozen(batch["observation"], action)[0, :, 0]
         actor = -value.mean() + self.action_l2 * action.square().mean()
         return {"loss_critic": critic, "loss_actor": actor}
 

@@ -85,17 +85,35 @@ class TaskEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         ids = np.arange(self.nsim) if mask is None else np.flatnonzero(mask.numpy().reshape(-1))
         if len(ids):
-            self.arms.set_dynamics(self.draw(self.rng, len(ids)), ids)
-            q = self.task.starts(self.robot, self.rng, len(ids))
-            self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
-            if self._stagger:
-                self._count[ids] = ids * GROUPS // self.nsim * self.task.steps // GROUPS
-                self._stagger = False
+            self._restart(ids)
         return self.read()
+
+    def _restart(self, ids: np.ndarray) -> State:
+        """Draw arms, starts and goals for `ids`; return the state of all arms."""
+        self.arms.set_dynamics(self.draw(self.rng, len(ids)), ids)
+        q = self.task.starts(self.robot, self.rng, len(ids))
+        state = self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
+        if self._stagger:
+            self._count[ids] = ids * GROUPS // self.nsim * self.task.steps // GROUPS
+            self._stagger = False
+        return state
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Return the step and the state after it, of which episodes that were cut off have begun anew.
+
+        As EnvBase's, without its checks and copies, which cost a fifth of a step of 32 arms.
+        """
+        after = self._step(tensordict)
+        tensordict.set("next", after)
+        cut = np.flatnonzero(self._count >= self.task.steps)
+        return tensordict, self._tensors(self._restart(cut)) if len(cut) else after.exclude("reward")
 
     def read(self) -> TensorDict:
         """Return the tensordict of the present state, before any action."""
-        state, none = self.arms.read(), torch.zeros((self.nsim, 1), dtype=torch.bool)
+        return self._tensors(self.arms.read())
+
+    def _tensors(self, state: State) -> TensorDict:
+        none = torch.zeros((self.nsim, 1), dtype=torch.bool)
         distance, _ = self.task.judge(state, np.zeros_like(self._dq), self.goal, self._reference)
         return TensorDict(
             {
@@ -125,8 +143,8 @@ class TaskEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         state = self.arms.step(tensordict["action"].numpy().astype(np.float64) * self._torque)
         self._count += 1
-        dq = state.dq.copy()
-        ddq, self._dq = (dq - self._dq) * self.task.ctrl_hz, dq
+        ddq = (state.dq - self._dq) * self.task.ctrl_hz
+        self._dq[:] = state.dq
         distance, terms = self.task.judge(state, ddq, self.goal, self._reference)
         observation = self.task.observe(state, self.goal, self._torque)
         check_finite("observation", observation, self._count)

@@ -78,25 +78,25 @@ class Critics(nn.Module):
         super().__init__()
         sizes = [obs_dim + act_dim, *hidden, outputs]
         self.weight, self.bias = nn.ParameterList(), nn.ParameterList()
-        self.gain, self.shift = nn.ParameterList(), nn.ParameterList()
+        self.norm_scale, self.norm_shift = nn.ParameterList(), nn.ParameterList()
         for i, o in pairwise(sizes):
             bound = i**-0.5  # torch.nn.Linear's own
             self.weight.append(nn.Parameter(torch.empty(count, i, o).uniform_(-bound, bound)))
             self.bias.append(nn.Parameter(torch.empty(count, 1, o).uniform_(-bound, bound)))
         for o in hidden:
-            self.gain.append(nn.Parameter(torch.ones(count, 1, o)))
-            self.shift.append(nn.Parameter(torch.zeros(count, 1, o)))
+            self.norm_scale.append(nn.Parameter(torch.ones(count, 1, o)))
+            self.norm_shift.append(nn.Parameter(torch.zeros(count, 1, o)))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """Return every critic's outputs (C, B, outputs)."""
-        return _outputs(observation, action, self.weight, self.bias, self.gain, self.shift)
+        return _outputs(observation, action, self.weight, self.bias, self.norm_scale, self.norm_shift)
 
-    def judge(self, observation: Tensor, action: Tensor, count: int | None = None) -> Tensor:
+    def frozen(self, observation: Tensor, action: Tensor, count: int | None = None) -> Tensor:
         """Return the outputs (C, B, outputs) of the first `count` critics (None: all) for an actor's loss.
 
         The gradient goes through the critics to the action, not into them.
         """
-        groups = (self.weight, self.bias, self.gain, self.shift)
+        groups = (self.weight, self.bias, self.norm_scale, self.norm_shift)
         return _outputs(observation, action, *([p.detach()[:count] for p in group] for group in groups))
 
 

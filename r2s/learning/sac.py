@@ -65,7 +65,7 @@ class SAC(EntropyLearner):
         critic = (values - target).square().mean(1).sum()
 
         action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
-        value = self.critics.judge(batch["observation"], action)[..., 0].min(0).values
+        value = self.critics.frozen(batch["observation"], action)[..., 0].min(0).values
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
         return {

@@ -113,5 +113,5 @@ class TD3(Learner):
 
     def _actor_loss(self, batch: Mapping[str, Tensor]) -> Tensor:
         action = self.actor.mode(batch["observation"])
-        value = self.critics.judge(batch["observation"], action, 1)[0, :, 0]
+        value = self.critics.frozen(batch["observation"], action, 1)[0, :, 0]
         return -value.mean() + self.action_l2 * action.square().mean()

@@ -75,7 +75,7 @@ class TQC(EntropyLearner):
         critic = QuantileHuber.apply(quantiles, target)
 
         action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
-        value = self.critics.judge(batch["observation"], action).mean((0, 2))
+        value = self.critics.frozen(batch["observation"], action).mean((0, 2))
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
         return {

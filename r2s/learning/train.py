@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 
@@ -54,22 +55,67 @@ class Budget:
         return max(time_share, step_share)
 
 
-def check_loop(
-    *,
-    batch_size: int,
-    learning_starts: int,
-    updates_per_step: int,
-    replay_size: int,
-    lr_decay: float,
-    lr_end: float,
-) -> None:
-    """Check the settings of `train` that no learner checks; raises UserError."""
-    check_number("algo.batch_size", batch_size, "[1, inf)", whole=True)
-    check_number("algo.learning_starts", learning_starts, "[0, inf)", whole=True)
-    check_number("algo.updates_per_step", updates_per_step, "[1, inf)", whole=True)
-    check_number("algo.replay_size", replay_size, f"[{batch_size}, inf)", whole=True)
-    check_number("algo.lr_decay", lr_decay, "[0, 1]")
-    check_number("algo.lr_end", lr_end, "[0, 1]")
+MATMUL = ("medium", "high", "highest")
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How the loop runs, whatever the algorithm.
+
+    Attributes:
+        batch_size: transitions per update. updates_per_step: per step of all arms.
+        learning_starts: environment steps of uniform random actions.
+        replay_size: transitions kept.
+        lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
+        eval_env_steps: environment steps between two evaluations; one more comes at the end.
+        compile: turn the losses into machine code first; the time counts.
+        matmul: precision of the products within an update, for torch.set_float32_matmul_precision: "highest", or
+            "medium", which rounds their factors to bfloat16 where the processor multiplies those faster.
+
+    Raises:
+        UserError: a value out of its range.
+    """
+
+    batch_size: int = 256
+    learning_starts: int = 3200
+    updates_per_step: int = 1
+    replay_size: int = 1_000_000
+    lr_decay: float = 0.6
+    lr_end: float = 0.1
+    eval_env_steps: int = 80_000
+    compile: bool = False
+    matmul: str = "highest"
+
+    def __post_init__(self):
+        check_number("algo.batch_size", self.batch_size, "[1, inf)", whole=True)
+        check_number("algo.learning_starts", self.learning_starts, "[0, inf)", whole=True)
+        check_number("algo.updates_per_step", self.updates_per_step, "[1, inf)", whole=True)
+        check_number("algo.replay_size", self.replay_size, f"[{self.batch_size}, inf)", whole=True)
+        check_number("algo.lr_decay", self.lr_decay, "[0, 1]")
+        check_number("algo.lr_end", self.lr_end, "[0, 1]")
+        check_number("evaluation.env_steps", self.eval_env_steps, "[1, inf)", whole=True)
+        if not isinstance(self.compile, bool):
+            raise UserError(f"compile: {self.compile!r} is not allowed; true and false are")
+        if self.matmul not in MATMUL:
+            raise UserError(f"matmul: '{self.matmul}' is not allowed; medium, high and highest are")
+
+    def lr_share(self, spent: float) -> float:
+        """Return the learning rate's share at the fraction `spent` of the budget."""
+        return 1.0 - (1.0 - self.lr_end) * max(0.0, spent - self.lr_decay) / max(1.0 - self.lr_decay, 1e-9)
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Who is told while a training runs.
+
+    Attributes:
+        log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
+        progress: gets the fraction spent and what is worth showing, every step.
+    """
+
+    log: Callable[[dict], None] = lambda row: None
+    evaluated: Callable[[dict], None] = lambda row: None
+    progress: Callable[[float, dict], None] = lambda share, row: None
 
 
 def keep_memory() -> None:
@@ -97,22 +143,12 @@ def train(
     algo: Learner,
     evaluate: Callable[[Policy], Episodes],
     weights: Callable[[float], np.ndarray],
-    *,
+    loop: Loop,
     budget: Budget,
-    batch_size: int = 256,
-    learning_starts: int = 3200,
-    updates_per_step: int = 1,
-    replay_size: int = 1_000_000,
-    lr_decay: float = 0.6,
-    lr_end: float = 0.1,
-    eval_env_steps: int = 80_000,
-    compile: bool = False,
-    matmul: str = "highest",
+    *,
     checkpoint: Checkpoint | None = None,
     dump: Path | None = None,
-    log: Callable[[dict], None] = lambda row: None,
-    evaluated: Callable[[dict], None] = lambda row: None,
-    progress: Callable[[float, dict], None] = lambda share, row: None,
+    listeners: Listeners = Listeners(),
 ) -> None:
     """Train `algo` in place.
 
@@ -120,37 +156,30 @@ def train(
         env: arms to learn on.
         algo: a learner (r2s/learning/tqc.py).
         evaluate: policy -> Episodes (r2s/learning/evaluate.py).
-        weights: fraction of the budget -> (3,) weights of the reward terms (r2s/tasks/rewards.py).
-        budget: when to stop.
-        batch_size: transitions per update. updates_per_step: per step of all arms.
-        learning_starts: environment steps of uniform random actions.
-        replay_size: transitions kept.
-        lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
-        eval_env_steps: environment steps between two evaluations; one more comes at the end.
-        compile: turn the losses into machine code first; the time counts.
-        matmul: precision of the products within an update, for torch.set_float32_matmul_precision: "highest", or
-            "medium", which rounds their factors to bfloat16 where the processor multiplies those faster.
+        weights: fraction of the budget -> (k,) weights of the reward terms (r2s/tasks/rewards.py).
+        loop: how. budget: when to stop.
         checkpoint: written after every evaluation; where it holds a state, training goes on from there.
-        dump: file for what led to a number that is not finite, for `replay`.
-        log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
-        progress: gets the fraction spent and what is worth showing, every step.
+        dump: file for what led to a number that is not finite, for `replay_dump`.
+        listeners: who is told.
 
     Raises:
         FloatingPointError: an action, observation, reward or loss is not finite.
     """
     keep_memory()
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every storage it makes
-    began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, eval_env_steps
+    began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, loop.eval_env_steps
     device = algo.torque.device
-    if compile:
-        with products(matmul):
-            algo.compile(batch_size)
-    storage = LazyTensorStorage(replay_size, device=device)
-    replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=batch_size)
+    if loop.compile:
+        with products(loop.matmul):
+            algo.compile(loop.batch_size)
+    storage = LazyTensorStorage(loop.replay_size, device=device)
+    replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=loop.batch_size)
     state = env.reset()
     row: dict = {}
     shown: dict = {}
-    if checkpoint and (saved := checkpoint.load(replay, replay_size)):
+    origin: dict = {}  # the environment's state before `actions`
+    actions: list[torch.Tensor] = []
+    if checkpoint and (saved := checkpoint.load(replay, loop.replay_size)):
         algo.load_state_dict(saved["algo"])
         env.set_state(_arrays(saved["env"]))
         state = state.update(saved["state"])
@@ -168,48 +197,50 @@ def train(
 
     while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
         env.weights = weights(spent)
-        algo.set_lr(1.0 - (1.0 - lr_end) * max(0.0, spent - lr_decay) / max(1.0 - lr_decay, 1e-9))
-        warm = env_steps >= learning_starts
+        algo.set_lr(loop.lr_share(spent))
+        warm = env_steps >= loop.learning_starts
         seen = state["observation"].to(device)
         state["action"] = algo.explore(seen).cpu() if warm else env.action_spec.rand()
-        before = env.state()
+        if len(actions) % env.task.steps == 0:
+            origin, actions = env.state(), []  # a dump replays from here: a copy at every step takes its time
+        actions.append(state["action"])
         try:
             step, state_next = env.step_and_maybe_reset(state)
         except FloatingPointError as error:
-            where = {"env": before, "action": state["action"], "weights": env.weights}
+            where = {"env": origin, "actions": torch.stack(actions)}
             raise _dumped(error, dump, where, f"{env_steps} env steps") from None
         replay.extend(_transition(step))
         state = state_next
         env_steps += env.nsim
-        if env_steps < learning_starts:
+        if env_steps < loop.learning_starts:
             continue
         price = torch.from_numpy(env.weights.astype(np.float32)).to(device)
-        for _ in range(updates_per_step):
+        for _ in range(loop.updates_per_step):
             batch = replay.sample()
             batch["reward"] = batch["reward_terms"] @ price
             random = torch.get_rng_state()
             try:
-                with products(matmul):
+                with products(loop.matmul):
                     row = algo.update(batch)
             except FloatingPointError as error:
-                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": matmul}
+                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": loop.matmul}
                 raise _dumped(error, dump, where, f"{env_steps} env steps") from None
             updates += 1
-        if updates % 1000 < updates_per_step or updates == updates_per_step:
+        if updates % 1000 < loop.updates_per_step or updates == loop.updates_per_step:
             numbers = {k: float(v) for k, v in row.items()}
             head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}
-            log(head | numbers | {f"weight_{i}": float(w) for i, w in enumerate(env.weights)})
+            listeners.log(head | numbers | {f"weight_{i}": float(w) for i, w in enumerate(env.weights)})
         if env_steps >= next_eval:
-            next_eval += eval_env_steps
+            next_eval += loop.eval_env_steps
             shown = evaluation()
-            evaluated(shown)
+            listeners.evaluated(shown)
             if checkpoint:
                 now = {"env_steps": env_steps, "updates": updates, "next_eval": next_eval, "shown": shown}
                 now |= {"seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
                 now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
-                checkpoint.save(now, replay, env_steps, replay_size)
-        progress(spent, shown | {"env_steps": env_steps, "updates": updates})
-    evaluated(evaluation())
+                checkpoint.save(now, replay, env_steps, loop.replay_size)
+        listeners.progress(spent, shown | {"env_steps": env_steps, "updates": updates})
+    listeners.evaluated(evaluation())
 
 
 def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any], when: str) -> FloatingPointError:
@@ -217,10 +248,10 @@ def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any],
     if path is None:
         return FloatingPointError(f"{error}, after {when}")
     torch.save(_tensors(where), path)
-    return FloatingPointError(f"{error}, after {when}; replay it with r2s.learning.train.replay on {path}")
+    return FloatingPointError(f"{error}, after {when}; replay it with r2s.learning.train.replay_dump on {path}")
 
 
-def replay(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
+def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
     """Do again what led to a number that is not finite.
 
     Args:
@@ -244,10 +275,10 @@ def replay(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy],
         return
     env.reset()
     env.set_state(_arrays(where["env"]))
-    env.weights = where["weights"].numpy()
-    state = env.read()
-    state["action"] = where["action"]
-    env.step(state)
+    state: TensorDictBase = env.read()
+    for action in where["actions"]:
+        state["action"] = action
+        _, state = env.step_and_maybe_reset(state)
 
 
 def _tensors(node: Any) -> Any:
@@ -266,8 +297,6 @@ def _arrays(node: Any) -> Any:
 
 def _transition(step) -> dict:
     """Return what an update needs of a step, flat."""
-    from tensordict import TensorDict
-
     after = step["next"]
     return TensorDict(
         {

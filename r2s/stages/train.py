@@ -25,12 +25,11 @@ def train(cfg, overrides):
 
     import torch
 
-    from r2s.errors import UserError
     from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import make_evaluation, selection_score
     from r2s.learning.policy import export_onnx, load_policy, save_policy
-    from r2s.learning.train import Budget, check_loop
+    from r2s.learning.train import Budget, Listeners, Loop
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
     from r2s.reporting import pages
@@ -39,15 +38,17 @@ def train(cfg, overrides):
 
     if cfg.algo.name == "oracle":
         return reference(cfg, overrides)
-    if cfg.matmul not in ("medium", "high", "highest"):
-        raise UserError(f"matmul: '{cfg.matmul}' is not allowed; medium, high and highest are")
     budget = Budget(cfg.budget.minutes, cfg.budget.env_steps)
     robot, task, settings = make_robot(cfg), make_task(cfg), plain(cfg.algo)
     center = make_dynamics(cfg, robot)
     draw = make_draw(cfg, robot, center)
     set_threads(cfg)
-    loop = {k: settings.pop(k) for k in LOOP}
-    check_loop(**loop)
+    loop = Loop(
+        **{k: settings.pop(k) for k in LOOP},
+        eval_env_steps=cfg.evaluation.env_steps,
+        compile=cfg.compile,
+        matmul=cfg.matmul,
+    )
     n_envs, name = settings.pop("n_envs"), settings.pop("name")
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
@@ -89,16 +90,11 @@ def train(cfg, overrides):
             algo,
             evaluate,
             weights,
-            budget=budget,
-            **loop,
-            compile=cfg.compile,
-            matmul=cfg.matmul,
-            eval_env_steps=cfg.evaluation.env_steps,
+            loop,
+            budget,
             checkpoint=checkpoint,
             dump=run.folder / "dump.pt",
-            log=lambda row: run.log("metrics", row),
-            evaluated=evaluated,
-            progress=show,
+            listeners=Listeners(lambda row: run.log("metrics", row), evaluated, show),
         )
         progress.close()
         checkpoint.clear()

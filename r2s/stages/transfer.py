@@ -21,8 +21,8 @@ def transfer(cfg, overrides):
     from omegaconf import OmegaConf
 
     from r2s.arm.deploy import DrivenArm
+    from r2s.arm.driven_batch import DrivenBatch
     from r2s.arm.interface import ArmStopped
-    from r2s.arm.simulated import SimulatedArm
     from r2s.engines.episodes import EngineArms
     from r2s.errors import UserError, nearest
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
@@ -76,12 +76,9 @@ def transfer(cfg, overrides):
         if arm is not None:
             fade = cfg.arm.soft_start_s
             if dynamics is not None:  # what the model says of this arm, behind the same driver
-                progress, shown = counted("predict from the model")
-                model = SimulatedArm(arm.robot, dynamics, position_noise=0.0, velocity_noise=0.0)
-                driven = DrivenArm(model, task, soft_start_s=fade)
-                done = rollout(policy, driven, task, starts, goals, shown)
-                progress.close()
-                rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(driven.stops)}, done
+                model = DrivenBatch(arm.robot, dynamics, task, len(goals), soft_start_s=fade, nthread=cfg.threads)
+                done = rollout(policy, model, task, starts, goals)
+                rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(model.stops)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")
             driven = DrivenArm(arm, task, soft_start_s=fade)
             done = rollout(policy, driven, task, starts, goals, shown)
