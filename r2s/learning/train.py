@@ -54,22 +54,43 @@ class Budget:
         return max(time_share, step_share)
 
 
-def check_loop(
-    *,
-    batch_size: int,
-    learning_starts: int,
-    updates_per_step: int,
-    replay_size: int,
-    lr_decay: float,
-    lr_end: float,
-) -> None:
-    """Check the settings of `train` that no learner checks; raises UserError."""
-    check_number("algo.batch_size", batch_size, "[1, inf)", whole=True)
-    check_number("algo.learning_starts", learning_starts, "[0, inf)", whole=True)
-    check_number("algo.updates_per_step", updates_per_step, "[1, inf)", whole=True)
-    check_number("algo.replay_size", replay_size, f"[{batch_size}, inf)", whole=True)
-    check_number("algo.lr_decay", lr_decay, "[0, 1]")
-    check_number("algo.lr_end", lr_end, "[0, 1]")
+@dataclass(frozen=True)
+class Loop:
+    """How a training goes.
+
+    Attributes:
+        batch_size: transitions per update. learning_starts: environment steps of uniform random actions.
+        updates_per_step: per step of all arms. replay_size: transitions kept.
+        lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
+        eval_env_steps: environment steps between two evaluations; one more comes at the end.
+        compile: turn the losses into machine code first; the time counts.
+        matmul: precision of the products within an update, for torch.set_float32_matmul_precision: "highest", or
+            "medium", which rounds their factors to bfloat16 where the processor multiplies those faster.
+
+    Raises:
+        UserError: a number outside its range, or no such precision.
+    """
+
+    batch_size: int = 256
+    learning_starts: int = 3200
+    updates_per_step: int = 1
+    replay_size: int = 1_000_000
+    lr_decay: float = 0.6
+    lr_end: float = 0.1
+    eval_env_steps: int = 80_000
+    compile: bool = False
+    matmul: str = "highest"
+
+    def __post_init__(self):
+        check_number("algo.batch_size", self.batch_size, "[1, inf)", whole=True)
+        check_number("algo.learning_starts", self.learning_starts, "[0, inf)", whole=True)
+        check_number("algo.updates_per_step", self.updates_per_step, "[1, inf)", whole=True)
+        check_number("algo.replay_size", self.replay_size, f"[{self.batch_size}, inf)", whole=True)
+        check_number("algo.lr_decay", self.lr_decay, "[0, 1]")
+        check_number("algo.lr_end", self.lr_end, "[0, 1]")
+        check_number("evaluation.env_steps", self.eval_env_steps, "[1, inf)", whole=True)
+        if self.matmul not in ("medium", "high", "highest"):
+            raise UserError(f"matmul: '{self.matmul}' is not allowed; medium, high and highest are")
 
 
 def keep_memory() -> None:
