@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from r2s.arm.twin import Twin
-from r2s.learning import randomization
 from r2s.learning.env import TaskEnv
+from r2s.learning.randomization import Around
 from r2s.learning.tqc import TQC
 from r2s.learning.train import keep_memory, products
 from r2s.physics.robot import SIM_DT
@@ -68,13 +68,7 @@ def friction(robot, dynamics, threads: int) -> tuple[float, float]:
 def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
     arms, steps, task = 32, 50, ReachTask(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
-
-    spread = {k: v for k, v in conf("dr/paper").items() if k != "name"}
-
-    def draw(rng, m):
-        return randomization.draw(rng, dynamics, m, **spread)
-
-    env = TaskEnv(robot, task, draw, arms, nthread=threads, stagger=True)
+    env = TaskEnv(robot, task, Around(robot, dynamics, **conf("dr/paper")), arms, nthread=threads, stagger=True)
     state = env.reset()
     action = env.action_spec.rand()
     bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)

@@ -18,14 +18,19 @@ from hydra.utils import instantiate  # noqa: E402
 from r2s.arm.ramp import poses_about, ramp  # noqa: E402
 from r2s.arm.tracking import record  # noqa: E402
 from r2s.excitation.fourier import fourier  # noqa: E402
+from r2s.identification.settings import Settings  # noqa: E402
 from r2s.physics.dynamics import nominal_dynamics  # noqa: E402
 from r2s.physics.robot import load_robot  # noqa: E402
 from r2s.runs import _cpu  # noqa: E402
 
 
 def conf(path: str) -> dict:
-    """Read one file of conf/."""
-    return yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+    """Read one file of conf/: the arguments of what its `_target_` names, for the Panda."""
+    document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+    if path.startswith("task/"):
+        document["torque_fraction"] = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())["torque_fraction"]
+    beside = {"_target_", "torque_fraction"} if path.startswith("robot/") else {"_target_"}
+    return {k: v for k, v in document.items() if k not in beside}
 
 
 MACHINE = f"{_cpu()}, {os.cpu_count()} cores"
@@ -42,12 +47,10 @@ def searches(name: str, **change) -> list:
     return [instantiate(s | {k: v for k, v in change.items() if k in s}) for s in yaml.safe_load(text)]
 
 
-def how(torque: str = "commanded", **change) -> dict:
-    """Return the keyword arguments of `identify` as stage=identify gives them."""
-    s = SETTINGS
-    out = {"bounds": s["bounds"], "prior": s["prior"][torque], "terms": s["terms"][torque]}
-    out |= {"window_s": s["window_s"], "stride": s["stride"], "cutoff_hz": s["cutoff_hz"], "folds": s["folds"]}
-    return out | {"breakaway_max": s["breakaway"]} | change
+def how(torque: str = "commanded", **change) -> Settings:
+    """Return the settings of `identify` as stage=identify gives them, but for the family."""
+    own = {k: v for k, v in SETTINGS.items() if k != "validation_fraction"}
+    return Settings(**own | {k: own[k][torque] for k in ("terms", "prior")} | change)
 
 
 def side_by_side(jobs: Sequence[Sequence[str]]) -> None:

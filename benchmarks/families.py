@@ -36,7 +36,7 @@ def main() -> None:
     """Run every truth and seed and write the table."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 10
     settings = how()
-    given = [settings[k] for k in ("bounds", "prior")] + [["offset", "inertia_scale", "delay"], settings["folds"]]
+    given = [settings.bounds, settings.prior, ["offset", "inertia_scale", "delay"], settings.folds]
     names = [f.name for f in FAMILIES]
     picks = {}
     began = time.perf_counter()

@@ -48,7 +48,7 @@ def one(seed: int) -> list[float]:
     motions = [recorded(seed, s) for s in (2 * seed, 2 * seed + 1)]
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
-    found = identify(ROBOT, OLD, motions[0], searches("staged"), family="sigmoid", ramps=ramps, **how(terms=TERMS))
+    found = identify(ROBOT, OLD, motions[0], searches("staged"), how(family="sigmoid", terms=TERMS), ramps=ramps)
     seconds = time.perf_counter() - began
     d, space = found.dynamics, found.space
     fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)

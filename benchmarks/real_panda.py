@@ -32,7 +32,7 @@ def main() -> None:
         low, high = np.quantile(phase, share)
         out = (phase >= low) & (phase <= high)
         near = (phase > low - GUARD_S) & (phase < high + GUARD_S)
-        found = identify(ROBOT, OLD, recording.select(~near), staged, family="auto", **how("measured"))
+        found = identify(ROBOT, OLD, recording.select(~near), staged, how("measured", family="auto"))
         e = prediction_errors(ROBOT, OLD, found.dynamics, recording.select(out), window_s=0.2, cutoff_hz=10.0)
         after, before = np.array(e["torque_rmse_Nm"]), np.array(e["nominal_torque_rmse_Nm"])
         cells = [

@@ -67,20 +67,17 @@ def there(seed: int, path: str) -> None:
     from sb3_contrib import TQC
     from stable_baselines3.common.callbacks import BaseCallback
 
-    from r2s.learning import randomization
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import make_evaluation
+    from r2s.learning.randomization import Around
     from r2s.tasks.episode import measures
     from r2s.tasks.reach import ReachTask
     from r2s.tasks.rewards import curriculum
 
     torch.set_num_threads(1)
     task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
-    spread = {k: v for k, v in conf("dr/paper").items() if k != "name"}
+    draw = Around(ROBOT, NEW, **conf("dr/paper"))
     mean, std = (x.astype(np.float32) for x in task.observation_scale(ROBOT))
-
-    def draw(rng, m):
-        return randomization.draw(rng, NEW, m, **spread)
 
     class Reach(gym.Env):
         observation_space = gym.spaces.Box(-10.0, 10.0, mean.shape, np.float32)

@@ -53,15 +53,15 @@ def main() -> None:
     ]
     s = how(terms=TERMS)
     nominal = replace(OLD, breakaway=TRUTH.breakaway)  # edges come from ramps, for all searches alike
-    space = searched(ROBOT, nominal, s["bounds"], TERMS, motions[0])
-    timing = {"window_s": s["window_s"], "stride": s["stride"], "slowest": CLEAR * OLD.dq_min}
+    space = searched(ROBOT, nominal, s.bounds, TERMS, motions[0])
+    timing = {"window_s": s.window_s, "stride": s.stride, "slowest": CLEAR * OLD.dq_min}
     judge = ReplayResidual(ROBOT, space, motions[1], window_s=0.2, stride=5, batch=SHOWN)
     figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
     lines = []
     for name in ("ga", "cmaes", "least_squares", "staged"):
         quick = TorqueResidual(ROBOT, space, motions[0])
         data = ReplayResidual(ROBOT, space, motions[0], **timing, batch=72)
-        problem = Watched(data, quick, s["prior"])
+        problem = Watched(data, quick, s.prior)
         problem.watch()
         u, count = problem.start, 0
         # stops of their own (generations, convergence) are lifted: only the clock ends a search

@@ -21,7 +21,7 @@ def one(seed: int) -> dict:
     train, validation = (record(Twin(ROBOT, seed), fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1))
     ramps = ramp(Twin(ROBOT, seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
-    found = identify(ROBOT, OLD, train, searches("staged"), family="auto", ramps=ramps, **how())
+    found = identify(ROBOT, OLD, train, searches("staged"), how(family="auto"), ramps=ramps)
     seconds = time.perf_counter() - began
     e = prediction_errors(ROBOT, OLD, found.dynamics, validation, window_s=0.2, cutoff_hz=10.0)
     joints = np.array(e["position_rmse_mrad"]) / np.array(e["nominal_position_rmse_mrad"])

@@ -6,39 +6,42 @@ Read it from the bottom: `main` composes and says a user's mistake as one line w
 import os
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-from r2s.stages.build import CONF, OPEN
+from r2s.errors import UserError, check_number, choices, nearest
+from r2s.stages.build import CONF, unread
 
 STAGES = ("train", "identify", "transfer", "compare", "pipeline")
 
 
-def check_overrides(words):
-    """Raise UserError for an option that the config does not have, with the nearest one that it has.
+def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
+    """Check what was typed; Hydra would stop too, with several lines.
 
-    Hydra would stop too, with several lines; a sweep is checked value by value before its first job starts.
+    A sweep is checked before its first job, value by value.
+
+    Args:
+        words: KEY=VALUE and GROUP=OPTION. config_dir: the user's own, as --config-dir says.
+
+    Raises:
+        UserError: an option that the config does not have, with the nearest that it has; or one that no job reads.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
-    from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from r2s.errors import UserError, choices, nearest
-
-    def keys(node, prefix=""):
-        for k in node:
-            yield prefix + str(k)
-            if not OmegaConf.is_missing(node, k) and isinstance(node[k], DictConfig):
-                yield from keys(node[k], f"{prefix}{k}.")
-
-    groups = {p.name: sorted(f.stem for f in p.glob("*.yaml")) for p in CONF.iterdir() if p.is_dir()}
+    own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        cfg = compose("config")
-        known = [*keys(cfg), *groups]
-        base: list[str] = []
+        cfg = compose("config", own)
+        loader = GlobalHydra.instance().config_loader()
+        groups = {g: loader.get_group_options(g) for g in loader.list_groups("") if g != "hydra"}
+        known = [*_keys(cfg), *groups]
+        typed: dict[str, str] = {}  # what is checked, by the name that an error calls it
+        jobs = [own]  # the words of a job with the first value of each sweep, and of one for every other value
         for word in words:
             if word.lstrip("+~").startswith(("hydra.", "hydra/")):
                 continue  # Hydra's own
@@ -50,60 +53,50 @@ def check_overrides(words):
                 values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
                 trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
                 for trial in trials:
-                    before, cfg = cfg, compose("config", [*base, trial])
-                    check_type(name, before, cfg)
-                if not parsed.is_sweep_override() and name in ("data", "arm", "simulator"):
-                    known = [*keys(cfg), *groups]
-                base.append(trials[0])
+                    cfg = compose("config", [*jobs[0], trial])
+                if name in groups:
+                    known = [*_keys(cfg), *groups]
+                first = jobs[0]
+                jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
+                typed[name] = word
             except (HydraException, OmegaConfBaseException) as error:
-                if "=" not in word:
-                    raise UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}") from None
-                key, value = word.split("=", 1)
-                bare = key.lstrip("+~")
-                if bare in groups:
-                    options = groups[bare]
-                    raise UserError(
-                        f"{bare}: no option '{value}'; allowed: {choices(options)}{nearest(value, options)}"
-                    ) from None
-                if bare not in known:
-                    raise UserError(
-                        f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}"
-                    ) from None
-                raise UserError(f"{word}: {' '.join(str(error).split())}") from None
+                raise _said_in_one_line(word, error, groups, known) from None
+        configs = [compose("config", job) for job in jobs]
+        for name in typed:
+            reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
+            if reasons and all(reasons):
+                raise UserError(reasons[0])
     GlobalHydra.instance().clear()
 
 
-def check_counts(cfg):
-    """Raise UserError where what counts something is no such number."""
-    from omegaconf import OmegaConf
+def _keys(node: Any, prefix: str = "") -> Iterator[str]:
+    from omegaconf import DictConfig, OmegaConf
 
-    from r2s.errors import check_number
-
-    least = {"seed": 0, "threads": 0, "arm.seed": 0, "evaluation.episodes": 1, "evaluation.env_steps": 1}
-    for key, low in (least | {"algo.n_envs": 1}).items():
-        if (value := OmegaConf.select(cfg, key)) is not None:
-            check_number(key, value, f"[{low}, inf)", whole=True)
+    for k in node:
+        yield prefix + str(k)
+        if not OmegaConf.is_missing(node, k) and isinstance(node._get_node(k), DictConfig):
+            yield from _keys(node[k], f"{prefix}{k}.")
 
 
-def check_type(key, before, after):
-    """Raise UserError where a number of the config was replaced by a word."""
-    from omegaconf import OmegaConf
-
-    from r2s.errors import UserError
-
-    def number(value):
-        return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-    old, new = OmegaConf.select(before, key, throw_on_missing=False), OmegaConf.select(after, key)
-    if number(old) and isinstance(new, str):
-        raise UserError(f"{key}: '{new}' is not a number, such as {old:g}")
+def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
+    """Return what is wrong with a word that Hydra does not take."""
+    if "=" not in word:
+        return UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}")
+    key, value = word.split("=", 1)
+    bare = key.lstrip("+~")
+    if bare in groups and value not in groups[bare]:
+        return UserError(
+            f"{bare}: no option '{value}'; allowed: {choices(groups[bare])}{nearest(value, groups[bare])}"
+        )
+    if bare not in known:
+        return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
+    return UserError(f"{word}: {' '.join(str(error).split())}")
 
 
 def resumed(cfg, overrides):
     """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
     from omegaconf import OmegaConf
 
-    from r2s.errors import UserError, nearest
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -125,7 +118,6 @@ def is_there(cfg, overrides):
     """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
     from omegaconf import OmegaConf
 
-    from r2s.errors import UserError
     from r2s.runs import is_done
 
     if not cfg.name:
@@ -148,44 +140,44 @@ def is_there(cfg, overrides):
     return False
 
 
+def run_job(cfg):
+    """Call the stage of one composed config; a mistake ends the job (`failed`)."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
+
+    overrides = list(HydraConfig.get().overrides.task)
+    try:
+        if cfg.stage not in STAGES:
+            raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
+        check_number("seed", cfg.seed, "[0, inf)", whole=True)
+        check_number("threads", cfg.threads, "[0, inf)", whole=True)
+        if cfg.resume:
+            cfg, overrides = resumed(cfg, overrides)
+        elif cfg.only_missing and is_there(cfg, overrides):
+            return
+        getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
+    except (UserError, FloatingPointError, InterpolationResolutionError) as error:
+        failed(" ".join(str(error).split()))
+    except MissingMandatoryValue as error:
+        failed(f"{error.full_key} must be given: {error.full_key}=...")
+    except KeyboardInterrupt:
+        print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
+        sys.exit(130)
+
+
 def main():
     """Compose and run; a user's mistake is one line and exit status 2."""
     import hydra
+    from hydra._internal.utils import get_args_parser
 
-    from r2s.errors import UserError
-
-    words = [w for w in sys.argv[1:] if not w.startswith("-")]
-    asked_for_help = any(
-        w in ("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--info", "-i") for w in sys.argv[1:]
-    )
-
-    @hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")
-    def job(cfg):
-        from hydra.core.hydra_config import HydraConfig
-        from omegaconf.errors import MissingMandatoryValue
-
-        overrides = list(HydraConfig.get().overrides.task)
-        try:
-            check_counts(cfg)
-            if cfg.resume:
-                cfg, overrides = resumed(cfg, overrides)
-            elif cfg.only_missing and is_there(cfg, overrides):
-                return
-            with OPEN:
-                getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
-        except (UserError, FloatingPointError) as error:
-            failed(error)
-        except MissingMandatoryValue as error:
-            failed(f"{error.full_key} must be given: {error.full_key}=...")
-        except KeyboardInterrupt:
-            print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
-            sys.exit(130)
-
+    sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
+    typed = get_args_parser().parse_args()
+    job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
     try:
-        if not asked_for_help:
-            check_overrides(words)
+        if not (typed.help or typed.hydra_help or typed.cfg or typed.info):
+            check_overrides(typed.overrides, typed.config_dir)
         with tempfile.TemporaryDirectory() as folder:
-            if {"-m", "--multirun"} & set(sys.argv[1:]):  # a job that fails leaves the others alone
+            if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
             try:
                 job()
@@ -197,6 +189,8 @@ def main():
                 sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
+    finally:
+        end_workers()
 
 
 def end_workers():
@@ -207,16 +201,16 @@ def end_workers():
         get_reusable_executor().shutdown(wait=True)
 
 
-def failed(error):
+def failed(message):
     """End a job that cannot go on: with exit status 2, or in a sweep with a note for its end."""
-    status = stop(error)
+    status = stop(message)
     if "R2S_FAILED" not in os.environ:
         sys.exit(status)
     with open(os.environ["R2S_FAILED"], "a") as file:
-        file.write(f"{error}\n")
+        file.write(f"{message}\n")
 
 
-def stop(error):
+def stop(message):
     """Print a user's mistake as one line and return the exit status."""
-    print(f"error: {error}", file=sys.stderr)
+    print(f"error: {message}", file=sys.stderr)
     return 2

@@ -220,6 +220,8 @@ def _make_folder(parent: Path, name: str) -> Path:
 
 def _git() -> dict[str, Any]:
     root = Path(__file__).parent.parent
+    if not (root / ".git").exists():  # installed, perhaps within somebody else's repository
+        return {"commit": None, "dirty": None}
 
     def ask(*words: str) -> str | None:
         try:

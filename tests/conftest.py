@@ -22,8 +22,13 @@ GRACE_S = 10.0  # a server that watches its parent needs a moment to see that it
 
 
 def conf(path: str) -> dict:
-    """Read one file of conf/ as plain YAML."""
-    return yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+    """Read one file of conf/ as plain YAML: the arguments of what its `_target_` names, for the Panda."""
+    document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
+    group = path.split("/")[0]
+    if group == "task":
+        document["torque_fraction"] = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())["torque_fraction"]
+    beside = {"_target_", "torque_fraction"} if group == "robot" else {"_target_"}
+    return {k: v for k, v in document.items() if k not in beside} if isinstance(document, dict) else document
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from conftest import conf
 from r2s.errors import UserError
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
-from r2s.learning.randomization import draw
+from r2s.learning.randomization import Around
 from r2s.learning.tqc import TQC
 from r2s.learning.train import Budget, Loop, replay_dump, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
@@ -56,10 +56,9 @@ def dynamics_of(panda, family="sigmoid"):
 
 def make_env(panda, family="sigmoid", seed=0):
     """Return an environment of 4 arms whose friction, delay and lag are drawn anew at every reset."""
-    settings = {k: v for k, v in conf("dr/paper").items() if k != "name"}
 
     def drawn(rng: np.random.Generator, m: int) -> Dynamics:
-        d = draw(rng, dynamics_of(panda, family), m, **settings)
+        d = Around(panda, dynamics_of(panda, family), **conf("dr/paper"))(rng, m)
         timing = {"delay": rng.uniform(1e-3, 5e-3, m), "lag": rng.uniform(0, 2e-3, m)}
         return Dynamics(**{**vars(d), **timing})
 

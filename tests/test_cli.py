@@ -7,6 +7,7 @@ import platform
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import REAL, ROOT
+from conftest import REAL, ROOT, conf
 
 from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
@@ -41,12 +42,12 @@ FORKS.set_forkserver_preload(
 )
 
 
-def front_door(words: tuple[str, ...], out: str, err: str) -> None:
-    """Be `python run.py WORDS` with its output in files."""
+def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
+    """Be `python run.py WORDS` in the folder `at`, with its output in files."""
     for number, path in enumerate((out, err), 1):
         os.dup2(os.open(path, os.O_WRONLY), number)
     os.environ["COLUMNS"] = "110"
-    os.chdir(ROOT)
+    os.chdir(at)
     sys.argv = ["run.py", *words]
     try:
         runpy.run_path(str(ROOT / "run.py"), run_name="__main__")
@@ -61,17 +62,17 @@ def front_door(words: tuple[str, ...], out: str, err: str) -> None:
     os._exit(status)  # a process of multiprocessing would wait for the workers of a sweep
 
 
-def r2s(*words: str) -> subprocess.CompletedProcess[str]:
+def r2s(*words: str, at: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run run.py as a user does, without a terminal."""
     with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:
-        child = FORKS.Process(target=front_door, args=(words, out.name, err.name))
+        child = FORKS.Process(target=front_door, args=(words, at, out.name, err.name))
         child.start()
         child.join()
         return subprocess.CompletedProcess(words, child.exitcode or 0, out.read(), err.read())
 
 
-def succeed(*words: str) -> str:
-    done = r2s(*words)
+def succeed(*words: str, at: Path = ROOT) -> str:
+    done = r2s(*words, at=at)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "INFO" not in done.stdout + done.stderr, "a library talks into the progress"
     return done.stdout
@@ -144,7 +145,7 @@ def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     sweep = ["-m", *TOY, f"root={tmp_path}", "only_missing=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
     done = r2s(*sweep)
     assert done.returncode == 2
-    assert "error: lr: 2.0 is not allowed; a number in (0, 1] is\n" in done.stderr
+    assert "error: algo.lr: 2.0 is not allowed; a number in (0, 1] is\n" in done.stderr
     assert done.stderr.endswith("error: 1 job of the sweep failed, see above; the others are done\n")
     assert json.loads((tmp_path / "train" / "lr0.001" / "meta.json").read_text())["status"] == "done"
     assert [p.name for p in (tmp_path / "train").iterdir()] == ["lr0.001"]
@@ -212,8 +213,8 @@ def test_exported_policy_is_the_trained_policy(trained):
     from r2s.tasks.reach import ReachTask
 
     config = yaml.safe_load((trained / "config.yaml").read_text())
-    task = ReachTask(**(config["task"] | {"reach": tuple(config["task"]["reach"])}))
-    policy = load_policy(trained, load_robot(**config["robot"]), task)
+    task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["task"]["reach"])}))
+    policy = load_policy(trained, load_robot(**conf("robot/panda")), task)
     session = onnxruntime.InferenceSession(str(trained / "policy.onnx"))
     seen = torch.randn(5, 47)
     torque = session.run(None, {"observation": seen.numpy()})[0]
@@ -286,6 +287,33 @@ MISTAKES = {
     "device=tpu": r"device: 'tpu' is not allowed; cpu and cuda are",
     "matmul=low": r"matmul: 'low' is not allowed; medium, high and highest are",
     "friction.phi1=[1,2]": r"friction.phi1: 2 values for the 7 joints",
+    "friction.phi1=abc": r"friction.phi1: 'abc' is not a number",
+    "algo.lr=2.0": r"algo.lr: 2.0 is not allowed; a number in \(0, 1\] is",
+    "algo.hidden=abc": r"algo.hidden: 'abc' is not a number",
+    "dr.phi_relative=1.5": r"dr.phi_relative: 1.5 is not allowed",
+    "reward.anneal=[a,b]": r"reward.anneal: 'a' is not a number",
+    "evaluation.env_steps=ten": r"evaluation.env_steps: 'ten' is not a number",
+    "budget.minutes=four": r"budget.minutes: 'four' is not a number",
+    "stage=identify identify.window_s=-1": r"identify.window_s: -1 is not allowed",
+    "stage=identify identify.folds=few": r"identify.folds: 'few' is not a number",
+    "stage=identify identify.bounds.phi1=[2,1]": r"identify.bounds.phi1: \[2, 1\] is not \[low, high\]",
+    "stage=identify data.seconds=long": r"data.seconds: 'long' is not a number",
+    "stage=identify data=simulated data.truth=papr": r"data.truth: no 'papr'.*did you mean 'paper'",
+    "stage=identify search.0.ftol=small": r"search.0.ftol: 'small' is not a number",
+    "stage=identify dr=none": r"dr: stage=identify does not read it",
+    "stage=identify data=simulated arm.seed=1": r"arm.seed: stage=identify does not read it: only data=arm moves",
+    "stage=transfer robot=fr3": r"robot: stage=transfer does not read it: it comes from the policy's run; leave it",
+    "stage=transfer task.ctrl_hz=20": r"task.ctrl_hz: stage=transfer does not read it",
+    "stage=compare friction=paper": r"friction: stage=compare does not read it: it reads robot, runs; leave it out",
+    "arm.seed=3": r"arm.seed: stage=train does not read it: a training meets no arm",
+    "calibration=RUN friction=uniform": r"friction: stage=train does not read it: calibration= says what friction is",
+    "algo=oracle budget.minutes=3": r"budget.minutes: stage=train does not read it: nothing is trained",
+    "-m algo=tqc seed=0,1 policy=x": r"policy: stage=train does not read it",
+    "stage=pipeline calibration=RUN": r"calibration: stage=pipeline does not read it: it identifies for itself",
+    "stage=pipeline budget.minutes=1": r"budget.minutes: stage=pipeline .*pipeline.train_minutes",
+    "stage=pipeline dr=identified": r"dr: the nominal training of stage=pipeline has no calibration",
+    "algo._target_=nowhere.Mine": r"algo._target_: cannot load 'nowhere.Mine'.*No module named 'nowhere'",
+    "+algo.speed=1": r"unknown option 'algo.speed'",
 }
 
 
@@ -382,6 +410,36 @@ def test_a_policy_for_an_fr3_meets_one(root):
     words = ["arm=fr3_emulated", "simulator=none", "evaluation.episodes=1", "name=fr3", f"root={root}"]
     succeed("stage=transfer", f"policy={root / 'train' / 'fr3'}", *words, *TOY)
     assert (root / "transfer" / "fr3" / "stops.txt").read_text() == "none\n"
+
+
+def test_a_training_transfers_without_the_identification_that_it_came_from(identified, tmp_path):
+    """calibration= and dr=identified: with the identify folder gone, the same policy meets the same arms."""
+    folder = tmp_path / "identified"
+    shutil.copytree(identified, folder)
+    words = [f"calibration={folder}", "dr=identified", "name=a"]
+    succeed(*words, f"root={tmp_path}", *TOY)
+    rows = []
+    for _ in range(2):
+        out = succeed("stage=transfer", f"policy={tmp_path / 'train' / 'a'}", f"root={tmp_path}", *TOY)
+        (written,) = re.findall(r"written: (\S+)", out)
+        rows.append(json.loads((Path(written) / "summary.json").read_text()))
+        shutil.rmtree(folder, ignore_errors=True)
+    assert rows[0] == rows[1]
+    assert set(rows[0]) == {"mujoco", "predicted", "twin"}
+
+
+def test_another_arm_needs_no_more_than_its_file(root):
+    """Six joints, their own limits, no published friction: the pipeline ends with its table."""
+    arm = Path(__file__).parent / "models" / "six_joints.xml"
+    words = ["robot=other", f"robot.mjcf={arm}", "pipeline.train_minutes=null", "name=six", f"root={root}", *TOY]
+    out = succeed("stage=pipeline", *words)
+    assert all(
+        f"{model} model, {where}" in out for model in ("identified", "nominal") for where in ("mujoco", "twin")
+    )
+    config = yaml.safe_load((root / "train" / "six_nominal" / "config.yaml").read_text())
+    assert config["friction"]["phi1"] == conf("friction/uniform")["phi1"]
+    parameters = yaml.safe_load((root / "identify" / "six" / "parameters.yaml").read_text())
+    assert parameters["joints"] == len(parameters["parameters"]["phi1"]["value"]) == 6
 
 
 def test_names_that_are_taken_get_one_line(tmp_path):

@@ -12,9 +12,9 @@ from r2s.engines.dart import DartEngine
 from r2s.engines.episodes import EngineArms
 from r2s.engines.interface import MujocoEngine
 from r2s.errors import UserError
-from r2s.learning import randomization
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.learning.policy import make_policy
+from r2s.learning.randomization import Around
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.tasks.episode import rollout
@@ -164,10 +164,7 @@ def test_a_policy_meets_the_same_arm_in_every_engine():
     robot, task = load_robot(**conf("robot/panda")), ReachTask(episode_s=0.9, torque_fraction=0.15)
     truth = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass)
-
-    def draw(rng, m):
-        return randomization.draw(rng, truth, m, phi_relative=0.1, inertia_relative=0.05)
-
+    draw = Around(robot, truth, phi_relative=0.1, inertia_relative=0.05)
     torch.manual_seed(0)
     policy = make_policy(robot, task, (16,))
     starts, goals = fixed_episodes(robot, task, 4)

@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from r2s.errors import UserError
-from r2s.learning import randomization
 from r2s.learning.env import TaskEnv
+from r2s.learning.randomization import Around
 from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
@@ -27,8 +27,7 @@ K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/table
 @pytest.fixture(scope="module")
 def draw(panda):
     center = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-    widths = {k: v for k, v in conf("dr/paper").items() if k != "name"}
-    return lambda rng, m: randomization.draw(rng, center, m, **widths)
+    return Around(panda, center, **conf("dr/paper"))
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """What was put into an arm is found again from its recording, by every search and for both kinds of torque."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import mujoco
@@ -24,10 +24,12 @@ from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.search.cmaes import CovarianceAdaptation
 from r2s.identification.search.genetic import Genetic
 from r2s.identification.search.least_squares import LeastSquares
+from r2s.identification.settings import Settings
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import _settled
 from r2s.identification.windows import cut_windows, replay
-from r2s.learning.randomization import draw_identified, physical
+from r2s.learning.randomization import Identified as Draws
+from r2s.learning.randomization import physical
 from r2s.physics.dynamics import nominal_dynamics, of_family
 from r2s.physics.friction import FAMILIES, family
 from r2s.physics.robot import load_robot
@@ -97,9 +99,11 @@ def recorded(robot, dynamics, seconds, seed):
 
 def run(robot, nominal, recording, searches, **change):
     """Identify with the settings of conf/, few terms and no scan of the dead zone unless `change` says so."""
-    how = {"bounds": BOUNDS, "prior": SETTINGS["prior"][recording.torque], "breakaway_max": None}
+    how = {"bounds": BOUNDS, "prior": SETTINGS["prior"][recording.torque], "breakaway": None}
     how |= {"terms": ["offset", "inertia_scale", *(["delay"] if recording.torque == "commanded" else [])]}
-    return identify(robot, nominal, recording, searches, **(how | WINDOW | {"stride": SETTINGS["stride"]} | change))
+    how |= {k: SETTINGS[k] for k in ("window_s", "cutoff_hz", "stride")}
+    how |= {f.name: change.pop(f.name) for f in fields(Settings) if f.name in change}
+    return identify(robot, nominal, recording, searches, Settings(**how), nthread=1, **change)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +124,7 @@ def found(arm, wrong, motion, ramps):
 @pytest.fixture(scope="module")
 def directly(arm, wrong, motion):
     """Least squares on replays alone, and the dead zone looked for in the motion."""
-    return run(arm, wrong, motion, [LeastSquares(ftol=1e-3)], breakaway_max=SETTINGS["breakaway"])
+    return run(arm, wrong, motion, [LeastSquares(ftol=1e-3)], breakaway=SETTINGS["breakaway"])
 
 
 def curve_error(found, truth, dq):
@@ -487,7 +491,7 @@ def test_whole_links_predict_an_arm_of_other_masses_and_centres(arm, truth, wron
 def test_draws_of_what_was_identified_are_physical_and_keep_its_correlation(linked):
     """dr=identified: every drawn arm is physical, and parameters vary together as in the joint distribution."""
     space, saved = linked.saved
-    drawn = draw_identified(np.random.default_rng(1), space, saved.samples, 3000)
+    drawn = Draws(space, saved.samples)(np.random.default_rng(1), 3000)
     assert drawn.offset.shape == (3000, 3)
     mass, least = inertial(drawn)
     assert mass.min() > 0
@@ -543,7 +547,7 @@ def test_an_interrupted_run_goes_on_to_the_same_end(arm, wrong, clean, motion, t
     recording, searches = clean, [Genetic(population=12, generations=3), LeastSquares(max_evaluations=3)]
     if torque == "commanded":
         recording, searches = motion.select(motion.t < 2.5), [TORQUE, LeastSquares(max_evaluations=2)]
-        how = {"breakaway_max": 1.5, "stride": 20}
+        how = {"breakaway": 1.5, "stride": 20}
     whole, store = Store(), Store()
     expected = run(arm, wrong, recording, searches, memo=whole, **how)
     assert len(whole.kept) >= 6

@@ -13,7 +13,7 @@ from r2s.errors import UserError
 from r2s.identification.link_inertia import CHOLESKY, LINK, inertia_scale, links, log_cholesky, pseudo_inertia
 from r2s.identification.parameter_file import load_parameters, load_posterior, save_parameters
 from r2s.identification.parameters import WHOLE_ARM, Estimate, parameter_space, units
-from r2s.learning.randomization import draw, draw_identified, physical
+from r2s.learning.randomization import Around, Identified, physical
 from r2s.physics.dynamics import nominal_dynamics, of_family
 from r2s.physics.friction import FAMILIES, STRIBECK
 from r2s.physics.robot import load_robot
@@ -287,7 +287,7 @@ def test_draws_come_back_from_their_file(tmp_path, panda, whole):
     space, _ = load_parameters(tmp_path, panda)
     for place in (tmp_path, tmp_path / "parameters.yaml"):
         assert np.array_equal(load_posterior(place, space), samples)
-    drawn = draw_identified(np.random.default_rng(0), space, samples, 40)
+    drawn = Identified(space, samples)(np.random.default_rng(0), 40)
     rows = whole.dynamics(samples)
     assert drawn.offset.shape == (40, 7)
     which = np.abs(drawn.delay[:, None] - rows.delay).argmin(1)
@@ -448,17 +448,10 @@ def test_impossible_dynamics_are_named(panda, change, words):
     assert all(word in str(caught.value) for word in words)
 
 
-def around(name):
-    """Return the widths of a conf/dr that draws around a centre."""
-    settings = conf(f"dr/{name}")
-    assert settings.pop("name") == "around"
-    return settings
-
-
 def test_the_papers_randomization_stays_in_its_ranges(panda, paper):
     """Phi within 10 %, tensor elements within 5 %, every tensor physical, each element a draw of its own."""
     m = 400
-    drawn = draw(np.random.default_rng(0), paper, m, phi_relative=0.10, inertia_relative=0.05)
+    drawn = Around(panda, paper, phi_relative=0.10, inertia_relative=0.05)(np.random.default_rng(0), m)
     phi = drawn.phi / paper.phi
     assert phi.shape == (m, 7, 3)
     assert 0.9 <= phi.min() < 0.901
@@ -488,18 +481,18 @@ def test_physical_tells_apart():
     assert physical(np.array([[1.0, 2, 0], [2, 1, 0], [0, 0, 1]])).tolist() is False
 
 
-def test_same_seed_same_draws(paper):
+def test_same_seed_same_draws(panda, paper):
     """A seed gives the same arms twice and another seed gives others."""
     first, again, other = (
-        draw(np.random.default_rng(s), paper, 3, phi_relative=0.1, inertia_relative=0.05) for s in (5, 5, 6)
+        Around(panda, paper, phi_relative=0.1, inertia_relative=0.05)(np.random.default_rng(s), 3) for s in (5, 5, 6)
     )
     assert np.array_equal(first.phi, again.phi)
     assert np.array_equal(first.inertia, again.inertia)
     assert not np.array_equal(first.phi, other.phi)
 
 
-def test_zero_widths_give_the_centre(paper):
+def test_zero_widths_give_the_centre(panda, paper):
     """conf/dr/none is m copies of the centre."""
-    drawn = draw(np.random.default_rng(0), paper, 5, **around("none"))
+    drawn = Around(panda, paper, **conf("dr/none"))(np.random.default_rng(0), 5)
     assert np.array_equal(drawn.phi, np.broadcast_to(paper.phi, (5, 7, 3)))
     assert np.array_equal(drawn.inertia, np.broadcast_to(paper.inertia, (5, 7, 3, 3)))

@@ -56,6 +56,7 @@ class Twin:
     """
 
     def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None):
+        check_number("arm.seed", seed, "[0, inf)", whole=True)
         check_number("arm.payload", payload, "[0, inf)")
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")

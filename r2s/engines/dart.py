@@ -4,6 +4,7 @@ Semi-implicit Euler, joint damping implicit, position limits hard, Coulomb frict
 below DART and Gazebo's own plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from r2s.errors import UserError
 from r2s.physics.description import Bodies, about, make_pose, shaped
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
 
@@ -149,6 +151,12 @@ class DartEngine:
         result = query()
         self._skeleton.setPositions(here)
         return result
+
+
+def dart(robot: Robot) -> Callable[[Dynamics], DartEngine]:
+    """Return what makes the engine of simulator=dart: of an arm with these links, without gravity."""
+    _dartpy()
+    return lambda d: DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
 
 
 def _dartpy() -> ModuleType:

@@ -9,6 +9,7 @@ import importlib
 import os
 import tempfile
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -109,6 +110,16 @@ class GazeboEngine:
         if all(q is not None and dq is not None for q, dq in seen):
             self._q = np.array([q[0] for q, _ in seen])
             self._dq = np.array([dq[0] for _, dq in seen])
+
+
+def gazebo(robot: Robot) -> Callable[[Dynamics], GazeboEngine]:
+    """Return what makes the engine of simulator=gazebo: of an arm with these links.
+
+    Raises:
+        UserError: Gazebo is not installed.
+    """
+    sim = bindings()
+    return lambda d: GazeboEngine(robot, d, sim)
 
 
 def bindings() -> ModuleType:

@@ -7,7 +7,7 @@ bootstrap). The paper's algorithm is search=ga on the residual of eq. (8).
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.errors import UserError
 from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_recording
 from r2s.identification.dead_zone import scan_breakaway
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.parameters import check_parameters
-from r2s.identification.problem import NONE, Problem, Report, Search, check_choices, check_prior, searched
+from r2s.identification.problem import NONE, Problem, Report, Search, searched
 from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.settings import Settings
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
 from r2s.physics.dynamics import Dynamics, of_family
@@ -41,18 +40,9 @@ def identify(
     nominal: Dynamics,
     recording: Recording,
     searches: Sequence[Search],
+    settings: Settings,
     *,
-    bounds: Mapping[str, Sequence[float]],
-    prior: Mapping[str, float],
-    terms: Sequence[str],
-    family: str = "sigmoid",
     ramps: Ramps | None = None,
-    window_s: float = 0.2,
-    stride: int = 5,
-    cutoff_hz: float = 10.0,
-    breakaway_max: float | None = 1.5,
-    folds: int = 4,
-    keep_nominal: bool = False,
     seed: int = 0,
     nthread: int = 0,
     report: Report = lambda row: None,
@@ -65,33 +55,20 @@ def identify(
         nominal: where to start, and what blocks without bounds keep.
         recording: what the arm did; its torque decides the residual (replay_residual.py or torque_residual.py).
         searches: at least one.
-        bounds: {"phi1": [low, high], ...}, of whatever may be searched.
-        prior: {"inertia_scale": sigma, ...}, see `Problem`.
-        terms: what is searched beside friction: offset, inertia_scale or link, delay, lag, load, drag_sin,
-            drag_cos, gain.
-        family: of the friction; auto keeps the one with the smallest error on motion left out.
+        settings: what is searched, within what, and how the residuals are made.
         ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
-        window_s, stride: replay windows, s, and ms that compared angles are means of (commanded torque).
-        cutoff_hz: zero-phase filter of the torque.
-        breakaway_max: scan the edges up to this, Nm, where there are no ramps (commanded torque; a link-side sensor
-            does not feel the motor's breakaway). None keeps the nominal edges.
-        folds: of the cross-validation within the recording.
-        keep_nominal: a joint whose refit predicts motion left out not clearly better than the nominal one keeps that.
         seed: of the bootstrap.
         nthread: 0 is all.
         report: called with a row of history after every step or generation.
         memo: called with the name of a step and a function that does it, returns its result; it may remember.
 
     Raises:
-        UserError: the recording does not fit the arm or hardly moves, or a term that does not exist.
+        UserError: the recording does not fit the arm or hardly moves.
     """
     check_recording(robot, recording)
-    check_choices(family, terms)
     names = [f.name for f in FAMILIES]
-    if folds < 2 and (family == "auto" or keep_nominal):
-        raise UserError(f"identify.folds: {folds} is too few to leave motion out; at least 2 are needed")
-    check_parameters("bounds", bounds)
-    check_prior(prior)
+    bounds, prior, terms, family = settings.bounds, settings.prior, settings.terms, settings.family
+    folds = settings.folds
     began, history = time.perf_counter(), []
 
     def told(row: dict) -> None:
@@ -106,11 +83,12 @@ def identify(
             history.extend(json.loads(str(done["history"])))
         return done
 
-    how = {"cutoff_hz": cutoff_hz}
+    how = {"cutoff_hz": settings.cutoff_hz}
     families: dict[str, float] = {}
     if family == "auto":
         chosen = step(
-            "family", lambda: compare_families(robot, nominal, recording, bounds, prior, terms, folds, how, told)
+            "family",
+            lambda: compare_families(robot, nominal, recording, bounds, prior, terms, folds, how, told),
         )
         families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
         family = names[int(chosen["best"])]
@@ -123,15 +101,15 @@ def identify(
         slowest = 0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min  # bristles have no dead zone
         data = ReplayResidual(
             *(robot, space, recording),
-            window_s=window_s,
-            stride=stride,
+            window_s=settings.window_s,
+            stride=settings.stride,
             slowest=slowest,
             edges=None if ramps is None else _reached(breakaway(ramps), np.array([-np.inf, np.inf])),
             batch=batch,
             nthread=nthread,
         )
     kept = np.zeros(robot.n, dtype=bool)
-    if keep_nominal:
+    if settings.keep_nominal:
         kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
     problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool))
     u = problem.start
@@ -152,6 +130,7 @@ def identify(
         if "lag" in space.blocks and u[lag := space.where("lag")] == problem.start[lag]:
             problem.believe(lag, NONE)
     dynamics, edges = space.dynamics(space.from_unit(u)), None
+    window_s, stride = settings.window_s, settings.stride
     scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=told)
     if ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
@@ -161,8 +140,8 @@ def identify(
             found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, None)})
             command = np.asarray(found["edges"]) - dynamics.offset[:, None]
         space = replace(space, break_command=command)
-    elif breakaway_max and recording.torque == "commanded":
-        found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, breakaway_max)})
+    elif settings.breakaway and recording.torque == "commanded":
+        found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, settings.breakaway)})
         space = replace(space, nominal=replace(nominal, breakaway=np.asarray(found["edges"])))
     sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
     return conclude(problem, space, sure, pd.DataFrame(history), families, None if edges is None else edges.spread)

@@ -170,6 +170,14 @@ def check_parameters(where: str, names: Iterable[str]) -> None:
             raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(known)}{nearest(name, known)}")
 
 
+def check_bounds(where: str, bounds: Mapping[str, Sequence[float]]) -> None:
+    """Raise UserError where bounds are not two rising numbers (positive where the scale is logarithmic)."""
+    for name, pair in bounds.items():
+        words = isinstance(pair, str) or any(isinstance(end, str) for end in pair)
+        if words or len(pair) != 2 or not pair[0] < pair[1] or (name in logarithmic() and pair[0] <= 0):
+            raise UserError(f"{where}.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
+
+
 def parameter_space(
     robot: Robot,
     nominal: Dynamics,
@@ -185,9 +193,8 @@ def parameter_space(
     if not bounds:
         raise UserError(f"bounds: no parameter is named; allowed: {choices(units())}")
     check_parameters("bounds", bounds)
-    for name, pair in bounds.items():
-        if len(pair) != 2 or not pair[0] < pair[1] or (name in logarithmic() and pair[0] <= 0):
-            raise UserError(f"bounds.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
+    check_bounds("bounds", bounds)
+    for name in bounds:
         others = {k for f in known_families() for k in f.names} - set(nominal.family.names)
         if name in others:
             raise UserError(

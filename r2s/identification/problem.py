@@ -47,7 +47,7 @@ def check_prior(prior: Mapping[str, float]) -> None:
     """Raise UserError if the prior names what does not exist (it may name what is not searched), or no deviation."""
     check_parameters("prior", prior)
     for name, sigma in prior.items():
-        if not sigma > 0:
+        if isinstance(sigma, str) or not sigma > 0:
             raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
 
 

@@ -1,53 +1,92 @@
 """Domain randomization: dynamics drawn around a centre, every link tensor physically valid."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from r2s.errors import UserError, check_number
+from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+
+Draw = Callable[[np.random.Generator, int], Dynamics]  # (source of the draws, m) -> dynamics of m arms
 
 TRIES = 64
 
 
-def draw(
-    rng: np.random.Generator, center: Dynamics, m: int, *, phi_relative: float, inertia_relative: float
-) -> Dynamics:
-    """Return m drawn dynamics: the paper's randomization at phi 0.10 and inertia 0.05.
+@dataclass(frozen=True)
+class Around:
+    """Dynamics drawn around a centre: the paper's randomization at phi 0.10 and inertia 0.05.
 
     phi (all 21) ~ center * U(1 - phi_relative, 1 + phi_relative)
     I_xx I_yy I_zz I_xy I_xz I_yz (all 42) ~ center * U(1 - inertia_relative, 1 + inertia_relative)
     Each element is a draw of its own; an unphysical tensor is drawn again.
 
-    Args:
-        rng: source of the draws.
-        center: dynamics without a batch shape, n joints.
-        m: how many.
+    Attributes:
+        robot: the arm.
+        center: its dynamics, without a batch shape.
         phi_relative, inertia_relative: half widths; 0 keeps the centre.
+
+    Raises:
+        UserError: a half width outside [0, 1).
     """
-    n = len(center.offset)
-    phi = center.phi * rng.uniform(1 - phi_relative, 1 + phi_relative, (m, *center.phi.shape))
-    inertia = np.broadcast_to(center.inertia, (m, n, 3, 3)).copy()
-    todo = np.ones((m, n), dtype=bool) if inertia_relative else np.zeros((m, n), dtype=bool)
-    for _ in range(TRIES):
-        if not todo.any():
-            break
-        arm, link = np.nonzero(todo)
-        factor = rng.uniform(1 - inertia_relative, 1 + inertia_relative, (len(arm), 3, 3))
-        upper = np.triu(factor)
-        tensor = center.inertia[link] * (upper + np.triu(factor, 1).transpose(0, 2, 1))
-        inertia[arm, link] = tensor
-        todo[arm, link] = ~physical(tensor)
-    inertia[todo] = np.broadcast_to(center.inertia, (m, n, 3, 3))[todo]  # after 64 tries: the centre, which is valid
-    return replace(center, phi=phi, inertia=inertia)
+
+    robot: Robot
+    center: Dynamics
+    phi_relative: float
+    inertia_relative: float
+
+    def __post_init__(self):
+        check_number("dr.phi_relative", self.phi_relative, "[0, 1)")
+        check_number("dr.inertia_relative", self.inertia_relative, "[0, 1)")
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return m drawn dynamics."""
+        center, wide, n = self.center, self.inertia_relative, self.robot.n
+        phi = center.phi * rng.uniform(1 - self.phi_relative, 1 + self.phi_relative, (m, *center.phi.shape))
+        inertia = np.broadcast_to(center.inertia, (m, n, 3, 3)).copy()
+        todo = np.ones((m, n), dtype=bool) if wide else np.zeros((m, n), dtype=bool)
+        for _ in range(TRIES):
+            if not todo.any():
+                break
+            arm, link = np.nonzero(todo)
+            factor = rng.uniform(1 - wide, 1 + wide, (len(arm), 3, 3))
+            upper = np.triu(factor)
+            tensor = center.inertia[link] * (upper + np.triu(factor, 1).transpose(0, 2, 1))
+            inertia[arm, link] = tensor
+            todo[arm, link] = ~physical(tensor)
+        inertia[todo] = np.broadcast_to(center.inertia, (m, n, 3, 3))[todo]  # after 64 tries the centre: it is valid
+        return replace(center, phi=phi, inertia=inertia)
 
 
-def draw_identified(rng: np.random.Generator, space: ParameterSpace, samples: np.ndarray, m: int) -> Dynamics:
-    """Return m dynamics drawn from what identification says of the arm: rows of `samples` (S, P), so correlated.
+@dataclass(frozen=True)
+class Identified:
+    """Dynamics drawn from what identification says of the arm: rows of `samples` (S, P) of `space`, so correlated.
 
     Every row is physical: scales of tensors are positive, and the full parametrisation has no other values.
     """
-    return space.dynamics(samples[rng.integers(len(samples), size=m)])
+
+    space: ParameterSpace
+    samples: np.ndarray
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return m drawn dynamics."""
+        return self.space.dynamics(self.samples[rng.integers(len(self.samples), size=m)])
+
+
+def identified(robot: Robot, center: Dynamics, calibration: str | Path | None) -> Identified:
+    """Return the draws of what `calibration`, a run folder, holds of the arm; they have their own centre.
+
+    Raises:
+        UserError: no such folder, or one without the draws of an identification.
+    """
+    if not calibration:
+        raise UserError("dr=identified draws from what was identified: give calibration=RUN_FOLDER as well")
+    space, _ = load_parameters(calibration, robot)
+    return Identified(space, load_posterior(calibration, space))
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:

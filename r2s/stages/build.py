@@ -1,104 +1,229 @@
-"""What several stages make from the config: robot, dynamics, task, draws, arms, engines, run folders."""
+"""What several stages make from the config: parts by their `_target_`, robot, dynamics, draws, arms, run folders."""
 
+import inspect
 import os
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from r2s.errors import UserError, check_number, choices, nearest
 
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
-OPEN = ExitStack()  # arms and emulators of this job
+COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """`evaluation` of the config.
+
+    Attributes:
+        episodes: goals of an evaluation. env_steps: between two evaluations of a training.
+
+    Raises:
+        UserError: one of them is no positive whole number.
+    """
+
+    episodes: int
+    env_steps: int
+
+    def __post_init__(self):
+        check_number("evaluation.episodes", self.episodes, "[1, inf)", whole=True)
+        check_number("evaluation.env_steps", self.env_steps, "[1, inf)", whole=True)
+
+
+def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
+    """Make the part that a config node names by `_target_`.
+
+    Args:
+        node: of the config; its keys are arguments of the part.
+        group: where the node is in the config, for error messages.
+        given: further arguments, which come from code and go first.
+        beside: keys of the node that are no arguments of the part.
+
+    Raises:
+        UserError: there is no such part, or not with these arguments.
+    """
+    settings = plain(node)
+    settings = {k: v for k, v in settings.items() if k not in ("_target_", "name", *beside)}
+    return called(target(node, group), group, settings, *given)
+
+
+def target(node: Any, group: str) -> Callable[..., Any]:
+    """Return what a config node's `_target_` names: a class or a function of an importable module."""
+    from hydra.utils import get_object
+
+    path = node.get("_target_")
+    if not path:
+        raise UserError(f"{group}: its yaml has no _target_, the dotted path of what makes it")
+    try:
+        return get_object(path)
+    except Exception as error:  # importing a user's module may fail in any way
+        cause = error.__cause__ or error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        seen = " ".join(str(cause).split())
+        raise UserError(f"{group}._target_: cannot load '{path}': {type(cause).__name__}: {seen}") from None
+
+
+def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
+    """Call `make` with arguments from code and with `settings` of a config group, whose mistakes are named as typed.
+
+    Raises:
+        UserError: an argument that it does not take or misses, a word where its annotation asks for a number, or
+            whatever it says itself.
+    """
+    check_words(make, group, settings)
+    try:
+        inspect.signature(make).bind(*given, **settings)
+    except TypeError as error:
+        raise UserError(f"{group}: {getattr(make, '__name__', make)}: {error}") from None
+    try:
+        return make(*given, **settings)
+    except UserError as error:
+        first = str(error).split(":")[0].split(".")[0]
+        if first in settings and first != group:  # a part does not know the name of its group
+            raise UserError(f"{group}.{error}") from None
+        raise
+
+
+def check_words(make: Callable[..., Any], group: str, settings: Mapping[str, Any]) -> None:
+    """Raise UserError where a word stands for what `make` wants as a number or as a list of numbers."""
+    try:
+        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
+    except NameError:  # annotations that only a type checker can resolve
+        return
+    for key, value in settings.items():
+        kinds = set(_kinds(hints.get(key)))
+        words = [v for v in (value if isinstance(value, list) else [value]) if isinstance(v, str)]
+        if words and kinds & {int, float} and not kinds & {str, Any}:
+            raise UserError(f"{group}.{key}: '{words[0]}' is not a number")
+
+
+def _kinds(hint: Any) -> Iterator[Any]:
+    inner = get_args(hint)
+    for kind in inner:
+        yield from _kinds(kind)
+    if not inner:
+        yield hint
+
+
+def unread(name: str, cfg: Any) -> str | None:
+    """Return why the stage of `cfg` does not read the typed key or group `name`; None where it does."""
+    from importlib import import_module
+
+    stage = import_module(f"r2s.stages.{cfg.stage}")
+    keys = stage.reads(cfg)
+    if any(name == key or name.startswith(f"{key}.") or key.startswith(f"{name}.") for key in (*COMMON, *keys)):
+        return None
+    head = name.split(".")[0]
+    why = stage.WHY.get(name) or stage.WHY.get(head) or f"it reads {choices(sorted(keys))}"
+    return f"{name}: stage={cfg.stage} does not read it: {why}; leave it out"
 
 
 def make_robot(cfg):
     """Return the arm of conf/robot."""
-    from r2s.physics.robot import load_robot
-
-    return load_robot(**plain(cfg.robot))
+    return part(cfg.robot, "robot", beside=["torque_fraction"])
 
 
 def make_dynamics(cfg, robot):
     """Return conf/friction and conf/inertia, or what `calibration=` identified."""
     from r2s.identification.parameter_file import load_parameters
-    from r2s.physics.dynamics import nominal_dynamics
 
     if cfg.calibration:
         space, x = load_parameters(cfg.calibration, robot)
         return space.dynamics(x)
-    return nominal_dynamics(robot, **plain(cfg.friction), inertia_scale=plain(cfg.inertia.scale))
+    return dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
+
+
+def dynamics_of(robot, friction, inertia):
+    """Return the dynamics that a file of conf/friction and one of conf/inertia describe."""
+    from r2s.physics.dynamics import nominal_dynamics
+
+    check_words(nominal_dynamics, "friction", friction)
+    check_words(nominal_dynamics, "inertia", {"scale": inertia["scale"]})
+    return nominal_dynamics(robot, **friction, inertia_scale=inertia["scale"])
 
 
 def make_task(cfg):
-    """Return conf/task."""
-    from r2s.tasks.reach import ReachTask
-
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items()}
-    return ReachTask(**settings)  # type: ignore[arg-type]
+    """Return conf/task; its lists are tuples there, a task is a fixed thing."""
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
+    return called(target(cfg.task, "task"), "task", settings)
 
 
 def make_draw(cfg, robot, center):
     """Return the domain randomization of conf/dr about `center`: (rng, m) -> Dynamics."""
-    from r2s.errors import UserError
-    from r2s.identification.parameter_file import load_parameters, load_posterior
-    from r2s.learning import randomization
-
-    settings = plain(cfg.dr)
-    if settings.pop("name") == "identified":
-        if not cfg.calibration:
-            raise UserError("dr=identified draws from what was identified: give calibration=RUN_FOLDER as well")
-        space, _ = load_parameters(cfg.calibration, robot)
-        samples = load_posterior(cfg.calibration, space)
-        return lambda rng, m: randomization.draw_identified(rng, space, samples, m)
-    return lambda rng, m: randomization.draw(rng, center, m, **settings)
+    return part(cfg.dr, "dr", robot, center)
 
 
-def make_arm(cfg, robot):
-    """Return conf/arm; what has to be closed is in OPEN."""
-    from functools import partial
+@contextmanager
+def opened_arm(cfg, robot):
+    """Give the arm of conf/arm inside a `with`; one that has to be closed is a context manager itself."""
+    from r2s.arm.interface import ArmStopped
 
-    from r2s.errors import UserError
-
-    name, arm = cfg.arm.name, cfg.arm
-    if name == "twin":
-        from r2s.arm.twin import Twin
-
-        return Twin(robot, arm.seed, arm.payload, arm.stiffness)
-    if name == "none":
-        raise UserError("arm: none cannot be commanded; allowed: twin, panda_emulated, fr3_emulated, panda, fr3")
-    from r2s.arm.fr3 import FR3
-    from r2s.arm.panda import Panda
-
-    make = Panda if name.startswith("panda") else FR3
-    if name.endswith("_emulated"):
-        from r2s.arm.emulator.process import Emulator
-        from r2s.arm.twin import Twin
-
-        version = 5 if name.startswith("panda") else 10
-        emulator = Emulator(partial(Twin, robot, arm.seed), version=version, realtime=arm.realtime)
-        client = make(robot, OPEN.enter_context(emulator), clear=lambda reason: True)
-    else:
-        client = make(robot, arm.address, clear=operator_agrees, realtime=arm.realtime)
-    OPEN.callback(client.close)
-    return client
+    if "_target_" not in cfg.arm:
+        raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(_arms())}")
+    with ExitStack() as stack:
+        try:
+            arm = part(cfg.arm, "arm", robot, beside=["soft_start_s"])
+            arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
+        except ArmStopped as stop:
+            raise UserError(f"arm={cfg.arm.name}: {stop}") from None
+        yield arm
 
 
-def make_engine(cfg, robot):
-    """Return Dynamics -> the engine of simulator=dart or gazebo, of an arm with these links."""
-    if cfg.simulator.name == "gazebo":
-        from r2s.engines.gazebo import GazeboEngine, bindings
-
-        sim = bindings()
-        return lambda d: GazeboEngine(robot, d, sim)
-    from r2s.engines.dart import DartEngine
-
-    return lambda d: DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
+def _arms():
+    return sorted(p.stem for p in (CONF / "arm").glob("*.yaml") if p.stem != "none")
 
 
-def operator_agrees(reason):
-    """Ask whether a stop of the arm may be cleared; nobody at the terminal: no."""
-    if not sys.stdin.isatty():
-        return False
-    return input(f"\nthe arm has stopped itself: {reason}\nis it safe to go on? [y/N] ").strip().lower() == "y"
+@contextmanager
+def opened_source(cfg, robot, seed):
+    """Give what is recorded: conf/arm, or with data=simulated an arm of known truth."""
+    if cfg.data.kind != "simulated":
+        with opened_arm(cfg, robot) as arm:
+            yield arm
+        return
+    from dataclasses import replace
+
+    from r2s.arm.simulated import SimulatedArm
+
+    dynamics = replace(make_truth(cfg, robot), delay=cfg.data.delay, lag=cfg.data.lag)
+    noise = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
+    yield SimulatedArm(robot, dynamics, **noise, seed=seed)
+
+
+def make_truth(cfg, robot):
+    """Return the dynamics of data.truth: a file of conf/friction, with the one of conf/inertia of that name.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    from omegaconf import OmegaConf
+
+    both = [CONF / group / f"{cfg.data.truth}.yaml" for group in ("friction", "inertia")]
+    if not all(path.is_file() for path in both):
+        known = sorted({p.stem for p in both[0].parent.glob("*")} & {p.stem for p in both[1].parent.glob("*")})
+        raise UserError(
+            f"data.truth: no '{cfg.data.truth}' in friction and inertia; allowed: "
+            f"{choices(known)}{nearest(str(cfg.data.truth), known)}"
+        )
+    return dynamics_of(robot, *(plain(OmegaConf.load(path)) for path in both))
+
+
+def is_learner(cfg):
+    """Return whether conf/algo is trained; what is not is a controller made of robot, task and dynamics."""
+    from r2s.learning.learner import Learner
+
+    kind = target(cfg.algo, "algo")
+    return inspect.isclass(kind) and issubclass(kind, Learner)
+
+
+def make_controller(cfg, robot, task):
+    """Return the controller of conf/algo, with the model that it believes in."""
+    return part(cfg.algo, "algo", robot, task, make_dynamics(cfg, robot))
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
@@ -125,7 +250,9 @@ def plain(node):
     """Return a config node as dicts, lists and numbers."""
     from omegaconf import OmegaConf
 
-    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    if not OmegaConf.is_config(node):
+        return node
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
 
 
 def console():
@@ -133,16 +260,6 @@ def console():
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 110)
-
-
-def learner(name):
-    """Return the class of conf/algo."""
-    from r2s.learning.ddpg import DDPG
-    from r2s.learning.sac import SAC
-    from r2s.learning.td3 import TD3
-    from r2s.learning.tqc import TQC
-
-    return {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC}[name]
 
 
 def set_threads(cfg):
@@ -157,35 +274,8 @@ def device(cfg):
     """Return where learner and replay buffer live; the physics stays on the processor."""
     import torch
 
-    from r2s.errors import UserError
-
     if cfg.device not in ("cpu", "cuda"):
         raise UserError(f"device: '{cfg.device}' is not allowed; cpu and cuda are")
     if cfg.device == "cuda" and not torch.cuda.is_available():
         raise UserError("device: cuda is not there; torch sees no GPU, device=cpu works")
     return cfg.device
-
-
-def make_source(cfg, robot, seed):
-    """Return what is recorded: conf/arm, or a simulated arm of known truth."""
-    if cfg.data.kind != "simulated":
-        return make_arm(cfg, robot)
-    from dataclasses import replace
-
-    from omegaconf import OmegaConf
-
-    from r2s.arm.simulated import SimulatedArm
-    from r2s.physics.dynamics import nominal_dynamics
-
-    truth = plain(OmegaConf.load(CONF / "friction" / f"{cfg.data.truth}.yaml"))
-    scale = plain(OmegaConf.load(CONF / "inertia" / f"{cfg.data.truth}.yaml"))["scale"]
-    dynamics = replace(nominal_dynamics(robot, **truth, inertia_scale=scale), delay=cfg.data.delay, lag=cfg.data.lag)
-    noise = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
-    return SimulatedArm(robot, dynamics, **noise, seed=seed)
-
-
-def oracle(cfg, robot, task):
-    """Return the controller of algo=oracle."""
-    from r2s.learning.computed_torque import Oracle
-
-    return Oracle(robot, task, make_dynamics(cfg, robot), cfg.algo.move_s)

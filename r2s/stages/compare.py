@@ -2,6 +2,13 @@
 
 from r2s.stages.build import console, make_robot, open_run
 
+WHY: dict[str, str] = {}
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    return {"runs", "robot"}
+
 
 def compare(cfg, overrides):
     """Put runs of stage=train side by side: tables with intervals over seeds, learning curves."""

@@ -1,8 +1,110 @@
 """stage=identify: recording -> parameters.yaml, errors on training and validation motion, figures."""
 
 import os
+from dataclasses import dataclass
+from typing import Any
 
-from r2s.stages.build import OPEN, console, make_dynamics, make_robot, make_source, open_run, plain
+from r2s.errors import UserError, check_number
+from r2s.stages.build import (
+    called,
+    console,
+    make_dynamics,
+    make_robot,
+    make_truth,
+    open_run,
+    opened_source,
+    part,
+    plain,
+)
+
+WHY = {
+    "arm": "only data=arm moves an arm",
+    "inertia": "calibration= says what the links are",
+    "friction": "calibration= says what friction is; friction.family= may change its law",
+}
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    keys = {"robot", "calibration", "identify", "search", "data"}
+    keys |= {"friction.family"} if cfg.calibration else {"friction", "inertia"}
+    return keys | ({"arm"} if cfg.data.kind == "arm" else set())
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What is recorded of an arm: data=arm, and with a known truth data=simulated.
+
+    Attributes:
+        torque: level of the torque that is kept, commanded or measured.
+        seconds: of each of the two motions.
+        excitation_seed: of the first motion, and 1 more of the second.
+        excitation: file of a motion to follow instead of the first; None: one is made.
+        ramp_poses: postures at which every joint's torque is ramped both ways; 0: none.
+
+    Raises:
+        UserError: a number outside its range.
+    """
+
+    kind: str
+    torque: str
+    seconds: float
+    excitation_seed: int
+    excitation: str | None
+    ramp_poses: int
+
+    def __post_init__(self):
+        check_number("data.seconds", self.seconds, "(0, inf)")
+        check_number("data.excitation_seed", self.excitation_seed, "[0, inf)", whole=True)
+        check_number("data.ramp_poses", self.ramp_poses, "[0, inf)", whole=True)
+        if self.torque not in ("commanded", "measured"):
+            raise UserError(f"data.torque: '{self.torque}' is not allowed; commanded and measured are")
+
+
+@dataclass(frozen=True)
+class Simulated(Excitation):
+    """An excitation of a simulated arm.
+
+    Attributes:
+        truth: what it is (`make_truth`). delay, lag: s, of its actuation.
+        position_noise, velocity_noise: standard deviations of its sensors, rad and rad/s.
+    """
+
+    truth: str
+    delay: float
+    lag: float
+    position_noise: float
+    velocity_noise: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        for name in ("delay", "lag", "position_noise", "velocity_noise"):
+            check_number(f"data.{name}", getattr(self, name), "[0, inf)")
+
+
+@dataclass(frozen=True)
+class File:
+    """The user's own recording, data=recording; r2s/recordings/readers.py says what each means.
+
+    Raises:
+        UserError: a number outside its range.
+    """
+
+    kind: str
+    path: str
+    torque: str | None
+    validation: str | None
+    ramps: str | None
+    period: float | None
+    max_gap_s: float
+    columns: dict[str, str | None]
+    topic: str | None
+    joints: list[str] | None
+
+    def __post_init__(self):
+        check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
+        if self.period is not None:
+            check_number("data.period", self.period, "(0, inf)")
 
 
 def record_motion(cfg, robot, motion, seed, label):
@@ -14,10 +116,9 @@ def record_motion(cfg, robot, motion, seed, label):
     progress = Progress(label)
     if motion is None:
         motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=cfg.data.torque == "measured")
-    arm = make_source(cfg, robot, seed)
-    out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+    with opened_source(cfg, robot, seed) as arm:  # one client at a time, and the next recording is another
+        out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
-    OPEN.close()  # an arm has one client at a time, and the next recording is another
     return motion, out
 
 
@@ -29,39 +130,39 @@ def record_ramps(cfg, robot):
     if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
         return None
     progress = Progress("ramp the joints until they move")
-    out = ramp(
-        make_source(cfg, robot, cfg.data.excitation_seed + 2),
-        poses_about(robot, cfg.data.ramp_poses),
-        progress=lambda k, n: progress(k / n, f"{k} ramps"),
-    )
+    with opened_source(cfg, robot, cfg.data.excitation_seed + 2) as arm:
+        poses = poses_about(robot, cfg.data.ramp_poses)
+        out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
     progress.close(f"{out.recording.duration:.1f} s of ramps")
-    OPEN.close()
     return out
 
 
-def read_motion(cfg, robot):
-    """Return training and validation motion of data.path and data.validation; they must not share motion."""
+def read_motion(robot, file, share):
+    """Return training and validation motion of a `File`; they must not share motion.
+
+    Args:
+        share: of the recording that validates where there is no second one.
+    """
     from dataclasses import replace
 
     import numpy as np
 
-    from r2s.errors import UserError
     from r2s.identification.checks import check_recording
     from r2s.recordings.readers import read
 
-    how = {k: plain(cfg.data[k]) for k in ("torque", "columns", "period", "max_gap_s", "topic", "joints")}
+    how = {k: getattr(file, k) for k in ("torque", "columns", "period", "max_gap_s", "topic", "joints")}
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
-    recording = read(cfg.data.path, **how)
+    recording = read(file.path, **how)
     check_recording(robot, recording)
-    if not cfg.data.validation:
-        if how["period"] is None and (period := recording.repeats_after()):
+    if not file.validation:
+        if file.period is None and (period := recording.repeats_after()):
             print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
             recording = replace(recording, period=period)
-        return recording.split(cfg.identify.validation_fraction)
-    if os.path.realpath(cfg.data.validation) == os.path.realpath(cfg.data.path):
+        return recording.split(share)
+    if os.path.realpath(file.validation) == os.path.realpath(file.path):
         raise UserError("data.validation is the training file itself: it must hold other motion")
-    validation = read(cfg.data.validation, **how)
+    validation = read(file.validation, **how)
     check_recording(robot, validation)
     rows = {row.tobytes() for row in np.column_stack([recording.q, recording.dq])}
     same = sum(row.tobytes() in rows for row in np.column_stack([validation.q, validation.dq]))
@@ -73,58 +174,89 @@ def read_motion(cfg, robot):
     return recording, validation
 
 
+def recorded(cfg, robot, run, motion):
+    """Return training and validation motion and the ramps of an arm; a resumed run reads what it has recorded.
+
+    Args:
+        run: the run folder, which gets them. motion: the excitation to follow; None: one is made.
+
+    Raises:
+        UserError: the arm stopped.
+    """
+    from r2s.arm.interface import ArmStopped
+    from r2s.recordings.ramps import Ramps
+    from r2s.recordings.readers import read
+
+    def one(name, motion, seed):
+        path = run.folder / f"{name}.npz"
+        if not path.is_file():
+            motion, out = record_motion(cfg, robot, motion, seed, f"record {name} motion")
+            motion.save(run.folder / f"excitation_{name}.csv")
+            out.save(path)
+        return read(path, torque=cfg.data.torque)
+
+    try:
+        train = one("train", motion, cfg.data.excitation_seed)
+        validation = one("validation", None, cfg.data.excitation_seed + 1)
+        path = run.folder / "ramps.npz"
+        ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
+        if ramps is not None and not path.is_file():
+            ramps.save(path)
+    except ArmStopped as stop:
+        raise UserError(f"the arm stopped while it was recorded: {stop}") from None
+    return train, validation, ramps
+
+
+def make_settings(cfg, torque):
+    """Return the `Settings` of an identification from this level of torque."""
+    from r2s.identification.settings import Settings
+
+    words: dict[str, Any] = plain(cfg.identify)
+    del words["validation_fraction"]
+    for key in ("terms", "prior"):
+        words[key] = words[key][torque]
+    return called(Settings, "identify", words | {"family": cfg.friction.family})
+
+
 def identify(cfg, overrides):
     """Recording -> parameters.yaml, errors on training and validation motion, figures."""
-    from hydra.utils import instantiate
-
-    from r2s.arm.interface import ArmStopped
-    from r2s.errors import UserError
     from r2s.excitation.motion import load
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
     from r2s.identification.prediction import prediction_errors
-    from r2s.identification.problem import check_choices
     from r2s.physics.description import write_description
     from r2s.progress import Progress
     from r2s.recordings.ramps import Ramps
-    from r2s.recordings.readers import files_of, read
+    from r2s.recordings.readers import files_of
     from r2s.reporting import pages
     from r2s.reporting.identification_tables import identification_table
 
-    robot, settings = make_robot(cfg), plain(cfg.identify)
+    robot = make_robot(cfg)
     nominal = make_dynamics(cfg, robot)
-    for terms in settings["terms"].values():
-        check_choices(cfg.friction.family, terms)
+    searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
+    # what is wrong is said before a folder is made
+    check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
+    if cfg.data.torque in cfg.identify.terms:
+        settings = make_settings(cfg, cfg.data.torque)
     inputs, ramps, motion = [], None, None
     if cfg.data.kind == "recording":
-        train, validation = read_motion(cfg, robot)
-        inputs = [f for p in (cfg.data.path, cfg.data.validation) if p for f in files_of(p)]
-        if cfg.data.ramps:
-            ramps = Ramps.load(cfg.data.ramps)
-            inputs.append(cfg.data.ramps)
-    elif cfg.data.excitation:
-        motion = load(cfg.data.excitation, robot)  # a wrong file is said before a folder is made
-        inputs = [cfg.data.excitation]
+        file = called(File, "data", plain(cfg.data))
+        train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
+        inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
+        if file.ramps:
+            ramps = Ramps.load(file.ramps)
+            inputs.append(file.ramps)
+    else:
+        called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
+        if cfg.data.kind == "simulated":
+            make_truth(cfg, robot)
+        if cfg.data.excitation:
+            motion = load(cfg.data.excitation, robot)
+            inputs = [cfg.data.excitation]
     with open_run(cfg, overrides, inputs) as run:
         if cfg.data.kind != "recording":
-
-            def recorded(name, motion, seed):
-                path = run.folder / f"{name}.npz"
-                if not path.is_file():
-                    motion, out = record_motion(cfg, robot, motion, seed, f"record {name} motion")
-                    motion.save(run.folder / f"excitation_{name}.csv")
-                    out.save(path)
-                return read(path, torque=cfg.data.torque)
-
-            try:
-                train = recorded("train", motion, cfg.data.excitation_seed)
-                validation = recorded("validation", None, cfg.data.excitation_seed + 1)
-                path = run.folder / "ramps.npz"
-                ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
-                if ramps is not None and not path.is_file():
-                    ramps.save(path)
-            except ArmStopped as stop:
-                raise UserError(f"the arm stopped while it was recorded: {stop}") from None
+            train, validation, ramps = recorded(cfg, robot, run, motion)
+        settings = make_settings(cfg, train.torque)
         progress = Progress("identify")
 
         def told(row):
@@ -137,27 +269,18 @@ def identify(cfg, overrides):
             robot,
             nominal,
             train,
-            [instantiate(s) for s in cfg.search],
-            bounds=settings["bounds"],
-            prior=settings["prior"][train.torque],
-            terms=settings["terms"][train.torque],
-            family=cfg.friction.family,
+            searches,
+            settings,
             ramps=ramps,
-            window_s=settings["window_s"],
-            stride=settings["stride"],
-            cutoff_hz=settings["cutoff_hz"],
-            breakaway_max=settings["breakaway"],
-            folds=settings["folds"],
-            keep_nominal=settings["keep_nominal"],
             seed=cfg.seed,
             nthread=cfg.threads,
             report=told,
             memo=run.memo,
         )
         progress.close()
-        how = {"window_s": settings["window_s"], "cutoff_hz": settings["cutoff_hz"], "nthread": cfg.threads}
+        how = {"window_s": settings.window_s, "cutoff_hz": settings.cutoff_hz}
         summary = {
-            side: prediction_errors(robot, nominal, found.dynamics, data, **how)
+            side: prediction_errors(robot, nominal, found.dynamics, data, **how, nthread=cfg.threads)
             for side, data in (("train", train), ("validation", validation))
         }
         source = {"recording": train.name, "torque": train.torque, "run": str(run.folder)}
@@ -170,7 +293,6 @@ def identify(cfg, overrides):
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         write_description(run.folder / "model", robot, found.dynamics)
         run.summary(summary)
-        drawn = {k: settings[k] for k in ("window_s", "cutoff_hz")}
-        pages.identification(run, robot, nominal, found, validation, summary, **drawn)
+        pages.identification(run, robot, nominal, found, validation, summary, **how)
         identification_table(console(), robot, found, summary)
     print(f"written: {run.folder}")

@@ -6,16 +6,40 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 from r2s.errors import UserError
-from r2s.stages.build import console, make_robot, open_run
+from r2s.stages import identify, train, transfer
+from r2s.stages.build import CONF, PACKAGE, console, make_robot, open_run, unread
 
-OWN = ("stage=", "name=", "pipeline.", "budget.", "threads=", "root=")  # what the chain sets for its steps itself
+STEPS = (
+    "1/3 record the arm and identify it",
+    "2/3 train on both models, side by side",
+    "3/3 take both policies to the arm",
+)
 MODELS = ("identified", "nominal")
+WHY = {
+    "calibration": "it identifies for itself",
+    "policy": "it trains its policies itself",
+    "budget": "pipeline.train_minutes= says how long, or null leaves it to budget=",
+    "only_missing": "its steps are run folders of their own",
+}
 
 
-def run_step(commands: dict[str, Sequence[str]]) -> None:
-    """Run commands side by side and pass on what they print, each line under its label.
+def reads(cfg):
+    """Return the keys of the config that the steps read, but for those that the chain sets itself."""
+    keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
+    return keys - {"budget"} if cfg.pipeline.train_minutes else keys
+
+
+def handed_on(overrides: Sequence[str], step: Any) -> list[str]:
+    """Return those of the typed overrides that a step reads, by its config."""
+    own = ("stage=", "name=", "root=", "threads=", "pipeline.")
+    return [o for o in overrides if not o.startswith(own) and not unread(o.lstrip("+~").split("=")[0], step)]
+
+
+def run_step(words: dict[str, list[str]]) -> None:
+    """Run commands side by side, {label: words}, and pass on what they print, each line under its label.
 
     Raises:
         UserError: one of them failed; the others are stopped.
@@ -32,8 +56,9 @@ def run_step(commands: dict[str, Sequence[str]]) -> None:
 
     threads = []
     try:
-        for label, command in commands.items():
-            print(f"  {label:<10} $ python run.py {' '.join(command[3:])}", file=sys.stderr, flush=True)
+        for label, typed in words.items():
+            print(f"  {label:<10} $ python run.py {' '.join(typed)}", file=sys.stderr, flush=True)
+            command = [*front_door(), *typed]
             piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
             process = subprocess.Popen(command, **piped, env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "110"})  # type: ignore[call-overload]
             running[label] = process
@@ -53,6 +78,15 @@ def run_step(commands: dict[str, Sequence[str]]) -> None:
             thread.join(timeout=5)
 
 
+def front_door() -> list[str]:
+    """Return the command that this process is: from a checkout or as installed, with the user's own config folder."""
+    from hydra.core.hydra_config import HydraConfig
+
+    program = [str(PACKAGE.parent / "run.py")] if CONF.parent != PACKAGE else ["-m", "r2s"]
+    own = [s.path for s in HydraConfig.get().runtime.config_sources if s.provider == "command-line"]
+    return [sys.executable, *program, *(word for path in own for word in ("--config-dir", path))]
+
+
 def check_free(root: Path, name: str) -> None:
     """Raise UserError if a folder that a step of the chain `name` would write is there already."""
     steps = [
@@ -63,43 +97,45 @@ def check_free(root: Path, name: str) -> None:
         raise UserError(f"name: {name} is taken, {taken[0]} is there already; give another name=")
 
 
-def run_chain(
-    program: Sequence[str], root: Path, name: str, overrides: Sequence[str], train_minutes: float | None
-) -> tuple[Path, dict[str, Path], dict[str, Path]]:
-    """Identify on the arm, train on the identified and on the nominal model, take both policies to the arm.
+def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
+    """Return what a chain runs, one {label: words of a command} per step: identify, train, transfer.
 
     The two trainings have the same recipe, time and machine, so that what differs on the arm is the model.
 
     Args:
-        program: the command that runs a stage. root: of run folders.
-        name: of this chain; its steps are named after it.
-        overrides: what the user typed; handed on to every step.
-        train_minutes: of each training; None leaves `budget` to the overrides.
-
-    Returns:
-        The run folders: identification, {label: training}, {label: transfer}.
-
-    Raises:
-        UserError: a step failed, or one of these folders is there already.
+        cfg: of the pipeline. name: of this chain; its steps are named after it.
+        overrides: what the user typed; each step gets what it reads.
     """
-    check_free(root, name)
-    theirs = [o for o in overrides if not o.startswith(OWN)]
-    half = f"threads={max(1, (os.cpu_count() or 2) // 2)}"
-    budget = (
-        [f"budget.minutes={train_minutes}"] if train_minutes else [o for o in overrides if o.startswith("budget.")]
-    )
-    common = [*program, *theirs, f"root={root}"]
-    identified = root / "identify" / name
-    print("1/3 record the arm and identify it", file=sys.stderr)
-    run_step({"identify": [*common, "stage=identify", f"name={name}"]})
-    changes = [f"calibration={identified}"], ["friction=gaz2019", "inertia=nominal"]
-    models = dict(zip(MODELS, changes, strict=True))
-    print("2/3 train on both models, side by side", file=sys.stderr)
-    run_step({k: [*common, "stage=train", f"name={name}_{k}", half, *budget, *m] for k, m in models.items()})
-    trained = {k: root / "train" / f"{name}_{k}" for k in models}
-    print("3/3 take both policies to the arm", file=sys.stderr)
-    run_step({k: [*common, "stage=transfer", f"name={name}_{k}", half, f"policy={trained[k]}"] for k in models})
-    return identified, trained, {k: root / "transfer" / f"{name}_{k}" for k in models}
+    root, choice = Path(cfg.root), chosen(overrides, cfg)
+    both = cfg.threads or os.cpu_count() or 2
+
+    def step(stage: str, label: str, *words: str, calibration: str | None = None) -> list[str]:
+        config = cfg.copy()
+        config.stage, config.calibration = stage, calibration
+        full = f"{name}_{label}" if stage != "identify" else name
+        threads = cfg.threads if stage == "identify" else max(1, both // 2)
+        head = [f"root={root}", f"stage={stage}", f"name={full}", f"threads={threads}"]
+        return [*handed_on(overrides, config), *head, *words]
+
+    budget = [f"budget.minutes={cfg.pipeline.train_minutes}"] if cfg.pipeline.train_minutes else []
+    known = f"calibration={root / 'identify' / name}"
+    return [
+        {"identify": step("identify", "identify")},
+        {
+            "identified": step("train", "identified", *budget, known, calibration=known),
+            "nominal": step("train", "nominal", *budget, *choice),
+        },
+        {m: step("transfer", m, f"policy={root / 'train' / f'{name}_{m}'}") for m in MODELS},
+    ]
+
+
+def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
+    """Return the words by which a training gets the model that identification starts from."""
+    from hydra.core.hydra_config import HydraConfig
+
+    choices = HydraConfig.get().runtime.choices
+    typed = {o.split("=")[0] for o in overrides}
+    return [f"{group}={choices[group]}" for group in ("friction", "inertia") if group not in typed]
 
 
 def pipeline(cfg, overrides):
@@ -108,13 +144,21 @@ def pipeline(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.runs import read_summary
 
-    robot = make_robot(cfg)
-    if cfg.name and not (Path(cfg.root) / "pipeline" / cfg.name).exists():
-        check_free(Path(cfg.root), cfg.name)
+    robot, root = make_robot(cfg), Path(cfg.root)
+    if "calibration" in cfg.dr:
+        raise UserError(
+            "dr: the nominal training of stage=pipeline has no calibration to draw from; another dr= does"
+        )
+    if cfg.name and not (root / "pipeline" / cfg.name).exists():
+        check_free(root, cfg.name)
     with open_run(cfg, overrides) as run:
-        program = [sys.executable, "-m", "r2s"]
-        name, minutes = run.folder.name, cfg.pipeline.train_minutes
-        identified, trained, transferred = run_chain(program, Path(cfg.root), name, overrides, minutes)
+        name = run.folder.name
+        check_free(root, name)
+        for what, step in zip(STEPS, commands(cfg, name, overrides), strict=True):
+            print(what, file=sys.stderr)
+            run_step(step)
+        identified = root / "identify" / name
+        trained, transferred = ({m: root / s / f"{name}_{m}" for m in MODELS} for s in ("train", "transfer"))
         rows = {}
         for label, folder in transferred.items():
             for where, row in read_summary(folder, "transfer").items():

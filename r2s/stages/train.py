@@ -1,21 +1,49 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
+from dataclasses import fields
+from pathlib import Path
+
+from r2s.errors import check_number
 from r2s.stages.build import (
+    Evaluation,
+    called,
+    check_words,
     console,
     device,
-    learner,
+    is_learner,
+    make_controller,
     make_draw,
     make_dynamics,
     make_robot,
     make_task,
     open_run,
-    oracle,
     plain,
     set_threads,
+    target,
 )
 
-# what conf/algo says of the loop rather than of the learner
-LOOP = ("batch_size", "learning_starts", "updates_per_step", "replay_size", "lr_decay", "lr_end")
+WHY = {
+    "friction": "calibration= says what friction is",
+    "inertia": "calibration= says what the links are",
+    "budget": "nothing is trained with this algo",
+    "reward": "nothing is trained with this algo",
+    "arm": "a training meets no arm; stage=transfer does",
+    "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
+    "data": "only stage=identify records or reads a motion",
+    "identify": "only stage=identify does that; calibration= brings what it found",
+    "search": "only stage=identify searches; calibration= brings what it found",
+}
+CALIBRATION = ("parameters.yaml", "posterior.npz")  # of an identification, kept by what was trained on it
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    keys = {"robot", "dr", "algo", "task", "evaluation.episodes", "calibration"}
+    if not cfg.calibration:
+        keys |= {"friction", "inertia"}
+    if "n_envs" in cfg.algo:  # else it is a controller
+        keys |= {"budget", "reward", "evaluation", "compile", "matmul", "device"}
+    return keys
 
 
 def train(cfg, overrides):
@@ -29,33 +57,28 @@ def train(cfg, overrides):
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import make_evaluation, selection_score
     from r2s.learning.policy import export_onnx, load_policy, save_policy
-    from r2s.learning.train import Budget, Listeners, Loop
+    from r2s.learning.train import Listeners
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
     from r2s.tasks.rewards import curriculum
 
-    if cfg.algo.name == "oracle":
+    if not is_learner(cfg):
         return reference(cfg, overrides)
-    budget = Budget(cfg.budget.minutes, cfg.budget.env_steps)
-    robot, task, settings = make_robot(cfg), make_task(cfg), plain(cfg.algo)
-    center = make_dynamics(cfg, robot)
-    draw = make_draw(cfg, robot, center)
-    set_threads(cfg)
-    loop = Loop(
-        **{k: settings.pop(k) for k in LOOP},
-        eval_env_steps=cfg.evaluation.env_steps,
-        compile=cfg.compile,
-        matmul=cfg.matmul,
-    )
-    n_envs, name = settings.pop("n_envs"), settings.pop("name")
-    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
-    evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
-    torque = torch.from_numpy(task.torque(robot))
-    mean, std = (torch.from_numpy(s) for s in task.observation_scale(robot))
-    algo = learner(name)((mean, std), torque, **settings).to(device(cfg))
+    n_envs, loop, settings = split(cfg)
+    budget = make_budget(cfg)
+    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
+    robot, task, model = make_robot(cfg), make_task(cfg), own_model(cfg)
+    draw = make_draw(model, robot, make_dynamics(model, robot))
+    check_words(curriculum, "reward", plain(cfg.reward))
     weights = partial(curriculum, **plain(cfg.reward))
+    set_threads(cfg)
+    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
+    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
+    torque = torch.from_numpy(task.torque(robot))
+    scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
+    algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
     best: dict = {}
     last: dict = {}
 
@@ -67,7 +90,8 @@ def train(cfg, overrides):
         return better
 
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
-        progress = Progress(f"train {name}")
+        keep_calibration(cfg, run.folder)
+        progress = Progress(f"train {cfg.algo.name}")
         checkpoint = Checkpoint(run.folder / "checkpoints")
         if cfg.resume:
             run.rewind("metrics", "env_steps", checkpoint.env_steps)
@@ -101,8 +125,56 @@ def train(cfg, overrides):
         export_onnx(run.folder / "policy.onnx", load_policy(run.folder, robot, task), robot, task)
         run.summary({"best": best, "last": last})
         pages.training(run, robot)
-        reach_table(console(), {"best": best, "last": last}, f"{name} in MuJoCo, dr: {plain(cfg.dr)}")
+        reach_table(console(), {"best": best, "last": last}, title(cfg))
     print(f"written: {run.folder}")
+
+
+def split(cfg):
+    """Return what conf/algo says of the environment, of the loop, and of the learner: arms, `Loop`, dict."""
+    from r2s.learning.train import Loop
+
+    settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
+    n_envs = settings.pop("n_envs", 32)
+    check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
+    words = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
+    words |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
+    return n_envs, called(Loop, "algo", words), settings
+
+
+def make_budget(cfg):
+    """Return when the training ends."""
+    from r2s.learning.train import Budget
+
+    return called(Budget, "budget", plain(cfg.budget))
+
+
+def own_model(cfg):
+    """Return the config that says what the arm is: of a training that goes on, with the calibration that it kept."""
+    if not (cfg.calibration and cfg.resume and (Path(cfg.resume) / CALIBRATION[0]).is_file()):
+        return cfg
+    model = cfg.copy()
+    model.calibration = cfg.resume  # its first place may be gone
+    return model
+
+
+def keep_calibration(cfg, folder):
+    """Copy what was identified into the run folder: it transfers without the one that it came from."""
+    import shutil
+
+    if not cfg.calibration or (folder / CALIBRATION[0]).is_file():
+        return
+    source = Path(cfg.calibration)
+    for name in CALIBRATION:
+        path = source / name if source.is_dir() else source.with_name(name)
+        path = source if name == CALIBRATION[0] and not source.is_dir() else path
+        if path.is_file():
+            shutil.copyfile(path, folder / name)
+
+
+def title(cfg):
+    """Return what the table of a training says above it."""
+    spread = ", ".join(f"{k} {v}" for k, v in plain(cfg.dr).items() if k != "_target_")
+    return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 
 
 def reference(cfg, overrides):
@@ -111,14 +183,17 @@ def reference(cfg, overrides):
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
 
+    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     robot, task = make_robot(cfg), make_task(cfg)
     draw = make_draw(cfg, robot, make_dynamics(cfg, robot))
+    controller, name = make_controller(cfg, robot, task), cfg.algo.name
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
-        evaluate = make_evaluation(robot, task, draw, episodes=cfg.evaluation.episodes, nthread=cfg.threads)
-        done = evaluate(oracle(cfg, robot, task))
+        keep_calibration(cfg, run.folder)
+        evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
+        done = evaluate(controller)
         row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | task.measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
-        pages.transfer(run, robot, {"oracle": done}, {"oracle": row}, task.torque(robot))
-        reach_table(console(), {"oracle": row}, f"oracle in MuJoCo, dr: {plain(cfg.dr)}")
+        pages.transfer(run, robot, {name: done}, {name: row}, task.torque(robot))
+        reach_table(console(), {name: row}, title(cfg))
     print(f"written: {run.folder}")

@@ -1,30 +1,61 @@
 """stage=transfer: the same policy and goals in simulators and on an arm."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
+from r2s.errors import UserError, check_number, nearest
 from r2s.stages.build import (
     console,
-    make_arm,
+    is_learner,
+    make_controller,
     make_draw,
     make_dynamics,
-    make_engine,
     make_robot,
     make_task,
     open_run,
-    oracle,
+    opened_arm,
+    part,
     set_threads,
 )
+
+FROM_POLICY = "it comes from the policy's run"
+WHY = {k: FROM_POLICY for k in ("robot", "friction", "inertia", "calibration", "dr", "task", "algo", "reward")}
+WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    return {"policy", "simulator", "arm", "evaluation.episodes"}
+
+
+def trained_config(cfg):
+    """Return the run folder of `policy=` and the config that it was made with.
+
+    What it was calibrated with lies in that folder too, so that it needs no other.
+
+    Raises:
+        UserError: it is no finished training.
+    """
+    from omegaconf import OmegaConf
+
+    source = Path(cfg.policy) if cfg.policy else None
+    if source is None or not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
+        names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
+        near = nearest(source.name, names) if source else ""
+        raise UserError(f"policy: '{cfg.policy}' is no finished run folder of stage=train{near}")
+    trained = OmegaConf.load(source / "config.yaml")
+    if trained.stage != "train":
+        raise UserError(f"policy: {source} is a run of stage={trained.stage}; allowed: train")
+    if trained.calibration:
+        trained.calibration = str(source)
+    return source, trained
 
 
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
-    from omegaconf import OmegaConf
-
     from r2s.arm.deploy import DrivenArm
     from r2s.arm.driven_batch import DrivenBatch
-    from r2s.arm.interface import ArmStopped
     from r2s.engines.episodes import EngineArms
-    from r2s.errors import UserError, nearest
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
     from r2s.learning.policy import load_policy
     from r2s.progress import Progress
@@ -32,29 +63,21 @@ def transfer(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.tasks.episode import gap, rollout
 
-    source = Path(cfg.policy) if cfg.policy else None
-    if source is None or not (source / "summary.json").is_file():
-        names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
-        raise UserError(
-            f"policy: '{cfg.policy}' is no finished run folder of stage=train"
-            f"{nearest(source.name, names) if source else ''}"
-        )
-    trained = OmegaConf.load(source / "config.yaml")
+    source, trained = trained_config(cfg)
+    check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
     robot, task = make_robot(trained), make_task(trained)
     set_threads(cfg)
-    policy = oracle(trained, robot, task) if trained.algo.name == "oracle" else load_policy(source, robot, task)
+    policy = load_policy(source, robot, task) if is_learner(trained) else make_controller(trained, robot, task)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
+    fade = cfg.arm.get("soft_start_s", 0.0)
+    check_number("arm.soft_start_s", fade, "[0, inf)")
     dynamics = draw = None
     if cfg.simulator.name != "none":
         dynamics = make_dynamics(trained, robot)
         draw = make_draw(trained, robot, dynamics)
-    engine = make_engine(cfg, robot) if cfg.simulator.name in ("dart", "gazebo") else None
-    try:
-        arm = None if cfg.arm.name == "none" else make_arm(cfg, robot)
-    except ArmStopped as stop:
-        raise UserError(f"arm={cfg.arm.name}: {stop}") from None
+    engine = part(cfg.simulator, "simulator", robot) if "_target_" in cfg.simulator else None
     rows, episodes, timing = {}, {}, None
     stops: list = []
 
@@ -62,7 +85,8 @@ def transfer(cfg, overrides):
         progress = Progress(what)
         return progress, lambda k, n: progress(k / n, f"{k} goals")
 
-    with open_run(cfg, overrides, parents=[str(source)]) as run:
+    opened = nullcontext() if cfg.arm.name == "none" else opened_arm(cfg, robot)
+    with opened as arm, open_run(cfg, overrides, parents=[str(source)]) as run:
         if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = task.measures(done), done
@@ -74,7 +98,6 @@ def transfer(cfg, overrides):
                 rows[cfg.simulator.name] = task.measures(done) | gap(done, episodes["mujoco"])
                 episodes[cfg.simulator.name] = done
         if arm is not None:
-            fade = cfg.arm.soft_start_s
             if dynamics is not None:  # what the model says of this arm, behind the same driver
                 model = DrivenBatch(arm.robot, dynamics, task, len(goals), soft_start_s=fade, nthread=cfg.threads)
                 done = rollout(policy, model, task, starts, goals)

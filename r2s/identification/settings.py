@@ -1,0 +1,56 @@
+"""What an identification is told: what is searched, within what, and how the residuals are made."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from r2s.errors import UserError, check_number
+from r2s.identification.parameters import check_bounds, check_parameters
+from r2s.identification.problem import check_choices, check_prior
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of `identify`: `identify.*` of the config, with the terms and the prior of one kind of torque.
+
+    Attributes:
+        bounds: {"phi1": [low, high], ...}, of whatever may be searched.
+        prior: {"inertia_scale": sigma, ...}, see `Problem`.
+        terms: what is searched beside friction: viscous, offset, inertia_scale or link, delay, lag, load, drag_sin,
+            drag_cos, gain.
+        family: of the friction; auto fits each and keeps the one that predicts motion left out best.
+        window_s: length of a replayed window, s (commanded torque).
+        stride: ms that compared angles are means of (commanded torque).
+        cutoff_hz: zero-phase filter of the torque.
+        breakaway: scan the dead zone's edges up to this, Nm, where there are no ramps (commanded torque; a link-side
+            sensor does not feel the motor's breakaway). None keeps the nominal edges.
+        folds: of the cross-validation within the recording.
+        keep_nominal: a joint whose refit predicts motion left out not clearly better than the nominal one keeps that.
+
+    Raises:
+        UserError: a family, term or parameter that does not exist, or a number outside its range.
+    """
+
+    bounds: Mapping[str, Sequence[float]]
+    prior: Mapping[str, float]
+    terms: Sequence[str]
+    family: str = "sigmoid"
+    window_s: float = 0.2
+    stride: int = 5
+    cutoff_hz: float = 10.0
+    breakaway: float | None = 1.5
+    folds: int = 4
+    keep_nominal: bool = False
+
+    def __post_init__(self):
+        check_choices(self.family, self.terms)
+        check_parameters("bounds", self.bounds)
+        check_bounds("bounds", self.bounds)
+        check_prior(self.prior)
+        check_number("identify.window_s", self.window_s, "(0, inf)")
+        check_number("identify.stride", self.stride, "[1, inf)", whole=True)
+        check_number("identify.cutoff_hz", self.cutoff_hz, "(0, inf)")
+        if self.breakaway is not None:
+            check_number("identify.breakaway", self.breakaway, "[0, inf)")
+        check_number("identify.folds", self.folds, "[1, inf)", whole=True)
+        if self.folds < 2 and (self.family == "auto" or self.keep_nominal):
+            raise UserError(f"identify.folds: {self.folds} is too few to leave motion out; at least 2 are needed")

@@ -1,0 +1,59 @@
+"""What `pip install .` brings: the wheel has all that a run needs, and runs from any folder."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """Return a folder that the wheel of this checkout is installed in, without what it depends on."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    for name in ("r2s", "conf"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", source)
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    subprocess.run([*pip, "wheel", str(source), "--no-deps", "--no-build-isolation", "-w", str(folder)], check=True)
+    (wheel,) = folder.glob("*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(folder / "site"), str(wheel)], check=True)
+    return folder / "site"
+
+
+def test_the_wheel_has_every_module_and_every_number(installed):
+    """All of r2s and of conf is in it, and nothing else of the checkout."""
+    for name, at in (("r2s", "r2s"), ("conf", "r2s/conf")):
+        own = {p.relative_to(ROOT / name) for kind in ("py", "yaml", "xml") for p in (ROOT / name).rglob(f"*.{kind}")}
+        there = {p.relative_to(installed / at) for p in (installed / at).rglob("*.*") if "__pycache__" not in str(p)}
+        assert {p for p in there if p.parts[0] != "conf"} == own if name == "r2s" else there == own
+    assert "r2s = r2s.cli:main" in next(installed.glob("*.dist-info/entry_points.txt")).read_text()
+
+
+def test_installed_it_runs_from_any_folder(installed, tmp_path):
+    """`r2s stage=identify` writes runs/ where it is called, and takes nothing from the checkout."""
+    seen = (
+        "import atexit, sys\natexit.register(lambda: print('FROM', *{m.__file__ for m in list(sys.modules.values()) "
+    )
+    seen += "if m.__name__.split('.')[0] == 'r2s' and getattr(m, '__file__', None)}))\n"
+    (tmp_path / "r2s_seen.py").write_text(seen)
+    here = {"PYTHONPATH": f"{installed}{os.pathsep}{tmp_path}", "PYTHONSAFEPATH": "1", "COLUMNS": "110"}
+    code = "import r2s_seen, sys; sys.argv[0] = 'r2s'; from r2s.cli import main; main()"
+    command = [sys.executable, "-c", code, "stage=identify", "+experiment=toy"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ | here, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder,) = re.findall(r"written: (\S+)", done.stdout)
+    assert (tmp_path / folder / "parameters.yaml").is_file()
+    modules = done.stdout.split("FROM")[1].split()
+    assert len(modules) > 30
+    assert all(Path(m).is_relative_to(installed) for m in modules)
+    script = subprocess.run(
+        [sys.executable, "-m", "r2s", "algo=tqq"], cwd=tmp_path, env=os.environ | here, capture_output=True, text=True
+    )
+    assert script.returncode == 2
+    assert "did you mean 'tqc'" in script.stderr
