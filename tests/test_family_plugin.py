@@ -56,6 +56,7 @@ TANH = Family(
     names=("level", "width", "viscous"),
     units=("Nm", "rad/s", "Nm s/rad"),
     logarithmic=("level", "width"),
+    bounds=((0.05, 10.0), (0.005, 0.5), (0.0, 10.0)),
     optional=("viscous",),
     formula="level tanh(v / width) + viscous v",
     law=law,
@@ -79,7 +80,7 @@ ARM = """
 </mujoco>
 """
 SETTINGS = conf("config")["identify"]
-BOUNDS = SETTINGS["bounds"] | {"level": [0.05, 10.0], "width": [0.005, 0.5]}
+BOUNDS = SETTINGS["bounds"]
 PHI = np.array([[1.6, 0.08], [0.7, 0.03]])  # Nm, rad/s
 
 
@@ -179,18 +180,23 @@ def test_it_goes_through_the_file(result, path, arm, tmp_path):
 def test_scales_and_optional_parameters_are_the_records(path, arm):
     """Logarithmic ones have their geometric mean in the middle of the cube; a term brings the optional one in."""
     own = of_family(nominal_dynamics(arm, **conf("friction/uniform")), path)
-    space = parameter_space(arm, own, {k: BOUNDS[k] for k in ("level", "width", "viscous")})
+    motion = SimpleNamespace(torque="commanded")
+    space = searched(arm, own, BOUNDS, ["viscous"], motion)
     middle = space.from_unit(np.full(6, 0.5))
     np.testing.assert_allclose(space.block(middle, "width"), np.sqrt(0.005 * 0.5))
     np.testing.assert_allclose(space.block(middle, "viscous"), 5.0)
-    motion = SimpleNamespace(torque="commanded")
+    narrow = searched(arm, own, BOUNDS | {"width": [0.01, 0.1]}, ["viscous"], motion)
+    np.testing.assert_allclose(narrow.block(narrow.upper, "width"), 0.1)
     for terms, blocks in ((["offset"], 3), (["viscous", "offset"], 4)):
         assert len(searched(arm, own, BOUNDS, terms, motion).blocks) == blocks
     with pytest.raises(UserError, match=r"^bounds\.phi1: friction family 'tanh' has level, width, viscous$"):
         parameter_space(arm, own, {"phi1": BOUNDS["phi1"]})
+    taken = replace(own, family=replace(own.family, names=("level", "lag", "viscous"), logarithmic=()))
+    with pytest.raises(UserError, match=r"^friction\.family: lag of 'tanh' is taken; give it another name$"):
+        parameter_space(arm, taken, {"level": [0.1, 1.0]})
     without = {k: v for k, v in BOUNDS.items() if k not in own.family.names}
     with pytest.raises(UserError, match=r"^identify\.bounds: none for level, width"):
-        searched(arm, own, without, ["offset"], motion)
+        searched(arm, replace(own, family=replace(own.family, bounds=())), without, ["offset"], motion)
 
 
 @pytest.mark.parametrize(
@@ -220,6 +226,7 @@ def test_a_record_that_does_not_fit_itself_is_one_line(path):
         {"units": ("Nm",)},
         {"logarithmic": ("levle",)},
         {"optional": ("level",)},
+        {"bounds": ((0.0, 1.0),)},
         {"names": tuple("abcdefghi"), "units": ("1",) * 9, "logarithmic": (), "optional": ()},
     ):
         with pytest.raises(UserError, match=r"^friction family 'tanh': "):

@@ -41,7 +41,8 @@ class Breakaway:
     """Commands at which n joints let go in K ramps; without gravity, as commanded.
 
     Attributes:
-        command: (n, 2) Nm, negative and positive direction, the mean over ramps; NaN where none got there.
+        command: (n, 2) Nm, negative and positive direction, the mean over ramps; NaN where none got there. Plus the
+            offset these are the dead zone's edges: ramps alone tell its width, not where its middle lies.
         spread: (n, 2) Nm, standard deviation over ramps: repeatability. NaN for fewer than two.
         count: (n, 2) ramps that got there.
         value: (K,) Nm, of each ramp; NaN where its joint did not let go.
@@ -66,13 +67,6 @@ class Breakaway:
             f"joint {self.joint[k] + 1}, {'positive' if self.sign[k] > 0 else 'negative'}, pose {self.pose[k] + 1}"
             for k in np.flatnonzero(np.isnan(self.value))
         ]
-
-    def edges(self, offset: np.ndarray) -> np.ndarray:
-        """Return (n, 2) Nm, the dead zone of r2s/physics/friction.py: its drive is command + offset (n,) Nm.
-
-        The offset comes from identification; ramps alone tell the dead zone's width, not where its middle lies.
-        """
-        return self.command + np.asarray(offset)[:, None]
 
 
 def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED) -> Breakaway:

@@ -190,6 +190,10 @@ def parameter_space(
         UserError: no block at all, an unknown one, one of another friction family or both kinds of inertia, or bounds
             that are not two rising numbers (positive where logarithmic).
     """
+    if clash := [name for name in nominal.family.names if name in OTHER_UNITS]:
+        raise UserError(
+            f"friction.family: {choices(clash)} of '{nominal.family.name}' is taken; give it another name"
+        )
     if not bounds:
         raise UserError(f"bounds: no parameter is named; allowed: {choices(units())}")
     check_parameters("bounds", bounds)

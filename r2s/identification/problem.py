@@ -60,6 +60,8 @@ def searched(
 ) -> ParameterSpace:
     """Return the space of the family's parameters and `terms`; `link` stands for its ten blocks.
 
+    What `bounds` do not name has those of the family's record.
+
     Delay and lag lie between a command and the motion, a gain error in the torque sensor: each is searched where
     it is.
 
@@ -68,6 +70,7 @@ def searched(
     """
     left_out = set(nominal.family.optional) - set(terms)
     own = [name for name in nominal.family.names if name not in left_out]
+    bounds = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | dict(bounds)
     if not set(own) & set(bounds):
         raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
     names = [name for name in own if name in bounds]

@@ -30,6 +30,7 @@ class Family:
         name: in tables.
         names: of the K parameters. units: of each. logarithmic: those whose values span decades: they are positive
             and searched by their logarithm.
+        bounds: (low, high) of each parameter, where `identify.bounds` names none, as it does for the four below.
         optional: the last of the names, those that are 0 and not searched unless `identify.terms` names them.
         formula: the law in one line of text.
         law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign (..., n); p is a
@@ -54,6 +55,7 @@ class Family:
     native: Callable[..., tuple[float, float]]
     start: Callable[[np.ndarray], list[np.ndarray]]
     logarithmic: tuple[str, ...] = ()
+    bounds: tuple[tuple[float, float], ...] = ()
     optional: tuple[str, ...] = ()
     held: Callable[[np.ndarray], np.ndarray] | None = None
 
@@ -61,6 +63,8 @@ class Family:
         where, k = f"friction family '{self.name}'", len(self.names)
         if not 1 <= k <= PHI or len(set(self.names)) < k or len(self.units) != k:
             raise UserError(f"{where}: {k} names and {len(self.units)} units; allowed are 1 to {PHI}, each name once")
+        if self.bounds and len(self.bounds) != k:
+            raise UserError(f"{where}: {len(self.bounds)} bounds for {k} parameters")
         for name in (*self.logarithmic, *self.optional):
             if name not in self.names:
                 raise UserError(f"{where}: no parameter '{name}'; it has {choices(self.names)}")

@@ -28,7 +28,7 @@ MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(MOMENT + 3, MOMENT + 8)  # soft limits; of 0: none
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(MOMENT + 3, MOMENT + 8)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 
