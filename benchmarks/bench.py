@@ -22,13 +22,13 @@ from rich.console import Console
 from rich.table import Table
 
 from r2s.arm.twin import Twin
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.learning.randomization import Around
 from r2s.learning.tqc import TQC
 from r2s.learning.train import keep_memory, products
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
-from r2s.tasks.reach import Task, observation_scale
+from r2s.tasks.reach import ReachTask
 
 REPEATS = 15
 
@@ -67,8 +67,8 @@ def friction(robot, dynamics, threads: int) -> tuple[float, float]:
 
 def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
-    arms, steps, task = 32, 50, Task(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
-    env = ReachEnv(robot, task, Around(robot, dynamics, **conf("dr/paper")), arms, nthread=threads, stagger=True)
+    arms, steps, task = 32, 50, ReachTask(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
+    env = TaskEnv(robot, task, Around(robot, dynamics, **conf("dr/paper")), arms, nthread=threads, stagger=True)
     state = env.reset()
     action = env.action_spec.rand()
     bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)
@@ -100,7 +100,7 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     from torchrl.objectives import SoftUpdate, TQCLoss
 
     torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, b = len(mean), robot.n, 256
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
     with products(matmul):
@@ -188,7 +188,7 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
     torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in observation_scale(robot, Task()))
+    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, count = len(mean), robot.n, 50
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
     with products(matmul):

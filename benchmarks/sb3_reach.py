@@ -67,24 +67,24 @@ def there(seed: int, path: str) -> None:
     from sb3_contrib import TQC
     from stable_baselines3.common.callbacks import BaseCallback
 
-    from r2s.learning.env import ReachEnv
+    from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import make_evaluation
     from r2s.learning.randomization import Around
     from r2s.tasks.episode import measures
-    from r2s.tasks.reach import Task, observation_scale
+    from r2s.tasks.reach import ReachTask
     from r2s.tasks.rewards import curriculum
 
     torch.set_num_threads(1)
-    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
     draw = Around(ROBOT, NEW, **conf("dr/paper"))
-    mean, std = (x.astype(np.float32) for x in observation_scale(ROBOT, task))
+    mean, std = (x.astype(np.float32) for x in task.observation_scale(ROBOT))
 
     class Reach(gym.Env):
         observation_space = gym.spaces.Box(-10.0, 10.0, mean.shape, np.float32)
         action_space = gym.spaces.Box(-1.0, 1.0, (ROBOT.n,), np.float32)
 
         def __init__(self):
-            self.arm = ReachEnv(ROBOT, task, draw, 1, nthread=1, seed=seed)
+            self.arm = TaskEnv(ROBOT, task, draw, 1, nthread=1, seed=seed)
             self.arm.weights = curriculum(0.0, **conf("reward/curriculum"))
 
         def reset(self, *, seed=None, options=None):

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2s.arm.simulated import SimulatedArm
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.physics.actuation import MAX_DELAY, Motors
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT
-from r2s.tasks.reach import Task
+from r2s.tasks.reach import ReachTask
 
 
 def noise(m, steps, n=3, seed=0):
@@ -128,16 +128,16 @@ def still(panda):
 
 def test_a_delayed_environment_is_the_same_one_later(panda, still):
     """With a delay of one control period every state comes one step later; the observed command does not."""
-    task = Task(episode_s=0.4)
+    task = ReachTask(episode_s=0.4)
     actions = np.random.default_rng(0).uniform(-1, 1, (10, 3, 7)).astype(np.float32)
 
     def states(dynamics):
-        env = ReachEnv(panda, task, lambda rng, m: dynamics, 3, nthread=1, seed=4)
+        env = TaskEnv(panda, task, lambda rng, m: dynamics, 3, nthread=1, seed=4)
         state, rows = env.reset(), []
         for action in actions:
             state["action"] = torch.from_numpy(action)
             state = env.step(state)["next"].exclude("reward")
-            rows.append(np.concatenate([env.sim.q, env.sim.dq, env.actuation.last], 1))
+            rows.append(np.concatenate([env.arms.sim.q, env.arms.sim.dq, env.arms.actuation.last], 1))
         return np.array(rows)
 
     prompt, late = states(still), states(replace(still, delay=task.substeps * SIM_DT))
@@ -150,16 +150,16 @@ def test_a_delayed_environment_is_the_same_one_later(panda, still):
 
 def test_an_environment_delays_each_arm_as_drawn(panda, still):
     """Delays drawn per arm act per arm, and an episode starts with no torque on its way."""
-    task = Task(episode_s=0.06)
+    task = ReachTask(episode_s=0.06)
     delays = np.array([0.0, 0.02])
-    env = ReachEnv(panda, task, lambda rng, m: replace(still, delay=delays[:m]), 2, nthread=1)
+    env = TaskEnv(panda, task, lambda rng, m: replace(still, delay=delays[:m]), 2, nthread=1)
     for _ in range(2):
         state, moved = env.reset(), []
-        start = env.sim.q.copy()
+        start = env.arms.sim.q.copy()
         for _ in range(task.steps):
             state["action"] = torch.ones(2, 7)
             state = env.step(state)["next"].exclude("reward")
-            moved.append(np.abs(env.sim.q - start).max(1))
+            moved.append(np.abs(env.arms.sim.q - start).max(1))
         moved = np.array(moved)
         assert np.all(moved[:, 0] > 1e-5)
         assert moved[0, 1] == 0

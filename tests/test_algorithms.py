@@ -29,7 +29,7 @@ from r2s.learning.sac import SAC
 from r2s.learning.td3 import TD3
 from r2s.learning.tqc import TQC
 from r2s.learning.train import train
-from r2s.tasks.reach import Task, observation_scale
+from r2s.tasks.reach import ReachTask
 
 ALL = (DDPG, TD3, SAC, TQC)
 NEAR = {"rtol": 1e-5, "atol": 1e-5}
@@ -397,7 +397,7 @@ def test_learns_to_bring_a_point_to_zero(kind):
 @pytest.mark.parametrize("kind", ALL)
 def test_the_policy_goes_onto_disk(kind, panda, tmp_path):
     """policy.pt of any algorithm gives the torques of the learner's policy."""
-    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
     policy = learner_of(kind, panda, task).policy
     save_policy(tmp_path, policy)
     loaded = load_policy(tmp_path, panda, task)
@@ -406,7 +406,7 @@ def test_the_policy_goes_onto_disk(kind, panda, tmp_path):
 
 
 def learner_of(kind, robot, task):
-    mean, std = (torch.from_numpy(s) for s in observation_scale(robot, task))
+    mean, std = (torch.from_numpy(s) for s in task.observation_scale(robot))
     return kind((mean, std), torch.from_numpy(task.torque(robot)), **{"hidden": HIDDEN})
 
 
@@ -414,7 +414,7 @@ def test_a_deterministic_policy_becomes_onnx(panda, tmp_path):
     """policy.onnx of TD3 gives the torques of the torch policy, within 1e-5 of their scale."""
     import onnxruntime
 
-    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
     policy = learner_of(TD3, panda, task).policy.eval()
     export_onnx(tmp_path / "policy.onnx", policy, panda, task)
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))

@@ -14,7 +14,7 @@ import torch
 from conftest import conf
 
 from r2s.errors import UserError
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import Around
 from r2s.learning.tqc import TQC
@@ -23,7 +23,7 @@ from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
 from r2s.tasks import rewards
-from r2s.tasks.reach import Task, observation_scale
+from r2s.tasks.reach import ReachTask
 
 ROOT = Path(__file__).parent.parent
 QUICK = [
@@ -62,13 +62,13 @@ def make_env(panda, family="sigmoid", seed=0):
         timing = {"delay": rng.uniform(1e-3, 5e-3, m), "lag": rng.uniform(0, 2e-3, m)}
         return Dynamics(**{**vars(d), **timing})
 
-    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
-    return ReachEnv(panda, task, drawn, 4, nthread=1, seed=seed, stagger=True)
+    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    return TaskEnv(panda, task, drawn, 4, nthread=1, seed=seed, stagger=True)
 
 
 def make_algo(env):
     torch.manual_seed(0)
-    mean, std = (torch.from_numpy(s) for s in observation_scale(env.robot, env.task))
+    mean, std = (torch.from_numpy(s) for s in env.task.observation_scale(env.robot))
     return TQC((mean, std), torch.from_numpy(env.task.torque(env.robot)), hidden=(16, 16))
 
 
@@ -93,7 +93,7 @@ def test_an_environment_goes_back_to_its_state(panda, family):
             row.append(torch.cat([step["next"]["observation"], step["next"]["reward_terms"]], -1))
         rows.append(torch.stack(row))
     assert torch.equal(*rows)
-    assert family != BRISTLE.name or np.abs(one.sim.state()["_memory"]).max() > 0
+    assert family != BRISTLE.name or np.abs(one.arms.sim.state()["_memory"]).max() > 0
 
 
 def run(folder, *words):

@@ -8,7 +8,7 @@ from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.arm.deploy import reach
+from r2s.arm.deploy import DrivenArm
 from r2s.arm.driver import DEADLINE_S, Driver
 from r2s.arm.fci import outside_fr3
 from r2s.arm.fr3 import within_fr3
@@ -20,10 +20,11 @@ from r2s.physics.actuation import Actuation
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.physics.robot import SIM_DT, load_robot
-from r2s.tasks.reach import Task
+from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
 
 PANDA = load_robot(**conf("robot/panda"))
-TASK = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 TORQUE = TASK.torque(PANDA)
 KINDS = ("nan", "inf", "huge", "flip", "silence", "full", "noise", "wrong shape of time")
 
@@ -192,8 +193,9 @@ def test_timing_counts_every_cycle():
     arm = SimulatedArm(PANDA, dynamics, position_noise=0.0, velocity_noise=0.0)
     starts, goals = fixed_episodes(PANDA, task, 2)
     policy = make_policy(PANDA, task, (8,))
-    episodes, stops, timing = reach(policy, arm, task, starts, goals)
-    assert stops == []
+    driven = DrivenArm(arm, task)
+    episodes, timing = rollout(policy, driven, task, starts, goals), driven.timing
+    assert driven.stops == []
     assert episodes.q.shape == (2, 10, 7)
     assert [row["count"] for row in timing.table()] == [20, 400, 398]
     assert all(0 < row["median_ms"] <= row["p99_ms"] <= row["max_ms"] for row in timing.table())
@@ -203,8 +205,9 @@ def test_a_slow_policy_is_not_taken_for_a_silent_one():
     """At 10 Hz a target holds for 100 ms: no stop."""
     task = replace(TASK, ctrl_hz=10, episode_s=1.0)
     arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0)
-    _, stops, _ = reach(make_policy(PANDA, task, (8,)), arm, task, *fixed_episodes(PANDA, task, 1))
-    assert stops == []
+    driven = DrivenArm(arm, task)
+    rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 1))
+    assert driven.stops == []
 
 
 def test_a_stop_that_has_just_begun_counts():
@@ -216,7 +219,9 @@ def test_a_stop_that_has_just_begun_counts():
 
     task = replace(TASK, episode_s=0.08)  # the watchdog acts after 50 ms, the arm would rest later
     arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0.1)
-    episodes, stops, _ = reach(Silent(), arm, task, *fixed_episodes(PANDA, task, 1))
+    driven = DrivenArm(arm, task)
+    episodes = rollout(Silent(), driven, task, *fixed_episodes(PANDA, task, 1))
+    stops = driven.stops
     assert [str(stop) for stop in stops] == ["episode 1, 0.08 s: no finite action for 50 ms"]
     assert np.isinf(episodes.distance[0, -1])
     assert stops[0].log.shape == (80, 29)

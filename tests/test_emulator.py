@@ -23,7 +23,7 @@ import torch
 from conftest import ROOT, conf
 
 from r2s.arm import fci
-from r2s.arm.deploy import reach
+from r2s.arm.deploy import DrivenArm
 from r2s.arm.emulator.control import Control, Fault
 from r2s.arm.emulator.process import Emulator, main
 from r2s.arm.emulator.server import listen
@@ -35,7 +35,8 @@ from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.robot import SIM_DT, load_robot
-from r2s.tasks.reach import Task
+from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
 
 CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3, 10)}
 CYCLES = 300
@@ -193,13 +194,15 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
 def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
     """The episode ends with libfranka's reason and keeps what it saw; the next one, when it is cleared, runs."""
     _, make, version = client
-    task = Task(episode_s=0.2)
+    task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[fault]) as address:
         arm = make(panda, address, clear=lambda reason: True)
         starts = np.stack([panda.q_home, panda.q_home])
         goals = fixed_episodes(panda, task, 2)[1]
-        episodes, stops, _ = reach(make_policy(panda, task, (8,)), arm, task, starts, goals)
+        driven = DrivenArm(arm, task)
+        episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
+        stops = driven.stops
         arm.close()
     assert len(stops) == 1, stops
     assert re.match(rf"episode 1, 0\.0[4-6]\d* s: .*{reason}", str(stops[0]))
@@ -213,12 +216,14 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
 def test_a_stop_button_ends_a_deployment(client, panda):
     """A reflex can be cleared, a pressed button cannot: the episode ends, and the next one does not begin."""
     _, make, version = client
-    task = Task(episode_s=0.2)
+    task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
         arm = make(panda, address, clear=lambda reason: True)
         starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
-        episodes, stops, _ = reach(make_policy(panda, task, (8,)), arm, task, starts, goals)
+        driven = DrivenArm(arm, task)
+        episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
+        stops = driven.stops
         arm.close()
     assert [stop.episode for stop in stops] == [0, 1]
     assert "on the way to its start: the arm is not ready to move: it is user stopped" in str(stops[1])

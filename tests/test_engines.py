@@ -9,7 +9,7 @@ import torch
 from conftest import conf
 
 from r2s.engines.dart import DartEngine
-from r2s.engines.episodes import reach
+from r2s.engines.episodes import EngineArms
 from r2s.engines.interface import MujocoEngine
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
@@ -17,7 +17,8 @@ from r2s.learning.policy import make_policy
 from r2s.learning.randomization import Around
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
-from r2s.tasks.reach import Task
+from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
 
 ODD_ARM = """
 <mujoco model="odd">
@@ -160,7 +161,7 @@ def test_wrong_shapes_are_named():
 
 def test_a_policy_meets_the_same_arm_in_every_engine():
     """Friction, breakaway, offsets, soft limits, delay: an episode in DART is the batch's, within 1e-3 mm."""
-    robot, task = load_robot(**conf("robot/panda")), Task(episode_s=0.9, torque_fraction=0.15)
+    robot, task = load_robot(**conf("robot/panda")), ReachTask(episode_s=0.9, torque_fraction=0.15)
     truth = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass)
     draw = Around(robot, truth, phi_relative=0.1, inertia_relative=0.05)
@@ -174,6 +175,6 @@ def test_a_policy_meets_the_same_arm_in_every_engine():
         return DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
 
     for make in (dart, lambda d: MujocoEngine(robot, d)):
-        away = reach(policy, make, robot, task, draw, starts, goals)
+        away = rollout(policy, EngineArms(make, robot, task, draw, 4), task, starts, goals)
         assert np.linalg.norm(away.ee - home.ee, axis=-1).max() < 1e-6  # no joint gets to a hard stop
         np.testing.assert_allclose(away.reward, home.reward, atol=1e-3)

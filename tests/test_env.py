@@ -9,15 +9,16 @@ import torch
 from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from r2s.errors import UserError
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.learning.randomization import Around
-from r2s.physics.actuation import Actuation, low_pass_gain
+from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
-from r2s.tasks.reach import Task, observation_scale, observe, sample_goals
+from r2s.tasks.reach import ReachTask, observe
 from r2s.tasks.rewards import PAPER, TERMS, curriculum, terms
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
@@ -32,16 +33,16 @@ def draw(panda):
 @pytest.fixture(scope="module")
 def task():
     settings = conf("task/reach")
-    return Task(**(settings | {"reach": tuple(settings["reach"])}))
+    return ReachTask(**(settings | {"reach": tuple(settings["reach"])}))
 
 
 @pytest.fixture
 def make(panda, task, draw):
-    """Return (nsim, ...) -> ReachEnv of short episodes."""
+    """Return (nsim, ...) -> TaskEnv of short episodes."""
 
     def maker(nsim, nthread=1, **change):
         short = replace(task, episode_s=change.pop("episode_s", 0.2))
-        return ReachEnv(panda, short, draw, nsim, nthread=nthread, seed=change.pop("seed", 0), **change)
+        return TaskEnv(panda, short, draw, nsim, nthread=nthread, seed=change.pop("seed", 0), **change)
 
     return maker
 
@@ -96,8 +97,8 @@ def test_episodes_are_cut_off_at_their_length_and_never_terminate(make):
         assert row["truncated"].any() == (k % steps == 0)
         assert torch.equal(row["done"], row["truncated"])
         assert not row["terminated"].any()
-    assert Task().steps == 200
-    assert Task().substeps == 20
+    assert ReachTask().steps == 200
+    assert ReachTask().substeps == 20
 
 
 def test_a_partial_reset_leaves_the_other_arms_alone(make):
@@ -113,7 +114,7 @@ def test_a_partial_reset_leaves_the_other_arms_alone(make):
     assert torch.equal(after["observation"][keep], before["observation"][keep])
     assert (after["observation"][new] != before["observation"][new]).any(-1).all()
     assert torch.equal(after["observation"][new][:, 7:14], torch.zeros(2, 7))  # at rest
-    assert not changed.actuation.last[new].any()
+    assert not changed.arms.actuation.last[new].any()
     action = actions(1, 4, seed=3)[0]
     rows = []
     for env in (changed, untouched):
@@ -122,6 +123,20 @@ def test_a_partial_reset_leaves_the_other_arms_alone(make):
         rows.append(env.step(state)["next"])
     for key in ("observation", "reward", "distance"):
         assert torch.equal(rows[0][key][keep], rows[1][key][keep])
+
+
+def test_a_step_with_its_reset_is_torchrls(make):
+    """`step_and_maybe_reset` returns what EnvBase's would: the same steps, and after them the same observations."""
+    ours, theirs = make(8, stagger=True), make(8, stagger=True)
+    one, other = ours.reset(), theirs.reset()
+    for action in actions(2 * ours.task.steps, 8):
+        one["action"] = other["action"] = action
+        step, one = ours.step_and_maybe_reset(one)
+        expected, other = EnvBase.step_and_maybe_reset(theirs, other)
+        for key in ("observation", "reward_terms", "distance", "reward", "done", "terminated", "truncated"):
+            assert torch.equal(step["next", key], expected["next", key]), key
+        assert torch.equal(one["observation"], other["observation"])
+        assert not one["done"].any()
 
 
 def test_staggered_episodes_end_at_different_times(make):
@@ -162,9 +177,9 @@ def test_the_environment_commands_what_the_actuation_says(make):
     for _ in range(8):
         state["action"] = torch.full((2, 7), 50.0)
         state = env.step(state)["next"].exclude("reward")
-        assert np.all(np.abs(env.actuation.last) <= limit)
+        assert np.all(np.abs(env.arms.actuation.last) <= limit)
     slow = limit > 20 * 8  # Nm that the rate limit lets pass in 8 steps
-    np.testing.assert_allclose(env.actuation.last[:, ~slow], np.broadcast_to(limit, (2, 7))[:, ~slow], rtol=1e-6)
+    np.testing.assert_allclose(env.arms.actuation.last[:, ~slow], np.broadcast_to(limit, (2, 7))[:, ~slow], rtol=1e-6)
 
 
 def test_soft_limits_contain_an_arm_under_full_torque(make):
@@ -176,8 +191,8 @@ def test_soft_limits_contain_an_arm_under_full_torque(make):
             action = torch.from_numpy(rng.choice([-1.0, 1.0], (4, 7)).astype(np.float32))
         state["action"] = action
         state = env.step(state)["next"].exclude("reward")
-        assert np.all((env.sim.q > r.q_min - 0.05) & (env.sim.q < r.q_max + 0.05))
-        assert np.all(np.abs(env.sim.dq) < 2 * r.dq_max)
+        assert np.all((env.arms.sim.q > r.q_min - 0.05) & (env.arms.sim.q < r.q_max + 0.05))
+        assert np.all(np.abs(env.arms.sim.dq) < 2 * r.dq_max)
 
 
 def test_soft_limits_push_back_only_near_the_hard_ones(panda, task):
@@ -197,9 +212,9 @@ def test_the_low_pass_has_its_time_constant(panda, cutoff):
     """A small step is answered as 1 - exp(-t / T) with T = 1 / (2 pi cutoff), to two cycles of 1 ms."""
     actuation = Actuation(panda, 1, cutoff_hz=cutoff)
     answer = actuation(np.full((1, 7), 0.5), 1000)[0] / 0.5
-    gain = low_pass_gain(cutoff)
+    factor = low_pass_factor(cutoff)
     k = np.arange(1, 1001)[:, None]
-    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - gain) ** k, answer.shape), atol=1e-12)
+    np.testing.assert_allclose(answer, np.broadcast_to(1 - (1 - factor) ** k, answer.shape), atol=1e-12)
     constant = 1 / (2 * np.pi * cutoff)
     reached = 1e-3 * (1 + np.argmax(answer[:, 0] >= 1 - np.exp(-1)))
     assert 0 <= reached - constant <= 2e-3
@@ -279,7 +294,7 @@ def test_the_papers_reward_never_changes(progress):
 
 def test_goals_lie_in_the_region_and_some_posture_reaches_them(panda, task):
     """Goals keep reach, height and azimuth, and for each there are joint angles within the limits that get there."""
-    goals = sample_goals(panda, task, np.random.default_rng(0), 12)
+    goals = task.goals(panda, np.random.default_rng(0), 12)
     shoulder = np.array([0, 0, 0.333])  # the second joint's axis meets the first's here
     away = np.linalg.norm(goals - shoulder, axis=1)
     assert np.all((away >= task.reach[0]) & (away <= task.reach[1]))
@@ -308,14 +323,14 @@ def test_goals_lie_in_the_region_and_some_posture_reaches_them(panda, task):
 def test_an_unreachable_region_is_one_line(panda, task):
     """A region beyond the arm is named instead of searched for ever."""
     with pytest.raises(UserError, match=r"^task\.reach 3 to 4 m.*widen them$"):
-        sample_goals(panda, replace(task, reach=(3.0, 4.0)), np.random.default_rng(0), 5)
+        replace(task, reach=(3.0, 4.0)).goals(panda, np.random.default_rng(0), 5)
 
 
 def test_a_list_of_torque_fractions_must_fit(panda):
     """One share per joint or one for all; another number of them is named."""
-    np.testing.assert_allclose(Task(torque_fraction=(0.1,) * 7).torque(panda), 0.1 * panda.tau_max)
+    np.testing.assert_allclose(ReachTask(torque_fraction=(0.1,) * 7).torque(panda), 0.1 * panda.tau_max)
     with pytest.raises(UserError, match=r"^task\.torque_fraction: 2 values for the 7 joints"):
-        Task(torque_fraction=(0.1, 0.2)).torque(panda)
+        ReachTask(torque_fraction=(0.1, 0.2)).torque(panda)
 
 
 def test_the_observation_is_the_one_an_arm_gives(make):
@@ -328,10 +343,10 @@ def test_the_observation_is_the_one_an_arm_gives(make):
     kinematics = Kinematics(env.robot)
     torque = env.task.torque(env.robot)
     for k in range(4):
-        q, dq = env.sim.q[k].copy(), env.sim.dq[k].copy()
+        q, dq = env.arms.sim.q[k].copy(), env.arms.sim.dq[k].copy()
         ee, jacobian = kinematics(q)
-        effort = env.actuation.last[k][None] / torque
-        own = observe(q[None], dq[None], ee[None], env.goal[k][None], jacobian[None], effort)
+        effort = env.arms.actuation.last[k][None]
+        own = observe(q[None], dq[None], ee[None], env.goal[k][None], jacobian[None], effort, torque)
         np.testing.assert_allclose(own[0], seen[k], atol=1e-6)
 
 
@@ -340,11 +355,11 @@ def test_the_observation_is_what_its_docstring_lists(panda):
     rng = np.random.default_rng(0)
     q, dq, effort = rng.normal(size=(3, 2, 7))
     ee, goal = rng.normal(size=(2, 2, 3))
-    jacobian = rng.normal(size=(2, 3, 7))
-    out = observe(q, dq, ee, goal, jacobian, effort)
+    jacobian, torque = rng.normal(size=(2, 3, 7)), rng.uniform(1, 9, 7)
+    out = observe(q, dq, ee, goal, jacobian, effort, torque)
     error = goal - ee
     pull = np.stack([j.T @ e for j, e in zip(jacobian, error, strict=True)])
-    parts = [q, dq, ee, goal, error, effort, np.tanh(error / 0.02), pull, np.tanh(pull / 0.015)]
+    parts = [q, dq, ee, goal, error, effort / torque, np.tanh(error / 0.02), pull, np.tanh(pull / 0.015)]
     np.testing.assert_allclose(out, np.concatenate(parts, 1), rtol=1e-6, atol=1e-7)
     assert out.shape == (2, 47)
     assert out.dtype == np.float32
@@ -352,7 +367,7 @@ def test_the_observation_is_what_its_docstring_lists(panda):
 
 def test_the_scale_of_observations_fits_them(make, panda, task):
     """Normalised observations of random motion are of order one: none is far off, all but joint 7's pull move."""
-    centre, scale = observation_scale(panda, task)
+    centre, scale = task.observation_scale(panda)
     assert centre.shape == scale.shape == (47,)
     assert np.all(scale > 0)
     rows = torch.cat([row["observation"] for row in run(make(8), actions(30, 8))]).numpy()

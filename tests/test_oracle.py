@@ -11,7 +11,7 @@ from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.tasks.episode import measures
-from r2s.tasks.reach import Task
+from r2s.tasks.reach import ReachTask
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def panda():
 
 @pytest.fixture(scope="module")
 def task():
-    return Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    return ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dyna
 
     kinematics = Kinematics(panda)
     for start, goal in zip(*fixed_episodes(panda, task, 40), strict=True):
-        q = oracle.reach(start, goal)
+        q = oracle.inverse_kinematics(start, goal)
         assert np.all((q > panda.q_min) & (q < panda.q_max))
         assert np.linalg.norm(kinematics(q)[0] - goal) < 2e-4
 

@@ -160,7 +160,7 @@ def oracle(robot, dynamics, k, q, dq, tau, soft=None):
         held += int(np.sum(np.isclose(passive + friction, -torque, atol=1e-12)))
         if soft is not None:
             passive = passive + soft(data.qpos, v)
-            slope = slope + soft.dq_gain * (np.abs(v) > soft.dq_soft)
+            slope = slope + soft.dq_damping * (np.abs(v) > soft.dq_soft)
         data.qfrc_applied[:] = torque + passive + slope * v
         model.dof_damping[:] = base + slope
         mujoco.mj_step(model, data)

@@ -11,11 +11,11 @@ from r2s.excitation.safety import check_limits
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import parameter_space
 from r2s.identification.torque_residual import TorqueResidual
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.recordings.recording import Recording
-from r2s.tasks.reach import Task
+from r2s.tasks.reach import ReachTask
 
 ARM = """
 <mujoco model="threelink">
@@ -144,7 +144,7 @@ def test_what_is_given_goes_over_the_file(write):
 def test_another_arm_goes_through_environment_and_identification(arm):
     """Three joints: an episode starts and steps, an excitation keeps its limits, a residual is computed."""
     nominal = nominal_dynamics(arm, **conf("friction/uniform"))
-    env = ReachEnv(arm, Task(reach=(0.1, 0.5)), lambda rng, m: nominal, 4, nthread=1)
+    env = TaskEnv(arm, ReachTask(reach=(0.1, 0.5)), lambda rng, m: nominal, 4, nthread=1)
     state = env.reset()
     state["action"] = env.action_spec.rand()
     after = env.step(state)["next"]

@@ -5,19 +5,15 @@ The policy is asked within the cycle. One that hangs leaves the arm without comm
 
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT
-from r2s.tasks import rewards
-from r2s.tasks.episode import Acts, Episodes
-from r2s.tasks.reach import Task, observe
+from r2s.tasks.task import State, Task
 
 LOGGED_S = 1.0  # before a stop, of every cycle
 
@@ -27,7 +23,7 @@ class Timing:
     """How long things took on the clock of this computer, s; in lock-step only what we do ourselves has a meaning.
 
     Attributes:
-        policy: observing and asking the policy, once per control step. driver: working out one command.
+        policy: from a state to the policy's target, once per control step. driver: working out one command.
         period: from one command to the next.
     """
 
@@ -63,103 +59,83 @@ class Stop:
         return f"episode {self.episode + 1}, {self.when}: {self.reason}"
 
 
-@torch.no_grad()
-def reach(
-    policy: Acts,
-    arm: Arm,
-    task: Task,
-    starts: np.ndarray,
-    goals: np.ndarray,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    *,
-    soft_start_s: float = 0.0,
-) -> tuple[Episodes, list[Stop], Timing]:
-    """Run one episode per goal; return them as the arm measured them, why it stopped, where it did, and the timing.
+class DrivenArm:
+    """An arm behind the driver, one control period at a time; the `Arms` of `r2s.tasks.episode.rollout`.
 
-    An episode that the arm stopped keeps its last state: it did not reach.
+    Attributes:
+        stops: why episodes ended early, where they did. timing: see there.
 
     Args:
-        policy: observation -> torque.
         arm: at 1 kHz.
-        task: rates, limits and length.
-        starts: (E, n) rad. goals: (E, 3) m.
-        progress: called after every episode with done, total.
+        task: rates and torques.
         soft_start_s: s, over which the torque of an episode fades in; hardware deserves some, the twin needs none.
     """
-    robot, count = arm.robot, len(goals)
-    kinematics = Kinematics(robot)
-    torque = task.torque(robot)
-    driver = Driver(robot, torque, cutoff_hz=task.cutoff_hz, period_s=1 / task.ctrl_hz, soft_start_s=soft_start_s)
-    timing, clock = Timing(), time.perf_counter
-    shape = (count, task.steps)
-    q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
-    ee, distance, reward = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    stops: list[Stop] = []
-    seen: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
 
-    def stop(when: str, reason: object) -> None:
-        rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in seen]
-        stops.append(Stop(e, when, str(reason), np.array(rows).reshape(-1, 1 + 4 * robot.n)))
+    width = 1
 
-    def ask(q: np.ndarray, dq: np.ndarray, place: np.ndarray, jacobian: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        effort = driver.effort[None] / torque
-        observation = observe(q[None], dq[None], place[None], goal[None], jacobian[None], effort)
-        return policy.action(torch.from_numpy(observation))[0].numpy().astype(np.float64)
+    def __init__(self, arm: Arm, task: Task, *, soft_start_s: float = 0.0):
+        self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
+        self._kinematics = Kinematics(arm.robot)
+        period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
+        self._driver = Driver(arm.robot, task.torque(arm.robot), **period, soft_start_s=soft_start_s)
+        self.stops: list[Stop] = []
+        self.timing = Timing()
+        self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
 
-    def worth(distance: float, distance0: float, dq: np.ndarray, ddq: np.ndarray) -> float:
-        terms = rewards.terms(np.array([distance]), np.array([distance0]), dq[None], ddq[None])
-        return float(terms[0] @ rewards.PAPER)
-
-    # what is compiled or loaded at its first call must not be so while an arm waits
-    ask(starts[0], np.zeros(robot.n), *kinematics(starts[0]), goals[0])
-    worth(1.0, 1.0, np.zeros(robot.n), np.zeros(robot.n))
-    for e in range(count):
-        driver.reset()
-        seen.clear()
-        stopped = False
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Move to starts (1, n) rad and begin episode `first` there; a stop on the way is its stop."""
+        self._driver.reset()
+        self._log.clear()
+        self._episode, self._stopped, self._sent = first, False, 0.0
         try:
-            state = arm.move_to(starts[e])
+            self._state = self._arm.move_to(starts[0])
         except ArmStopped as reason:
-            state, stopped = arm.read(), True
-            stop("on the way to its start", reason)
-        place, jacobian = kinematics(state.q)
-        distance0 = max(float(np.linalg.norm(goals[e] - place)), 1e-3)
-        before, sent = state.dq, 0.0
-        for k in range(task.steps):
-            if not stopped:
-                asked = clock()
-                action = ask(state.q, state.dq, place, jacobian, goals[e])
-                timing.policy.append(clock() - asked)
-                try:
-                    for ms in range(task.substeps):
-                        began = clock()
-                        wanted = driver(state, action * torque if ms == 0 else None)
-                        now = clock()
-                        timing.driver.append(now - began)
-                        if sent:
-                            timing.period.append(now - sent)
-                        sent = now
-                        seen.append((state, wanted))
-                        arm.command(wanted)
-                        state = arm.read()
-                        if driver.done:
-                            raise ArmStopped(driver.stopping)
-                except ArmStopped as reason:
-                    stop(f"{state.t:.2f} s", reason)
-                    stopped = True
-                place, jacobian = kinematics(state.q)
-            q[e, k], dq[e, k], ee[e, k], tau[e, k] = state.q, state.dq, place, state.tau_J_d
-            distance[e, k] = np.linalg.norm(goals[e] - place)
-            ddq = (state.dq - before) * task.ctrl_hz
-            before = state.dq
-            reward[e, k] = worth(distance[e, k], distance0, state.dq, ddq)
-        if not stopped and driver.stopping is not None:  # the end came before the arm was at rest
-            stop(f"{state.t:.2f} s", driver.stopping)
-            stopped = True
-        if stopped:
-            distance[e, -1] = np.inf  # reached means reached and held by an arm that still runs
-        arm.stop()
-        progress(e + 1, count)
-    t = (1 + np.arange(task.steps)) / task.ctrl_hz
-    episodes = Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward)
-    return episodes, stops, timing
+            self._state = self._arm.read()
+            self._stop("on the way to its start", reason)
+        return self._read()
+
+    def step(self, target: np.ndarray) -> State:
+        """Go on for one control period with the target torque (1, n) Nm, or until the arm stops."""
+        self.timing.policy.append(time.perf_counter() - self._told)
+        try:
+            for ms in range(self._substeps):
+                self._cycle(target[0] if ms == 0 else None)
+        except ArmStopped as reason:
+            self._stop(f"{self._state.t:.2f} s", reason)
+        return self._read()
+
+    def end(self) -> np.ndarray:
+        """Stop the arm; return (1,), whether it had stopped, or was being stopped, before."""
+        if not self._stopped and self._driver.stopping is not None:  # the end came before the arm was at rest
+            self._stop(f"{self._state.t:.2f} s", self._driver.stopping)
+        self._arm.stop()
+        return np.array([self._stopped])
+
+    def _cycle(self, target: np.ndarray | None) -> None:
+        began = time.perf_counter()
+        wanted = self._driver(self._state, target)
+        now = time.perf_counter()
+        self.timing.driver.append(now - began)
+        if self._sent:
+            self.timing.period.append(now - self._sent)
+        self._sent = now
+        self._log.append((self._state, wanted))
+        self._arm.command(wanted)
+        self._state = self._arm.read()
+        if self._driver.done:
+            raise ArmStopped(self._driver.stopping)
+
+    def _stop(self, when: str, reason: object) -> None:
+        rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in self._log]
+        log = np.array(rows).reshape(-1, 1 + 4 * self.robot.n)
+        self.stops.append(Stop(self._episode, when, str(reason), log))
+        self._stopped = True
+
+    def _read(self) -> State:
+        s, (ee, jacobian) = self._state, self._kinematics(self._state.q)
+        state = State(
+            t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
+            tau=s.tau_J_d[None], effort=self._driver.effort[None], stopped=np.array([self._stopped]),
+        )  # fmt: skip
+        self._told = time.perf_counter()
+        return state

@@ -220,7 +220,7 @@ class Franka:
 
     def _damp(self) -> None:
         """Take speed out, and torque back, before the arm's own controller takes over."""
-        gain = REST_RATE / np.diag(self._inverse(self._state.q))
+        gain = REST_RATE / np.diag(self._inverse(self._state.q[None])[0])
         most, step = REST_SHARE * self.robot.tau_max, RATE_SHARE * self.robot.dtau_max * SIM_DT
         for _ in range(round(REST_S / SIM_DT)):
             s = self._state

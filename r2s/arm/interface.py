@@ -74,12 +74,21 @@ class Reflexes:
         self.robot = robot
         self._step = robot.dtau_max * dt + RATE_TOLERANCE
 
+    def takes(self, tau: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
+        """Return (...), whether arms would take tau (..., n) Nm after the commands tau_J_d (..., n) Nm."""
+        return ((np.abs(tau) <= self.robot.tau_max) & (np.abs(tau - tau_J_d) <= self._step)).all(-1)  # NaN fails both
+
+    def inside(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return (...), whether q, dq (..., n) rad, rad/s are within the arm's limits."""
+        r = self.robot
+        return ((q >= r.q_min) & (q <= r.q_max) & (np.abs(dq) <= r.dq_max)).all(-1)
+
     def command(self, tau: np.ndarray, tau_J_d: np.ndarray) -> None:
         """Raise ArmStopped if the arm would not take tau (n,) Nm after the command tau_J_d (n,) Nm."""
         r = self.robot
         if tau.shape != r.tau_max.shape:
             raise ArmStopped(f"the command has shape {tau.shape}, the arm has {r.n} joints")
-        if (np.abs(tau) <= r.tau_max).all() and (np.abs(tau - tau_J_d) <= self._step).all():  # NaN fails both
+        if self.takes(tau, tau_J_d):
             return
         if not np.isfinite(tau).all():
             i = int(np.argmin(np.isfinite(tau)))
@@ -96,7 +105,7 @@ class Reflexes:
     def state(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Raise ArmStopped if q, dq (n,) rad, rad/s are outside the arm's limits."""
         r = self.robot
-        if (q >= r.q_min).all() and (q <= r.q_max).all() and (np.abs(dq) <= r.dq_max).all():
+        if self.inside(q, dq):
             return
         out = np.maximum(r.q_min - q, q - r.q_max)
         if not (out <= 0).all():

@@ -1,9 +1,8 @@
-"""A policy in another engine than it was trained in: the same goals, starts and drawn arms, one after the other."""
+"""Episodes in another engine than the policy was trained in: the same goals, starts and drawn arms, one by one."""
 
 from collections.abc import Callable
 
 import numpy as np
-import torch
 
 from r2s.engines.interface import Engine, Law
 from r2s.learning.evaluate import GOAL_SEED
@@ -12,58 +11,62 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
-from r2s.tasks import rewards
-from r2s.tasks.episode import Acts, Episodes
-from r2s.tasks.reach import Task, observe
+from r2s.tasks.task import State, Task
+
+NONE = np.zeros(1, dtype=bool)  # has stopped
 
 
-@torch.no_grad()
-def reach(
-    policy: Acts,
-    make: Callable[[Dynamics], Engine],
-    robot: Robot,
-    task: Task,
-    draw: Callable[[np.random.Generator, int], Dynamics],
-    starts: np.ndarray,
-    goals: np.ndarray,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Episodes:
-    """Run one episode per goal; arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`.
+class EngineArms:
+    """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.episode.rollout`.
+
+    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`.
 
     Args:
-        policy: observation -> action.
         make: the engine of an arm with given dynamics.
         robot, task, draw: as trained.
-        starts: (E, n) rad. goals: (E, 3) m.
-        progress: called after every episode with done, total.
+        count: episodes.
     """
-    count, torque, kinematics = len(goals), task.torque(robot), Kinematics(robot)
-    drawn = draw(np.random.default_rng(GOAL_SEED), count)
-    actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
-    shape = (count, task.steps)
-    q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
-    ee, distance, reward = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-    for e in range(count):
-        dynamics = drawn.one(e)
-        engine, law = make(dynamics), Law(robot, dynamics, SoftLimits.of(robot, torque))
-        motors = Motors(1, robot.n, dynamics.delay, dynamics.lag)
-        actuation.reset()
-        now = starts[e], np.zeros(robot.n)
-        engine.reset(*now)
-        place, jacobian = kinematics(now[0])
-        distance0 = np.array([max(float(np.linalg.norm(goals[e] - place)), 1e-3)])
-        for k in range(task.steps):
-            effort = actuation.last / torque
-            seen = observe(now[0][None], now[1][None], place[None], goals[e][None], jacobian[None], effort)
-            action = policy.action(torch.from_numpy(seen)).numpy().astype(np.float64)
-            before = now[1]
-            for applied in motors(actuation(np.clip(action, -1.0, 1.0) * torque, task.substeps))[0]:
-                now = engine.step(applied + law(*now, applied))
-            place, jacobian = kinematics(now[0])
-            q[e, k], dq[e, k], ee[e, k], tau[e, k] = *now, place, actuation.last[0]
-            distance[e, k] = np.linalg.norm(goals[e] - place)
-            ddq = (now[1] - before)[None] * task.ctrl_hz
-            reward[e, k] = rewards.terms(distance[e, k : k + 1], distance0, now[1][None], ddq)[0] @ rewards.PAPER
-        progress(e + 1, count)
-    t = (1 + np.arange(task.steps)) / task.ctrl_hz
-    return Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward)
+
+    width = 1
+
+    def __init__(
+        self,
+        make: Callable[[Dynamics], Engine],
+        robot: Robot,
+        task: Task,
+        draw: Callable[[np.random.Generator, int], Dynamics],
+        count: int,
+    ):
+        self.robot, self._make, self._torque = robot, make, task.torque(robot)
+        self._substeps, self._period = task.substeps, 1 / task.ctrl_hz
+        self._drawn = draw(np.random.default_rng(GOAL_SEED), count)
+        self._kinematics, self._soft = Kinematics(robot), SoftLimits.of(robot, self._torque)
+        self._actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
+
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Make the arm of episode `first` and put it at rest at starts (1, n) rad."""
+        dynamics = self._drawn.one(first)
+        self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics, self._soft)
+        self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
+        self._actuation.reset()
+        self._now, self._steps = (starts[0], np.zeros(self.robot.n)), 0
+        self._engine.reset(*self._now)
+        return self._read()
+
+    def step(self, target: np.ndarray) -> State:
+        """Go on for one control period with the target torque (1, n) Nm."""
+        command = self._actuation(np.clip(target, -self._torque, self._torque), self._substeps)
+        for applied in self._motors(command)[0]:
+            self._now = self._engine.step(applied + self._law(*self._now, applied))
+        self._steps += 1
+        return self._read()
+
+    def end(self) -> np.ndarray:
+        """Return (1,), whether the arm was stopped: nothing stops it here."""
+        return NONE
+
+    def _read(self) -> State:
+        q, dq = self._now
+        ee, jacobian = self._kinematics(q)
+        last, t = self._actuation.last, np.array([self._steps * self._period])
+        return State(t, q[None], dq[None], ee[None], jacobian[None], tau=last, effort=last, stopped=NONE)

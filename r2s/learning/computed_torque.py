@@ -13,7 +13,7 @@ from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.physics.robot import Robot
-from r2s.tasks.reach import Task
+from r2s.tasks.reach import ReachTask
 
 STIFF = 12.0  # rad/s, bandwidth of the feedback, critically damped: 50 Hz and the delays of an arm bear no more
 POSTURE = 1e-3  # weight of staying near the start in the inverse kinematics, against metres of the end effector
@@ -30,7 +30,7 @@ class Oracle:
         move_s: s, shortest duration of a motion; no joint gets faster than FAST of its limit.
     """
 
-    def __init__(self, robot: Robot, task: Task, dynamics: Dynamics, move_s: float = 0.6):
+    def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
         self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
         self._model = robot.model(gravity=False)
         mass = robot.mass if dynamics.mass is None else dynamics.mass
@@ -57,7 +57,7 @@ class Oracle:
         for i, row in enumerate(rows):
             q, dq, goal, effort = row[:n], row[n : 2 * n], row[2 * n + 3 : 2 * n + 6], row[2 * n + 9 : 3 * n + 9]
             if i not in self._plans or not effort.any():
-                end = self.reach(q, goal)
+                end = self.inverse_kinematics(q, goal)
                 fastest = np.max(PEAK * np.abs(end - q) / (FAST * self.robot.dq_max))
                 self._plans[i] = q, end, max(self.move_s, float(fastest)), 0
             start, end, seconds, k = self._plans[i]
@@ -75,7 +75,7 @@ class Oracle:
         mujoco.mj_rne(self._model, data, 1, rigid)
         return rigid + self.dynamics.friction(dto) - self.dynamics.offset - self._soft(q, dq)
 
-    def reach(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
+    def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
         """Return q (n,) within the limits whose end effector is at `goal` (3,) m, near `start`; damped steps."""
         q, jacobian = start.copy(), np.empty((3, self.robot.n))
         low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15

@@ -11,12 +11,12 @@ import torch
 from r2s.errors import UserError
 from r2s.learning.networks import Actor, Normalizer, Policy
 from r2s.physics.robot import Robot
-from r2s.tasks.reach import Task, observation_scale
+from r2s.tasks.task import Task
 
 
 def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
     """Return an untrained policy of this arm and task."""
-    mean, std = (torch.from_numpy(x) for x in observation_scale(robot, task))
+    mean, std = (torch.from_numpy(x) for x in task.observation_scale(robot))
     torque = torch.from_numpy(task.torque(robot)).float()
     return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
 
@@ -72,7 +72,7 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
     facts = {
         "robot": robot.name,
         "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
-        "observation": "q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015); rad, rad/s, m",
+        "observation": task.observed,
         "policy_hz": str(task.ctrl_hz),
         "q_min_rad": " ".join(f"{q:g}" for q in robot.q_min),
         "q_max_rad": " ".join(f"{q:g}" for q in robot.q_max),

@@ -22,10 +22,10 @@ from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.errors import UserError, check_number
 from r2s.learning.checkpoint import Checkpoint
-from r2s.learning.env import ReachEnv
+from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
-from r2s.tasks.episode import Episodes, measures
+from r2s.tasks.task import Episodes
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def products(precision: str) -> Iterator[None]:
 
 
 def train(
-    env: ReachEnv,
+    env: TaskEnv,
     algo: Learner,
     evaluate: Callable[[Policy], Episodes],
     weights: Callable[[float], np.ndarray],
@@ -181,7 +181,7 @@ def train(
 
     def evaluation() -> dict:
         try:
-            out = measures(evaluate(copy.deepcopy(algo.policy).cpu()))
+            out = env.task.measures(evaluate(copy.deepcopy(algo.policy).cpu()))
         except FloatingPointError as error:
             when = f"{env_steps} env steps, in an evaluation"
             raise _dumped(error, dump, {"algo": algo.state_dict()}, when) from None
@@ -201,7 +201,7 @@ def train(
             raise _dumped(error, dump, where, f"{env_steps} env steps") from None
         replay.extend(_transition(step))
         state = state_next
-        env_steps += env.sim.nsim
+        env_steps += env.nsim
         if env_steps < learning_starts:
             continue
         price = torch.from_numpy(env.weights.astype(np.float32)).to(device)
@@ -241,7 +241,7 @@ def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any],
     return FloatingPointError(f"{error}, after {when}; replay it with r2s.learning.train.replay on {path}")
 
 
-def replay(path: Path, env: ReachEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
+def replay(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
     """Do again what led to a number that is not finite.
 
     Args:

@@ -14,18 +14,18 @@ from numba import njit
 from r2s.physics.robot import SIM_DT, Robot
 
 
-def low_pass_gain(cutoff_hz: float, dt: float = SIM_DT) -> float:
-    """Return the gain of a first-order low-pass per step of dt s (libfranka's `lowpassFilter`)."""
+def low_pass_factor(cutoff_hz: float, dt: float = SIM_DT) -> float:
+    """Return the factor of a first-order low-pass per step of dt s (libfranka's `lowpassFilter`)."""
     return dt / (dt + 1.0 / (2.0 * math.pi * cutoff_hz))
 
 
 @njit(cache=True)
-def _condition(target, filtered, last, nstep, gain, tau_max, step_max, out):
+def _condition(target, filtered, last, nstep, factor, tau_max, step_max, out):
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             f, u = filtered[i, j], last[i, j]
             for k in range(nstep):
-                f += gain * (target[i, j] - f)
+                f += factor * (target[i, j] - f)
                 clipped = min(max(f, -tau_max[j]), tau_max[j])
                 u += min(max(clipped - u, -step_max[j]), step_max[j])
                 out[i, k, j] = u
@@ -38,7 +38,7 @@ class Actuation:
     def __init__(self, robot: Robot, m: int, *, cutoff_hz: float):
         self.filtered = np.zeros((m, robot.n))
         self.last = np.zeros((m, robot.n))
-        self._gain = low_pass_gain(cutoff_hz)
+        self._factor = low_pass_factor(cutoff_hz)
         self._tau_max, self._step_max = robot.tau_max, robot.dtau_max * SIM_DT
 
     def reset(self, ids: np.ndarray | None = None) -> None:
@@ -59,7 +59,7 @@ class Actuation:
         """Return the commands (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
-        _condition(target, self.filtered, self.last, nstep, self._gain, self._tau_max, self._step_max, out)
+        _condition(target, self.filtered, self.last, nstep, self._factor, self._tau_max, self._step_max, out)
         return out
 
 
@@ -67,7 +67,7 @@ MAX_DELAY = 0.02  # s, the longest pure delay that is kept in mind
 
 
 @njit(cache=True)
-def _feel(tau, delay, lag, steps, line, motor, out):
+def delayed(tau, delay, lag, steps, line, motor, out):
     """Delay each arm's commands by `delay` steps (fractions interpolate), then lag them by a first order."""
     history = line.shape[1]
     for i in range(tau.shape[0]):
@@ -120,5 +120,5 @@ class Motors:
         if not self._delay.any() and (self._gain == 1.0).all():
             return tau
         out = np.empty(tau.shape)
-        _feel(tau, self._delay, self._gain, tau.shape[1], self._line, self._motor, out)
+        delayed(tau, self._delay, self._gain, tau.shape[1], self._line, self._motor, out)
         return out

@@ -7,6 +7,7 @@ mass m, first moments h = m c, and the tensor's xx, yy, zz, xy, xz, yz. Everythi
 from dataclasses import dataclass
 
 import mujoco
+import mujoco.batch
 import numpy as np
 
 from r2s.physics.robot import Robot
@@ -142,21 +143,23 @@ class Kinematics:
 
 
 class InverseInertia:
-    """How torques accelerate the joints of an arm at rest, by the nominal model.
+    """How torques accelerate the joints of m arms at rest, by the nominal model.
 
     1 over its diagonal is the inertia that each joint feels with the others free.
     """
 
-    def __init__(self, robot: Robot):
-        self._model = robot.model(gravity=False)
-        self._data = mujoco.MjData(self._model)
-        self._mass = np.empty((robot.n, robot.n))
+    def __init__(self, robot: Robot, m: int = 1):
+        model = robot.model(gravity=False)
+        self._batch = mujoco.batch.Batch(model, m, 1)
+        self._q, self._sparse = self._batch.bind("qpos"), self._batch.bind("M")
+        self._columns = model.M_colind
+        self._rows = np.repeat(np.arange(robot.n), model.M_rownnz)
 
-    def __call__(self, q: np.ndarray) -> np.ndarray:
-        """Return M^-1 (n, n), 1/(kg m^2), at q (n,) rad."""
-        self._data.qpos[:] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_crb(self._model, self._data)
-        mujoco.mj_fullM(self._model, self._data, self._mass)
-        return np.linalg.inv(self._mass)
+    def __call__(self, q: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
+        """Return M^-1 (m, n, n), 1/(kg m^2), at q (m, n) rad of the arms `ids` (all by default)."""
+        at = slice(None) if ids is None else ids
+        self._q[at] = q
+        self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
+        mass = np.empty((*q.shape, q.shape[1]))
+        mass[:, self._rows, self._columns] = mass[:, self._columns, self._rows] = self._sparse[at]
+        return np.linalg.inv(mass)

@@ -179,7 +179,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
 
 def _soft_columns(limits: SoftLimits) -> np.ndarray:
     """Return the columns of `jnt_user` that are soft limits, (n, WIDTH - Q_LOW)."""
-    return np.stack([limits.q_low, limits.q_high, limits.q_gain, limits.dq_soft, limits.dq_gain], -1)
+    return np.stack([limits.q_low, limits.q_high, limits.q_stiffness, limits.dq_soft, limits.dq_damping], -1)
 
 
 def _quaternions(rotation: np.ndarray) -> np.ndarray:

@@ -54,14 +54,13 @@ def train(cfg, overrides):
     import torch
 
     from r2s.learning.checkpoint import Checkpoint
-    from r2s.learning.env import ReachEnv
-    from r2s.learning.evaluate import make_evaluation
+    from r2s.learning.env import TaskEnv
+    from r2s.learning.evaluate import make_evaluation, selection_score
     from r2s.learning.policy import export_onnx, load_policy, save_policy
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.reach import observation_scale
     from r2s.tasks.rewards import curriculum
 
     if not is_learner(cfg):
@@ -74,10 +73,10 @@ def train(cfg, overrides):
     check_words(curriculum, "reward", plain(cfg.reward))
     weights = partial(curriculum, **plain(cfg.reward))
     set_threads(cfg)
-    env = ReachEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
+    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
     torque = torch.from_numpy(task.torque(robot))
-    scale = tuple(torch.from_numpy(s) for s in observation_scale(robot, task))
+    scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
     algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
     best: dict = {}
     last: dict = {}
@@ -85,7 +84,7 @@ def train(cfg, overrides):
     def is_best(row):
         nonlocal best, last
         last = row
-        better = not best or worth(row) >= worth(best)
+        better = not best or selection_score(row) >= selection_score(best)
         best = row if better else best
         return better
 
@@ -179,17 +178,11 @@ def title(cfg):
     return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 
 
-def worth(row):
-    """Return what makes one evaluation better than another: 1 % more within 1 cm is worth 1 of the return."""
-    return 100 * row["success_1cm"] + row["return_paper"]
-
-
 def reference(cfg, overrides):
     """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
     from r2s.learning.evaluate import make_evaluation
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.episode import measures
 
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     robot, task = make_robot(cfg), make_task(cfg)
@@ -199,7 +192,7 @@ def reference(cfg, overrides):
         keep_calibration(cfg, run.folder)
         evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
         done = evaluate(controller)
-        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | measures(done)
+        row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | task.measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
         pages.transfer(run, robot, {name: done}, {name: row}, task.torque(robot))

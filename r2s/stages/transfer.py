@@ -53,15 +53,15 @@ def trained_config(cfg):
 
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
-    from r2s.arm.deploy import reach
-    from r2s.arm.simulated import SimulatedArm
-    from r2s.engines.episodes import reach as engine_reach
+    from r2s.arm.deploy import DrivenArm
+    from r2s.arm.driven_batch import DrivenBatch
+    from r2s.engines.episodes import EngineArms
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
     from r2s.learning.policy import load_policy
     from r2s.progress import Progress
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.episode import gap, measures
+    from r2s.tasks.episode import gap, rollout
 
     source, trained = trained_config(cfg)
     check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
@@ -89,24 +89,25 @@ def transfer(cfg, overrides):
     with opened as arm, open_run(cfg, overrides, parents=[str(source)]) as run:
         if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
-            rows["mujoco"], episodes["mujoco"] = measures(done), done
+            rows["mujoco"], episodes["mujoco"] = task.measures(done), done
             if engine is not None:
                 progress, shown = counted(f"reach in {cfg.simulator.name}")
-                done = engine_reach(policy, engine, robot, task, draw, starts, goals, shown)
+                arms = EngineArms(engine, robot, task, draw, len(goals))
+                done = rollout(policy, arms, task, starts, goals, shown)
                 progress.close()
-                rows[cfg.simulator.name] = measures(done) | gap(done, episodes["mujoco"])
+                rows[cfg.simulator.name] = task.measures(done) | gap(done, episodes["mujoco"])
                 episodes[cfg.simulator.name] = done
         if arm is not None:
             if dynamics is not None:  # what the model says of this arm, behind the same driver
-                progress, shown = counted("predict from the model")
-                model = SimulatedArm(arm.robot, dynamics, position_noise=0.0, velocity_noise=0.0)
-                done, ends, _ = reach(policy, model, task, starts, goals, shown, soft_start_s=fade)
-                progress.close()
-                rows["predicted"], episodes["predicted"] = measures(done) | {"stops": len(ends)}, done
+                model = DrivenBatch(arm.robot, dynamics, task, len(goals), soft_start_s=fade, nthread=cfg.threads)
+                done = rollout(policy, model, task, starts, goals)
+                rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(model.stops)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")
-            done, stops, timing = reach(policy, arm, task, starts, goals, shown, soft_start_s=fade)
+            driven = DrivenArm(arm, task, soft_start_s=fade)
+            done = rollout(policy, driven, task, starts, goals, shown)
+            stops, timing = driven.stops, driven.timing
             progress.close()
-            rows[cfg.arm.name], episodes[cfg.arm.name] = measures(done) | {"stops": len(stops)}, done
+            rows[cfg.arm.name], episodes[cfg.arm.name] = task.measures(done) | {"stops": len(stops)}, done
             if "predicted" in rows:
                 rows[cfg.arm.name] |= gap(done, episodes["predicted"])
             for row in timing.table():

@@ -1,31 +1,15 @@
-"""Episodes, and how well they reached; the measures serve every simulator and arm."""
+"""Episodes of a policy, and how well they reached: one rollout and one set of measures for simulators and arms."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 import torch
 
+from r2s.physics.robot import Robot
+from r2s.tasks.task import Episodes, State, Task
+
 HOLD_S = 0.5  # s, at the end of an episode: reached means reached and held
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """E finished episodes of T control steps; row k is the state after step k.
-
-    Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m. tau: (E, T, n) Nm, the command at the end of
-        the step. distance: (E, T) m. reward: (E, T), eq. (2).
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    dq: np.ndarray
-    ee: np.ndarray
-    goal: np.ndarray
-    tau: np.ndarray
-    distance: np.ndarray
-    reward: np.ndarray
 
 
 class Acts(Protocol):
@@ -34,6 +18,82 @@ class Acts(Protocol):
     def action(self, observation: torch.Tensor) -> torch.Tensor:
         """Return actions (B, n) in [-1, 1] for observations (B, d)."""
         ...
+
+
+class Arms(Protocol):
+    """What episodes run on, one control period at a time: a batch, one arm in an engine, or the arm itself.
+
+    Attributes:
+        robot: what each of them is. width: how many episodes run at once; fewer than all run one after the other.
+    """
+
+    @property
+    def robot(self) -> Robot: ...  # noqa: D102 (said above)
+    @property
+    def width(self) -> int: ...  # noqa: D102
+
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Begin the episodes first, first + 1, ... at rest at starts (width, n) rad."""
+        ...
+
+    def step(self, target: np.ndarray) -> State:
+        """Go on for one control period with the target torques (width, n) Nm; an arm that has stopped stays."""
+        ...
+
+    def end(self) -> np.ndarray:
+        """End the episodes; return (width,), which of them were stopped before."""
+        ...
+
+
+@torch.no_grad()
+def rollout(
+    policy: Acts,
+    arms: Arms,
+    task: Task,
+    starts: np.ndarray,
+    goals: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Episodes:
+    """Run one episode per goal.
+
+    An episode that was stopped keeps its last state and did not reach: its last distance is infinite.
+
+    Args:
+        policy: observation -> action.
+        arms: what moves. task: what is asked of them.
+        starts: (E, n) rad. goals: (E, ...), as `task.goals` has them; E a multiple of the arms' width.
+        progress: called whenever episodes end, with done, total.
+    """
+    robot, count, width = arms.robot, len(goals), arms.width
+    torque, weights = task.torque(robot), task.paper_weights
+    shape = (count, task.steps)
+    q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
+    ee, distance, reward = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+
+    def ask(state: State, goals: np.ndarray) -> np.ndarray:
+        observation = torch.from_numpy(task.observe(state, goals, torque))
+        return policy.action(observation).numpy().astype(np.float64)
+
+    # what is compiled or loaded at its first call must not be so while an arm waits
+    still = State.still(robot)
+    ask(still, goals[:1])
+    task.judge(still, still.dq, goals[:1], task.reference(still, goals[:1]))
+    for first in range(0, count, width):
+        now = slice(first, first + width)
+        state = arms.place(starts[now], first)
+        reference, before = task.reference(state, goals[now]), state.dq.copy()
+        for k in range(task.steps):
+            if not state.stopped.all():
+                state = arms.step(ask(state, goals[now]) * torque)
+            ddq = (state.dq - before) * task.ctrl_hz
+            distance[now, k], terms = task.judge(state, ddq, goals[now], reference)
+            reward[now, k] = terms @ weights
+            q[now, k], dq[now, k], ee[now, k], tau[now, k] = state.q, state.dq, state.ee, state.tau
+            before = dq[now, k]
+        distance[now, -1][arms.end()] = np.inf  # reached means reached and held by an arm that still runs
+        progress(min(first + width, count), count)
+    t = (1 + np.arange(task.steps)) / task.ctrl_hz
+    return Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward)
 
 
 def measures(episodes: Episodes) -> dict[str, float]:

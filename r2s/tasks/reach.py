@@ -1,4 +1,4 @@
-"""Reach a point and stay there: the region of goals, what a policy observes, and its scale."""
+"""Reach a point and stay there: the region of goals, what a policy observes, its scale, and what a step is worth."""
 
 from dataclasses import dataclass
 
@@ -8,14 +8,18 @@ from numba import njit
 
 from r2s.errors import UserError, check_number
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.tasks import rewards
+from r2s.tasks.episode import measures
+from r2s.tasks.task import Episodes, State
 
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
+CLOSE_M = 1e-3  # at least this is a distance that others are divided by
 
 
 @dataclass(frozen=True)
-class Task:
-    """What is asked of the arm; conf/task/reach.yaml.
+class ReachTask:
+    """Reach a point; a `Task` (r2s/tasks/task.py) from conf/task/reach.yaml.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
@@ -60,49 +64,100 @@ class Task:
         """Physics steps of a control step."""
         return round(1.0 / (self.ctrl_hz * SIM_DT))
 
+    @property
+    def observed(self) -> str:
+        """What is in an observation."""
+        return f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}); rad, rad/s, m"
 
-def sample_goals(robot: Robot, task: Task, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return (count, 3) m: end-effector positions of random joint angles, so that every goal can be reached.
+    @property
+    def paper_weights(self) -> np.ndarray:
+        """(3,), of the terms that make eq. (2)."""
+        return rewards.PAPER
 
-    Raises:
-        UserError: hardly any position of the arm lies within the task's region.
-    """
-    model = robot.model(gravity=False)
-    data = mujoco.MjData(model)
-    site = model.site(robot.ee_site).id
-    data.qpos = robot.q_home
-    mujoco.mj_kinematics(model, data)
-    shoulder = data.xanchor[min(1, robot.n - 1)].copy()
-    middle, half = 0.5 * (robot.q_min + robot.q_max), 0.45 * (robot.q_max - robot.q_min)
-    goals: list[np.ndarray] = []
-    for tried in range(1, 1000 * count + 1001):
-        data.qpos = middle + half * rng.uniform(-1, 1, robot.n)
+    def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return (count, n) rad: q_home + U(-start_spread, start_spread)."""
+        return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
+
+    def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return (count, 3) m: end-effector positions of random joint angles, so that every goal can be reached.
+
+        Raises:
+            UserError: hardly any position of the arm lies within the task's region.
+        """
+        model = robot.model(gravity=False)
+        data = mujoco.MjData(model)
+        site = model.site(robot.ee_site).id
+        data.qpos = robot.q_home
         mujoco.mj_kinematics(model, data)
-        p = data.site_xpos[site]
-        away = np.linalg.norm(p - shoulder)
-        if (
-            task.reach[0] <= away <= task.reach[1]
-            and p[2] >= task.height
-            and abs(np.arctan2(p[1], p[0])) <= task.azimuth
-        ):
-            goals.append(p.copy())
-            if len(goals) == count:
-                return np.array(goals)
-        if tried == 2000 and len(goals) < 2:
-            break
-    raise UserError(
-        f"task.reach {task.reach[0]:g} to {task.reach[1]:g} m, task.height {task.height:g} m: {robot.name} hardly "
-        "ever gets there; widen them"
-    )
+        shoulder = data.xanchor[min(1, robot.n - 1)].copy()
+        middle, half = 0.5 * (robot.q_min + robot.q_max), 0.45 * (robot.q_max - robot.q_min)
+        found: list[np.ndarray] = []
+        for tried in range(1, 1000 * count + 1001):
+            data.qpos = middle + half * rng.uniform(-1, 1, robot.n)
+            mujoco.mj_kinematics(model, data)
+            p = data.site_xpos[site]
+            away = np.linalg.norm(p - shoulder)
+            if (
+                self.reach[0] <= away <= self.reach[1]
+                and p[2] >= self.height
+                and abs(np.arctan2(p[1], p[0])) <= self.azimuth
+            ):
+                found.append(p.copy())
+                if len(found) == count:
+                    return np.array(found)
+            if tried == 2000 and len(found) < 2:
+                break
+        raise UserError(
+            f"task.reach {self.reach[0]:g} to {self.reach[1]:g} m, task.height {self.height:g} m: {robot.name} "
+            "hardly ever gets there; widen them"
+        )
+
+    def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (5 n + 12,) to normalise `observe` by: the task's own scales.
+
+        Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
+        decide about stopping at a goal vanish.
+        """
+        n, far = robot.n, self.reach[1]
+        centre = np.zeros(5 * n + 12)
+        centre[:n] = 0.5 * (robot.q_min + robot.q_max)
+        places = [np.full(3, 0.5 * far)] * 3
+        scale = [0.3 * (robot.q_max - robot.q_min), np.full(n, 0.5), *places, np.full(n, 0.5)]
+        scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(n)]
+        return centre, np.concatenate(scale)
+
+    def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the observations (m, 5 n + 12) float32 of goals (m, 3) m; `torque` (n,) Nm: an action of 1."""
+        return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
+
+    def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Return (m,) m, the distances at the start, at least CLOSE_M."""
+        return np.maximum(np.linalg.norm(goals - state.ee, axis=-1), CLOSE_M)
+
+    def judge(
+        self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance (m,) m and the reward terms (m, 3) of r2s/tasks/rewards.py; see `Task.judge`."""
+        return _judge(state.ee, goals, reference, state.dq, ddq)
+
+    def measures(self, episodes: Episodes) -> dict[str, float]:
+        """Return one row of evaluations.csv."""
+        return measures(episodes)
 
 
 @njit(cache=True)
 def observe(
-    q: np.ndarray, dq: np.ndarray, ee: np.ndarray, goal: np.ndarray, jacobian: np.ndarray, effort: np.ndarray
+    q: np.ndarray,
+    dq: np.ndarray,
+    ee: np.ndarray,
+    goal: np.ndarray,
+    jacobian: np.ndarray,
+    effort: np.ndarray,
+    torque: np.ndarray,
 ) -> np.ndarray:
     """Return the observation (m, 5 n + 12) float32 in SI units; the same on the arm as in simulation.
 
-    q, dq, ee, goal, error, effort, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm): the last three
+    q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm): the last three
     tell a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is
     state, because the rate limit lets a torque change by 1 Nm per ms only.
 
@@ -110,7 +165,7 @@ def observe(
         q, dq: (m, n) rad, rad/s.
         ee, goal: (m, 3) m.
         jacobian: (m, 3, n) m/rad.
-        effort: (m, n) the last command (tau_J_d) over what an action of 1 asks for.
+        effort: (m, n) Nm, the target as it has come through the low-pass. torque: (n,) Nm, an action of 1.
     """
     m, n = q.shape
     out = np.empty((m, 5 * n + 12), np.float32)
@@ -119,7 +174,7 @@ def observe(
             pull = 0.0
             for k in range(3):
                 pull += jacobian[i, k, j] * (goal[i, k] - ee[i, k])
-            out[i, j], out[i, n + j], out[i, 2 * n + 9 + j] = q[i, j], dq[i, j], effort[i, j]
+            out[i, j], out[i, n + j], out[i, 2 * n + 9 + j] = q[i, j], dq[i, j], effort[i, j] / torque[j]
             out[i, 3 * n + 12 + j], out[i, 4 * n + 12 + j] = pull, np.tanh(pull / FINE_RAD)
         for k in range(3):
             error = goal[i, k] - ee[i, k]
@@ -128,16 +183,10 @@ def observe(
     return out
 
 
-def observation_scale(robot: Robot, task: Task) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (5 n + 12,) to normalise `observe` by: the task's own scales.
-
-    Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
-    decide about stopping at a goal vanish.
-    """
-    n, far = robot.n, task.reach[1]
-    centre = np.zeros(5 * n + 12)
-    centre[:n] = 0.5 * (robot.q_min + robot.q_max)
-    places = [np.full(3, 0.5 * far)] * 3
-    scale = [0.3 * (robot.q_max - robot.q_min), np.full(n, 0.5), *places, np.full(n, 0.5)]
-    scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(n)]
-    return centre, np.concatenate(scale)
+@njit(cache=True)
+def _judge(ee, goal, reference, dq, ddq):
+    distance = np.empty(len(ee))
+    for i in range(len(ee)):
+        x, y, z = goal[i, 0] - ee[i, 0], goal[i, 1] - ee[i, 1], goal[i, 2] - ee[i, 2]
+        distance[i] = np.sqrt(x * x + y * y + z * z)
+    return distance, rewards.terms(distance, reference, dq, ddq)

@@ -1,0 +1,121 @@
+"""What a task has to say, and what it is told: the protocol that environment, rollout and policies depend on.
+
+A new task is one file beside reach.py and one yaml: where episodes start, what is asked, what a policy sees of it,
+and what that is worth.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from r2s.physics.robot import Robot
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """m arms of n joints at one moment. Its arrays may be views that the next step overwrites.
+
+    Attributes:
+        t: (m,) s since their episodes began. q, dq: (m, n) rad, rad/s.
+        ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
+        tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target as it has come through the low-pass.
+        stopped: (m,), whether the arm has ended its motion.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    ee: np.ndarray
+    jacobian: np.ndarray
+    tau: np.ndarray
+    effort: np.ndarray
+    stopped: np.ndarray
+
+    @staticmethod
+    def still(robot: Robot) -> "State":
+        """Return one arm at rest at home, without kinematics: what functions are compiled on."""
+        rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
+        return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, np.zeros(1, dtype=bool))
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """E finished episodes of T control steps; row k is the state after step k.
+
+    Attributes:
+        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m. tau: (E, T, n) Nm, the command at the end of
+        the step. distance: (E, T) m. reward: (E, T), eq. (2).
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    ee: np.ndarray
+    goal: np.ndarray
+    tau: np.ndarray
+    distance: np.ndarray
+    reward: np.ndarray
+
+
+class Task(Protocol):
+    """What is asked of an arm in episodes of `steps` control steps.
+
+    Attributes:
+        ctrl_hz: policy rate. cutoff_hz: low-pass on the torque. steps: control steps of an episode.
+        substeps: physics steps of a control step.
+        observed: what is in an observation, in words and units, for whoever deploys the policy.
+        paper_weights: (k,), of the reward terms in `Episodes.reward`.
+    """
+
+    @property
+    def ctrl_hz(self) -> int: ...  # noqa: D102 (said above)
+    @property
+    def cutoff_hz(self) -> float: ...  # noqa: D102
+    @property
+    def steps(self) -> int: ...  # noqa: D102
+    @property
+    def substeps(self) -> int: ...  # noqa: D102
+    @property
+    def observed(self) -> str: ...  # noqa: D102
+    @property
+    def paper_weights(self) -> np.ndarray: ...  # noqa: D102
+
+    def torque(self, robot: Robot) -> np.ndarray:
+        """Return (n,) Nm that an action of 1 asks for."""
+        ...
+
+    def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return (count, n) rad, where episodes start at rest."""
+        ...
+
+    def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return (count, ...), what is asked in that many episodes: a point, or a path with its times."""
+        ...
+
+    def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (d,) to normalise observations by."""
+        ...
+
+    def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the observations (m, d) float32; `torque` (n,) Nm is what an action of 1 asks for."""
+        ...
+
+    def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Return (m,) m, what the distances of the episodes that begin at `state` are measured by."""
+        ...
+
+    def judge(
+        self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance (m,) m from what is asked, and the reward terms (m, k).
+
+        Args:
+            state: after a step. ddq: (m, n) rad/s^2, mean over that control period.
+            goals: (m, ...). reference: (m,), see there.
+        """
+        ...
+
+    def measures(self, episodes: Episodes) -> dict[str, float]:
+        """Return one row of evaluations.csv."""
+        ...
