@@ -66,9 +66,9 @@ def train(cfg, overrides):
 
     if not is_learner(cfg):
         return reference(cfg, overrides)
+    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     n_envs, loop, settings = split(cfg)
     budget = make_budget(cfg)
-    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     robot, task, model = make_robot(cfg), make_task(cfg), own_model(cfg)
     draw = make_draw(model, robot, make_dynamics(model, robot))
     check_words(curriculum, "reward", plain(cfg.reward))
