@@ -137,8 +137,9 @@ def split(cfg):
     n_envs = settings.pop("n_envs", 32)
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
     words = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
+    check_words(Loop, "algo", words)
     words |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
-    return n_envs, called(Loop, "algo", words), settings
+    return n_envs, Loop(**words), settings
 
 
 def make_budget(cfg):
