@@ -16,6 +16,8 @@ from r2s.physics.robot import Robot, load_robot
 
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
+# What takes seconds to make: tests that share one of a group run on one worker, so that it is made once.
+TOGETHER = {"runs": ("trained", "identified", "stopped"), "identified": ("found", "directly", "linked")}
 SESSION = "R2S_TEST_SESSION"  # every process that a session starts inherits this variable, whoever its parent is
 NAME = pytest.StashKey[str]()
 GRACE_S = 10.0  # a server that watches its parent needs a moment to see that it is gone
@@ -29,6 +31,17 @@ def conf(path: str) -> dict:
 @pytest.fixture(scope="session")
 def panda() -> Robot:
     return load_robot(**conf("robot/panda"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Put the tests that share an expensive fixture, as an argument or as a parameter's value, into one group."""
+    for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        used = {*item.fixturenames, *(v for v in values if isinstance(v, str))}
+        for group, fixtures in TOGETHER.items():
+            if used & set(fixtures):
+                item.add_marker(pytest.mark.xdist_group(group))
 
 
 def pytest_configure(config):
