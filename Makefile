@@ -1,19 +1,23 @@
 # make run: everything on the embedded twin. make test: lint and tests. Both set up what is missing first.
+# make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test test-slow lint format bench setup clean
+.PHONY: run test test-slow test-portable lint format bench setup clean
 
 run: $(READY)
 	$(BIN)/python run.py stage=pipeline
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+test-portable: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/portable.py -n 2 --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .

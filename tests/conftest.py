@@ -16,7 +16,10 @@ from r2s.physics.robot import Robot, load_robot
 
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
+# What takes seconds to make: tests that share one of a group run on one worker, so that it is made once.
+TOGETHER = {"runs": ("trained", "identified", "stopped"), "identified": ("found", "directly", "linked")}
 SESSION = "R2S_TEST_SESSION"  # every process that a session starts inherits this variable, whoever its parent is
+SERVERS = ("from multiprocessing.forkserver ", "from multiprocessing.resource_tracker ")
 NAME = pytest.StashKey[str]()
 GRACE_S = 10.0  # a server that watches its parent needs a moment to see that it is gone
 
@@ -36,6 +39,17 @@ def panda() -> Robot:
     return load_robot(**conf("robot/panda"))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Put the tests that share an expensive fixture, as an argument or as a parameter's value, into one group."""
+    for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        used = {*item.fixturenames, *(v for v in values if isinstance(v, str))}
+        for group, fixtures in TOGETHER.items():
+            if used & set(fixtures):
+                item.add_marker(pytest.mark.xdist_group(group))
+
+
 def pytest_configure(config):
     """Name the session, unless this is a worker of one or a run of pytest within a test."""
     if SESSION not in os.environ:
@@ -43,12 +57,17 @@ def pytest_configure(config):
 
 
 def left_running(name: str) -> dict[psutil.Process, str]:
-    """Return the processes of session `name` besides this one, with their command lines."""
+    """Return the processes of session `name` besides this one, with their command lines.
+
+    Python's own SERVERS of this very process do not count: they end with it.
+    """
     found = {}
     for process in psutil.process_iter():
         try:
             if process.pid != os.getpid() and process.environ().get(SESSION) == name:
-                found[process] = " ".join(process.cmdline())
+                command = " ".join(process.cmdline())
+                if process.ppid() != os.getpid() or not any(server in command for server in SERVERS):
+                    found[process] = command
         except psutil.Error:
             pass  # gone meanwhile, or somebody else's
     return found

@@ -14,6 +14,7 @@ import tempfile
 import time
 import traceback
 from importlib.util import find_spec
+from multiprocessing import forkserver
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,24 @@ FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
     [
         "hydra",
+        "onnxscript",
         "r2s.arm.deploy",
         "r2s.engines.episodes",
         "r2s.reporting.pages",
         "r2s.learning.tqc",
         "r2s.learning.train",
+        "torch.export",
+        "warm",
     ]
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def server():
+    """Start the server, where it finds tests/warm.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        forkserver.ensure_running()
 
 
 def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:

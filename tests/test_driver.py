@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from conftest import conf
 from hypothesis import given, settings
@@ -90,10 +91,11 @@ def hostile(cycles, seed, robot=PANDA, check=None):
     return k, reflexes, stops
 
 
-def test_a_hostile_policy_never_breaks_a_rule():
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])  # a million cycles, in parts that two processes can share
+def test_a_hostile_policy_never_breaks_a_rule(seed):
     """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
-    cycles, reflexes, stops = hostile(1_000_000, seed=1)
-    assert cycles >= 1_000_000
+    cycles, reflexes, stops = hostile(250_000, seed)
+    assert cycles >= 250_000
     assert not reflexes
     assert any("no finite action" in s for s in stops)
 
