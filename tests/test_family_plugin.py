@@ -18,6 +18,7 @@ from r2s.identification.parameter_file import load_parameters, save_parameters
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import check_choices, searched
 from r2s.identification.search.least_squares import LeastSquares
+from r2s.identification.settings import Settings
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
 from r2s.physics.friction import FAMILIES, SIGMOID, Family, family, spelled
 from r2s.physics.rigid_body import InverseInertia
@@ -112,11 +113,7 @@ def result(path, arm):
         nominal_dynamics(arm, **conf("friction/uniform") | {"family": path}),
         motion,
         [LeastSquares(level="torque", max_evaluations=12), LeastSquares(max_evaluations=12, ftol=1e-3)],
-        bounds=BOUNDS,
-        prior=SETTINGS["prior"]["commanded"],
-        terms=["offset", "delay"],
-        family=path,
-        breakaway_max=None,
+        Settings(BOUNDS, SETTINGS["prior"]["commanded"], ["offset", "delay"], family=path, breakaway=None),
         nthread=1,
     )
 
@@ -148,7 +145,7 @@ def test_its_native_form_is_its_numpy_form(path, arm):
     free = frictionless.rollout(np.zeros((21, 1, 2)), record=("qvel",))["qvel"][:, 0]
     for k in range(21):
         law, own = (family(path), phi[k]) if k < 20 else (SIGMOID, np.array([[1.0, 10.0, 0.0]] * 2))
-        mass = np.linalg.inv(InverseInertia(arm)(q[k]))
+        mass = np.linalg.inv(InverseInertia(arm)(q[k : k + 1])[0])
         torque, slope = law.torque(dq[k], own), law.slope(dq[k], own)
         step = np.linalg.solve(mass + 1e-3 * np.diag(slope), mass @ (free[k] - dq[k]) - 1e-3 * torque)
         # of a few dozen operations, each within eps of the largest term, through a matrix of this condition

@@ -17,7 +17,7 @@ class Settings:
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
         terms: what is searched beside friction: viscous, offset, inertia_scale or link, delay, lag, load, drag_sin,
             drag_cos, gain.
-        family: of the friction; auto fits each and keeps the one that predicts motion left out best.
+        family: of the friction; auto keeps the one with the smallest error on motion left out.
         window_s: length of a replayed window, s (commanded torque).
         stride: ms that compared angles are means of (commanded torque).
         cutoff_hz: zero-phase filter of the torque.

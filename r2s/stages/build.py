@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -223,7 +223,10 @@ def is_learner(cfg):
 
 def make_controller(cfg, robot, task):
     """Return the controller of conf/algo, with the model that it believes in."""
-    return part(cfg.algo, "algo", robot, task, make_dynamics(cfg, robot))
+    from r2s.learning.train import Loop
+
+    trained = ("n_envs", "hidden", *(f.name for f in fields(Loop)))  # an experiment may say how to train
+    return part(cfg.algo, "algo", robot, task, make_dynamics(cfg, robot), beside=trained)
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):

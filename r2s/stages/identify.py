@@ -1,7 +1,7 @@
 """stage=identify: recording -> parameters.yaml, errors on training and validation motion, figures."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from r2s.errors import UserError, check_number
@@ -240,7 +240,8 @@ def identify(cfg, overrides):
         settings = make_settings(cfg, cfg.data.torque)
     inputs, ramps, motion = [], None, None
     if cfg.data.kind == "recording":
-        file = called(File, "data", plain(cfg.data))
+        own = {f.name for f in fields(File)}  # an experiment may set what other kinds of data have
+        file = called(File, "data", {k: v for k, v in plain(cfg.data).items() if k in own})
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
         if file.ramps:

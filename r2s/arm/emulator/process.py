@@ -166,6 +166,7 @@ def _yaml(path: Path | None) -> dict:
     import yaml
 
     try:
-        return yaml.safe_load(path.read_text())
+        settings = yaml.safe_load(path.read_text())
     except OSError as error:
         raise UserError(f"--robot {path}: {error.strerror}") from None
+    return {k: v for k, v in settings.items() if k not in ("_target_", "torque_fraction")}  # not load_robot's own
