@@ -72,7 +72,7 @@ def there(seed: int, path: str) -> None:
     from r2s.learning.randomization import Around
     from r2s.tasks.episode import measures
     from r2s.tasks.reach import ReachTask
-    from r2s.tasks.rewards import curriculum
+    from r2s.tasks.rewards import Curriculum
 
     torch.set_num_threads(1)
     task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
@@ -85,7 +85,7 @@ def there(seed: int, path: str) -> None:
 
         def __init__(self):
             self.arm = TaskEnv(ROBOT, task, draw, 1, nthread=1, seed=seed)
-            self.arm.weights = curriculum(0.0, **conf("reward/curriculum"))
+            self.arm.weights = Curriculum(**conf("reward/curriculum"))(0.0)
 
         def reset(self, *, seed=None, options=None):
             self.state = self.arm.reset()

@@ -6,7 +6,7 @@ Read it from the bottom: `main` composes and says a user's mistake as one line w
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -30,43 +30,70 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
-    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
+    words = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]  # those are Hydra's own
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        cfg = compose("config", own)
         loader = GlobalHydra.instance().config_loader()
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("") if g != "hydra"}
-        known = [*_keys(cfg), *groups]
-        typed: dict[str, str] = {}  # what is checked, by the name that an error calls it
-        jobs = [own]  # the words of a job with the first value of each sweep, and of one for every other value
-        for word in words:
-            if word.lstrip("+~").startswith(("hydra.", "hydra/")):
-                continue  # Hydra's own
-            try:
-                parsed = OverridesParser.create().parse_override(word)
-                name = parsed.key_or_group
-                if parsed.is_add() and name not in groups:  # Hydra would take it, and nothing would read it
-                    raise UserError(f"unknown option '{name}'{nearest(name, known)}")
-                values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
-                trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
-                for trial in trials:
-                    cfg = compose("config", [*jobs[0], trial])
-                if name in groups:
-                    known = [*_keys(cfg), *groups]
-                first = jobs[0]
-                jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
-                typed[name] = word
-            except (HydraException, OmegaConfBaseException) as error:
-                raise _said_in_one_line(word, error, groups, known) from None
-        configs = [compose("config", job) for job in jobs]
-        for name in typed:
+        try:
+            names, jobs = _jobs(words, own, groups)
+            configs = [compose("config", job) for job in jobs]
+        except (HydraException, OmegaConfBaseException, UnknownOption):
+            raise _first_mistake(words, own, groups) from None
+        for name in names:
             reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
             if reasons and all(reasons):
                 raise UserError(reasons[0])
     GlobalHydra.instance().clear()
+
+
+class UnknownOption(Exception):  # noqa: N818 (whose message is made where the options are known)
+    """A word adds to the config what nothing would read."""
+
+
+def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return the keys and groups typed, and the words of a job with the first value of each sweep, and of one more
+    for every other value.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    names, jobs = [], [own]
+    for word in words:
+        parsed = OverridesParser.create().parse_override(word)
+        names.append(parsed.key_or_group)
+        if parsed.is_add() and parsed.key_or_group not in groups:  # Hydra would take it
+            raise UnknownOption
+        values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
+        trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
+        first = jobs[0]
+        jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
+    return names, jobs
+
+
+def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> UserError:
+    """Return what is wrong with the first word that the config does not take after those before it."""
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    known = [*_keys(compose("config", own)), *groups]
+    for k, word in enumerate(words):
+        job = [word]
+        try:
+            names, jobs = _jobs(words[: k + 1], own, groups)
+            for job in jobs:
+                cfg = compose("config", job)
+        except UnknownOption:
+            name = word.lstrip("+~").split("=", 1)[0]
+            return UserError(f"unknown option '{name}'{nearest(name, known)}")
+        except (HydraException, OmegaConfBaseException) as error:
+            return _said_in_one_line(job[-1], error, groups, known)  # of a sweep the value that is not taken
+        if names[-1] in groups:
+            known = [*_keys(cfg), *groups]
+    raise AssertionError("each word is taken, and all of them are not")
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[str]:

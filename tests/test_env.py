@@ -19,7 +19,7 @@ from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.limits import SoftLimits
 from r2s.tasks.reach import ReachTask, observe
-from r2s.tasks.rewards import PAPER, TERMS, curriculum, terms
+from r2s.tasks.rewards import PAPER, TERMS, Curriculum, terms
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
 
@@ -281,15 +281,15 @@ def test_the_curriculum_goes_from_one_end_to_the_other():
     start, end = settings["anneal"]
     first, last = ([1.0, *(settings[name][k] for name in TERMS[1:])] for k in (0, 1))
     for progress, weights in ((0.0, first), (start, first), (end, last), (1.0, last), (2.0, last)):
-        np.testing.assert_allclose(curriculum(progress, **settings), weights)
-    np.testing.assert_allclose(curriculum(0.5 * (start + end), **settings), np.mean([first, last], axis=0))
+        np.testing.assert_allclose(Curriculum(**settings)(progress), weights)
+    np.testing.assert_allclose(Curriculum(**settings)(0.5 * (start + end)), np.mean([first, last], axis=0))
 
 
 @pytest.mark.parametrize("progress", [0.0, 0.3, 1.0])
 def test_the_papers_reward_never_changes(progress):
     """conf/reward/paper weighs the terms as eq. (2) does, from the first step to the last."""
     weights = [1.0, 1.0] + [0.0] * (len(TERMS) - 2)
-    assert curriculum(progress, **conf("reward/paper")).tolist() == PAPER.tolist() == weights
+    assert Curriculum(**conf("reward/paper"))(progress).tolist() == PAPER.tolist() == weights
 
 
 def test_goals_lie_in_the_region_and_some_posture_reaches_them(panda, task):

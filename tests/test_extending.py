@@ -14,7 +14,10 @@ LINES = 60  # about a screen
 
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_a_part_is_one_file_one_yaml_and_one_command(example, tmp_path, monkeypatch):
-    """The files of an example, in an empty folder, and its command in that folder: the run ends well."""
+    """The files of an example, in an empty folder, and its command in that folder: the run ends well.
+
+    +experiment=toy names a family, so the example's own is said again, after it.
+    """
     assert len(EXAMPLES[example].splitlines()) <= LINES
     blocks = re.findall(r"```(\w+)\n(.*?)```", EXAMPLES[example], flags=re.S)
     commands = [text for kind, text in blocks if kind == "bash"]
@@ -26,6 +29,9 @@ def test_a_part_is_one_file_one_yaml_and_one_command(example, tmp_path, monkeypa
     assert len(blocks) - len(commands) == 2
     for command in commands:
         words = shlex.split(command.removeprefix("python run.py"))
+        words += [
+            f"friction.family={family}" for family in re.findall(r"^family: (\S+)", EXAMPLES[example], flags=re.M)
+        ]
         out = succeed(*words, *TOY, at=tmp_path)
         (folder,) = re.findall(r"written: (\S+)", out)
         assert (tmp_path / folder / "summary.json").is_file()

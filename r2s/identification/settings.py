@@ -3,9 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from r2s.errors import UserError, check_number
+from r2s.errors import UserError, check_number, choices
+from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import check_bounds, check_parameters
-from r2s.identification.problem import check_choices, check_prior
+from r2s.identification.problem import check_choices, check_prior, optional_friction
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,9 @@ class Settings:
         check_parameters("bounds", self.bounds)
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
+        terms = [name for term in self.terms for name in (LINK if term == "link" else [term])]
+        if missing := [name for name in terms if name not in {*self.bounds, *optional_friction()}]:
+            raise UserError(f"identify.bounds: none for {choices(missing)}")
         check_number("identify.window_s", self.window_s, "(0, inf)")
         check_number("identify.stride", self.stride, "[1, inf)", whole=True)
         check_number("identify.cutoff_hz", self.cutoff_hz, "(0, inf)")

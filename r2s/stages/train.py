@@ -49,7 +49,6 @@ def reads(cfg):
 def train(cfg, overrides):
     """Train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
     import copy
-    from functools import partial
 
     import torch
 
@@ -62,7 +61,7 @@ def train(cfg, overrides):
     from r2s.progress import Progress
     from r2s.reporting import pages
     from r2s.reporting.tables import reach_table
-    from r2s.tasks.rewards import curriculum
+    from r2s.tasks.rewards import Curriculum
 
     if not is_learner(cfg):
         return reference(cfg, overrides)
@@ -71,8 +70,7 @@ def train(cfg, overrides):
     budget = make_budget(cfg)
     robot, task, model = make_robot(cfg), make_task(cfg), own_model(cfg)
     draw = make_draw(model, robot, make_dynamics(model, robot))
-    check_words(curriculum, "reward", plain(cfg.reward))
-    weights = partial(curriculum, **plain(cfg.reward))
+    weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)

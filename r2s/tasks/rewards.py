@@ -5,9 +5,12 @@ every stored transition is worth what the present weights say.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+
+from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
@@ -46,25 +49,37 @@ def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.n
 PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
 
 
-def curriculum(
-    progress: float,
-    *,
-    smoothness: Sequence[float],
-    precision: Sequence[float],
-    anneal: Sequence[float],
-) -> np.ndarray:
-    """Return the (3,) weights at `progress` in [0, 1] of the training budget.
+@dataclass(frozen=True)
+class Curriculum:
+    """The weights of the terms over a training.
 
     Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
     with light smoothness and a bonus for precision, then moves linearly towards eq. (2) between the two `anneal`
     fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
-    Args:
-        progress: fraction of the budget spent.
+    Attributes:
         smoothness, precision: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
+
+    Raises:
+        UserError: no pair of numbers, or a number outside its range.
     """
-    start, end = anneal
-    at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
-    moving = [before + at * (after - before) for before, after in (smoothness, precision)]
-    return np.array([1.0, *moving])
+
+    smoothness: Sequence[float]
+    precision: Sequence[float]
+    anneal: Sequence[float]
+
+    def __post_init__(self):
+        for name, interval in (("smoothness", "[0, inf)"), ("precision", "[0, inf)"), ("anneal", "[0, 1]")):
+            pair = getattr(self, name)
+            if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+                raise UserError(f"reward.{name}: {pair} is not allowed; two numbers are, before and after")
+            for number in pair:
+                check_number(f"reward.{name}", number, interval)
+
+    def __call__(self, progress: float) -> np.ndarray:
+        """Return the (3,) weights at `progress`, the fraction of the training budget that is spent."""
+        start, end = self.anneal
+        at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
+        moving = [before + at * (after - before) for before, after in (self.smoothness, self.precision)]
+        return np.array([1.0, *moving])
