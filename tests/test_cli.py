@@ -440,6 +440,7 @@ def test_a_training_transfers_without_the_identification_that_it_came_from(ident
     assert set(rows[0]) == {"mujoco", "predicted", "twin"}
 
 
+@pytest.mark.slow
 def test_another_arm_needs_no_more_than_its_file(root):
     """Six joints, their own limits, no published friction: the pipeline ends with its table."""
     arm = Path(__file__).parent / "models" / "six_joints.xml"

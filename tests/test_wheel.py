@@ -35,6 +35,11 @@ def test_the_wheel_has_every_module_and_every_number(installed):
     assert "r2s = r2s.cli:main" in next(installed.glob("*.dist-info/entry_points.txt")).read_text()
 
 
+def surroundings(installed: Path, folder: Path) -> dict[str, str]:
+    """Return the variables under which Python finds the installed r2s and modules of a folder, not the checkout."""
+    return {"PYTHONPATH": f"{installed}{os.pathsep}{folder}", "PYTHONSAFEPATH": "1", "COLUMNS": "110"}
+
+
 def test_installed_it_runs_from_any_folder(installed, tmp_path):
     """`r2s stage=identify` writes runs/ where it is called, and takes nothing from the checkout."""
     seen = (
@@ -42,7 +47,7 @@ def test_installed_it_runs_from_any_folder(installed, tmp_path):
     )
     seen += "if m.__name__.split('.')[0] == 'r2s' and getattr(m, '__file__', None)}))\n"
     (tmp_path / "r2s_seen.py").write_text(seen)
-    here = {"PYTHONPATH": f"{installed}{os.pathsep}{tmp_path}", "PYTHONSAFEPATH": "1", "COLUMNS": "110"}
+    here = surroundings(installed, tmp_path)
     code = "import r2s_seen, sys; sys.argv[0] = 'r2s'; from r2s.cli import main; main()"
     command = [sys.executable, "-c", code, "stage=identify", "+experiment=toy"]
     done = subprocess.run(command, cwd=tmp_path, env=os.environ | here, capture_output=True, text=True)
@@ -57,3 +62,17 @@ def test_installed_it_runs_from_any_folder(installed, tmp_path):
     )
     assert script.returncode == 2
     assert "did you mean 'tqc'" in script.stderr
+
+
+@pytest.mark.slow
+def test_installed_its_pipeline_ends_for_another_arm(installed, tmp_path):
+    """`r2s robot=other robot.mjcf=FILE stage=pipeline` in an empty folder: six joints, nothing else typed of them."""
+    words = ["robot=other", f"robot.mjcf={Path(__file__).parent / 'models' / 'six_joints.xml'}", "stage=pipeline"]
+    words += ["pipeline.train_minutes=null", "name=six", "+experiment=toy"]
+    here = os.environ | surroundings(installed, tmp_path)
+    command = [sys.executable, "-m", "r2s", *words]
+    done = subprocess.run(command, cwd=tmp_path, env=here, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for model in ("identified", "nominal"):
+        assert f"{model} model, twin" in done.stdout
+        assert (tmp_path / "runs" / "transfer" / f"six_{model}" / "summary.json").is_file()
