@@ -93,7 +93,8 @@ class Run:
         for _, file in self._tables.values():
             file.close()
         self._meta["wall_clock_s"] = round(time.time() - self._began, 3)
-        self._meta["status"] = "done" if kind is None else "failed"
+        interrupted = kind is KeyboardInterrupt
+        self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
         self._write_meta()

@@ -1,5 +1,6 @@
 """What can be said of several trainings, against hand calculations and known distributions."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from r2s.reporting.comparison import (
 from r2s.reporting.grouping import LONGEST, group
 from r2s.reporting.statistics import improvement, interquartile_mean, interval
 from r2s.reporting.trainings import comparable, in_words, read_trainings
+from r2s.runs import Run
 from r2s.stages.build import CONF
 
 ROOT = Path(__file__).parent.parent
@@ -271,3 +273,15 @@ def test_a_band_is_over_what_all_seeds_have(grouped):
     assert middle[0] == pytest.approx(-101.0)
     assert high[0] == -100.0
     assert high[-1] == pytest.approx(-80.0)
+
+
+def test_a_run_says_how_it_ended(tmp_path):
+    """Done, stopped by a person's Ctrl-C, or failed: what the comparison then says of it."""
+    how = {"overrides": [], "config": "", "seed": 0, "threads": 1}
+    for name, error in (("whole", None), ("stopped", KeyboardInterrupt()), ("broken", ValueError("why"))):
+        with contextlib.suppress(KeyboardInterrupt, ValueError), Run(tmp_path, "train", name, **how):
+            if error:
+                raise error
+    files = [tmp_path / "train" / name / "meta.json" for name in ("whole", "stopped", "broken")]
+    seen = [json.loads(file.read_text())["status"] for file in files]
+    assert seen == ["done", "stopped", "failed"]
