@@ -1,17 +1,13 @@
 """A training that stopped goes on where it was; a number that is not finite stops it, and can be had again."""
 
-import os
-import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from conftest import conf
+from test_cli import r2s, server, started, succeed  # noqa: F401
 
 from r2s.errors import UserError
 from r2s.learning.env import TaskEnv
@@ -25,7 +21,6 @@ from r2s.physics.robot import load_robot
 from r2s.tasks import rewards
 from r2s.tasks.reach import ReachTask
 
-ROOT = Path(__file__).parent.parent
 QUICK = [
     "root=runs",
     "threads=1",
@@ -34,12 +29,9 @@ QUICK = [
     "evaluation.episodes=4",
     "algo.hidden=[32,32]",
     "algo.batch_size=32",
-]
-QUICK += [
-    "algo.batch_size=32",
-    "budget.env_steps=9600",
-    "evaluation.env_steps=3200",
-    "algo.learning_starts=1600",
+    "budget.env_steps=4800",
+    "evaluation.env_steps=1600",
+    "algo.learning_starts=800",
     "algo.replay_size=5000",
 ]
 
@@ -96,28 +88,18 @@ def test_an_environment_goes_back_to_its_state(panda, family):
     assert family != BRISTLE.name or np.abs(one.arms.sim.state()["_memory"]).max() > 0
 
 
-def run(folder, *words):
-    """Start run.py on a training of seconds."""
-    command = [sys.executable, str(ROOT / "run.py"), *words]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    )
-
-
 def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
     """Killed after its first checkpoint and resumed: the same policy and evaluations as without, to the bit."""
-    whole = run(tmp_path, *QUICK, "name=whole")
-    stopped = run(tmp_path, *QUICK, "name=stopped")
+    stopped = started(*QUICK, "name=stopped", at=tmp_path)
+    whole = started(*QUICK, "name=whole", at=tmp_path)
     state = tmp_path / "runs" / "train" / "stopped" / "checkpoints" / "state.pt"
     while not state.is_file():
-        assert stopped.poll() is None, stopped.communicate()[0]
+        assert stopped.is_alive(), "it ended before it could be killed"
         time.sleep(0.02)
-    stopped.send_signal(signal.SIGKILL)
-    stopped.wait()
-    assert whole.wait() == 0, whole.communicate()[0]
-    resumed = run(tmp_path, f"resume={state.parent.parent}")
-    assert resumed.wait() == 0, resumed.communicate()[0]
+    stopped.kill()
+    succeed(f"resume={state.parent.parent}", at=tmp_path)
+    whole.join()
+    assert whole.exitcode == 0
     folders = [tmp_path / "runs" / "train" / name for name in ("whole", "stopped")]
     policies = [torch.load(f / "policy.pt", weights_only=True)["state"] for f in folders]
     assert all(torch.equal(v, policies[1][k]) for k, v in policies[0].items())
@@ -125,9 +107,9 @@ def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
         first, second = (pd.read_csv(f / f"{table}.csv").drop(columns="wall_clock_s") for f in folders)
         pd.testing.assert_frame_equal(first, second)
     assert not (folders[1] / "checkpoints").exists()
-    again = run(tmp_path, f"resume={folders[1]}")
-    assert again.wait() == 2
-    assert again.communicate()[0].strip().endswith("is finished")
+    again = r2s(f"resume={folders[1]}", at=tmp_path)
+    assert again.returncode == 2
+    assert again.stderr.strip().endswith("is finished")
 
 
 def train_until_it_breaks(env, algo, dump):

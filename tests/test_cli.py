@@ -74,11 +74,17 @@ def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
     os._exit(status)  # a process of multiprocessing would wait for the workers of a sweep
 
 
+def started(*words: str, at: Path, out: str = os.devnull, err: str = os.devnull) -> multiprocessing.Process:
+    """Start `python run.py WORDS` in the folder `at`."""
+    child = FORKS.Process(target=front_door, args=(words, at, out, err))
+    child.start()
+    return child
+
+
 def r2s(*words: str, at: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run run.py as a user does, without a terminal."""
     with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:
-        child = FORKS.Process(target=front_door, args=(words, at, out.name, err.name))
-        child.start()
+        child = started(*words, at=at, out=out.name, err=err.name)
         child.join()
         return subprocess.CompletedProcess(words, child.exitcode or 0, out.read(), err.read())
 
@@ -124,11 +130,12 @@ def stopped(root) -> Path:
     """Return the folder of an identification that was killed in the middle of its searches."""
     words = ["stage=identify", "name=killed", f"root={root}", *TOY]
     folder = root / "identify" / "killed"
-    with subprocess.Popen([sys.executable, "run.py", *words], cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-        while not (folder / "checkpoints" / "search_1.npz").is_file():
-            assert process.poll() is None, "it ended before it could be killed"
-            time.sleep(0.02)
-        process.kill()
+    process = started(*words, at=ROOT)
+    while not (folder / "checkpoints" / "search_1.npz").is_file():
+        assert process.is_alive(), "it ended before it could be killed"
+        time.sleep(0.02)
+    process.kill()
+    process.join()
     assert not (folder / "parameters.yaml").exists()
     return folder
 
