@@ -18,16 +18,25 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 FAMILY_HZ = 50.0  # rows per second that families are compared on
+GUARD_S = 0.1  # s, rows this close to a block are nearly its own
 
 
-def left_out(recording: Recording, folds: int) -> list[tuple[Recording, Recording]]:
-    """Return (rest, block) for blocks of time, or of phase where the motion repeats itself; 0.1 s apart."""
-    clock = recording.t % recording.period if recording.period else recording.t
-    edges = np.quantile(clock, np.linspace(0, 1, folds + 1))
+def left_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
+    """Return (rest, out) for each of the folds: `blocks` blocks are left out, and GUARD_S about them of the rest.
+
+    Blocks are of time, or of phase where the motion repeats itself.
+    """
+    period = recording.period or np.inf
+    clock = recording.t % period if recording.period else recording.t
+    edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
     pairs = []
-    for low, high in pairwise(edges):
-        out = (clock >= low) & (clock <= high)
-        near = (clock > low - 0.1) & (clock < high + 0.1)
+    for k in range(folds):
+        out, near = np.zeros((2, len(clock)), dtype=bool)
+        for low, high in edges[k::folds]:
+            inside = (clock >= low) & (clock <= high)
+            out |= inside
+            # on a circle: after the last phase comes phase 0; without a period the way round is infinite
+            near |= inside | ((low - clock) % period < GUARD_S) | ((clock - high) % period < GUARD_S)
         pairs.append((recording.select(~near), recording.select(out)))
     return pairs
 

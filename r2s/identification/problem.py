@@ -13,7 +13,7 @@ from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import ParameterSpace, check_parameters, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
-from r2s.identification.torque_residual import TorqueResidual
+from r2s.identification.torque_residual import STEP, TorqueResidual
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
 from r2s.physics.friction import known_families
@@ -21,8 +21,7 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
-STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
-TERMS = ("offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
+TERMS = ("offset", "inertia_scale", "link", "delay", "lag", "load", "drag", "drag_sin", "drag_cos", "gain")
 Report = Callable[[dict], None]
 
 
@@ -41,6 +40,11 @@ def check_choices(family: str, terms: Sequence[str]) -> None:
 def optional_friction() -> list[str]:
     """Return the friction parameters that are searched only where terms name them, of whichever family."""
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
+
+
+def parts(term: str) -> tuple[str, ...]:
+    """Return the blocks that a term stands for."""
+    return {"link": tuple(LINK), "drag": ("drag_sin", "drag_cos")}.get(term, (term,))
 
 
 def check_prior(prior: Mapping[str, float]) -> None:
@@ -76,9 +80,8 @@ def searched(
     names = [name for name in own if name in bounds]
     elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
     for term in terms:
-        if term in elsewhere or term in optional_friction():
-            continue
-        names += LINK if term == "link" else [term]
+        if term not in elsewhere and term not in optional_friction():
+            names += parts(term)
     if missing := [name for name in names if name not in bounds]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
     return parameter_space(robot, nominal, {name: bounds[name] for name in names})
@@ -133,9 +136,7 @@ class Problem:
 
     def quick_jacobian(self, u: np.ndarray) -> np.ndarray:
         """Return (R + P, P), the Jacobian of `quick` at u (P,)."""
-        h = np.where(u > 0.5, -STEP, STEP)
-        change = self.quick_data.change(self.space.from_unit(u), self.space.from_unit(u + h))
-        return np.concatenate([change / h, np.diag(self.weight)])
+        return np.concatenate([self.quick_data.jacobian(u), np.diag(self.weight)])
 
     def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:
         return np.concatenate([data(self.space.from_unit(u)), (u - self.start) * self.weight], axis=1)

@@ -12,6 +12,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # friction is evaluated this often, then filtered as the torque is
+MIXED = 0.01  # of the low-pass's weights
 FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over that of the torque
 
 
@@ -75,6 +76,10 @@ class SmoothMotion:
     def filtered(self, x: np.ndarray) -> np.ndarray:
         """Return (T, n): the low-pass of x (F, n) at the moments."""
         return self.low_pass @ x
+
+    def unmixed(self, true: np.ndarray) -> np.ndarray:
+        """Return (T, n) bool: moments whose low-pass takes next to nothing from where `true` (F, n) does not hold."""
+        return abs(self.low_pass) @ (~true).astype(float) < MIXED
 
     def tau_at(self, delay: float) -> np.ndarray:
         """Return (T, n) Nm: the torque `delay` s before each moment."""

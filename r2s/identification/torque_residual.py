@@ -14,10 +14,12 @@ from r2s.identification.smooth_motion import SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
 from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor, rigid_body
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
+STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's curvature
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
+HELD = 0.5  # steps: a command that is held for a step is that late on average
 BLOCK_S = 0.5  # s, stretches that the bootstrap draws
 
 
@@ -38,9 +40,11 @@ class TorqueResidual:
         rate_hz: float = 100.0,
         block_s: float = BLOCK_S,
         presliding_rad: float = PRESLIDING,
+        slowest: float = 0.0,
     ):
         self.space = space
         self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+        self.seen = m.unmixed(np.abs(m.fast) >= slowest) if slowest else np.ones_like(m.q, dtype=bool)
         self.commanded = recording.torque == "commanded"
         gravity = None if self.commanded else GRAVITY
         self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
@@ -89,12 +93,17 @@ class TorqueResidual:
 
     def off(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded, of one arm."""
-        late = float(dynamics.delay) + float(dynamics.lag) if self.commanded else 0.0
+        late = float(dynamics.delay) + float(dynamics.lag) + HELD * SIM_DT if self.commanded else 0.0
         return self.predict(dynamics) - self.motion.tau_at(late)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
-        return (self.error(x) / self._scale).reshape(len(x), -1)
+        return (self.error(x) * (self.seen / self._scale)).reshape(len(x), -1)
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Return (R, P), the Jacobian at u (P,) on the unit cube."""
+        h = np.where(u > 0.5, -STEP, STEP)
+        return self.change(self.space.from_unit(u), self.space.from_unit(u + h)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
         """Return (R, P): what the residual at x (P,) changes by as each value in turn goes to `stepped` (P,).
@@ -122,7 +131,7 @@ class TorqueResidual:
                 out[..., at[0]] = moved
             else:
                 out[:, np.arange(n), at] = moved
-        return (out / self._scale[:, None]).reshape(-1, len(x))
+        return (out * (self.seen / self._scale)[..., None]).reshape(-1, len(x))
 
     def _standard(self, d: Dynamics) -> np.ndarray:
         """Return (..., n, 10) standard parameters."""
@@ -133,8 +142,13 @@ class TorqueResidual:
 
         It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing.
         """
-        r = self.error(x[None])[0]
-        self._scale = (1.0 if fitted else 0.5) * np.sqrt((r**2).mean(0) * np.minimum(_correlation_length(r), LONGEST))
+        r = self.error(x[None])[0] * self.seen
+        square = (r**2).sum(0) / np.maximum(self.seen.sum(0), 1)
+        self._scale = (1.0 if fitted else 0.5) * np.sqrt(square * np.minimum(_correlation_length(r), LONGEST))
+
+    def weigh_like(self, other: "TorqueResidual") -> None:
+        """Take the standard deviations that `other` found."""
+        self._scale = other._scale
 
 
 def _correlation_length(r: np.ndarray) -> np.ndarray:
