@@ -50,7 +50,9 @@ class SmoothMotion:
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
         kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
         every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
-        ddq, keep, rows, fast, bristle = smooth.acceleration(), [], [], [], []
+        # of the angles: logged velocities are late by a filter on an arm, by half a step in a simulator
+        dq, fastest = smooth.derivative(smooth.q), quick.derivative(quick.q)
+        ddq, keep, rows, fast, bristle = smooth.derivative(dq), [], [], [], []
         step, edge, base = round(1 / (rate_hz * SIM_DT)), round(0.05 / SIM_DT), 0
         for s in smooth.stretches:
             some = np.arange(s.start + edge, s.stop - edge, step)
@@ -58,8 +60,8 @@ class SmoothMotion:
             near = np.clip((some[:, None] - s.start) // every + np.arange(-reach, reach + 1), 0, len(at) - 1)
             keep.append(some)
             rows.append(base + near)
-            fast.append(quick.dq[at])
-            bristle.append(presliding(quick.dq[s], SIM_DT, presliding_rad)[::every])
+            fast.append(fastest[at])
+            bristle.append(presliding(fastest[s], SIM_DT, presliding_rad)[::every])
             base += len(at)
         kept = np.concatenate(keep)
         if not len(kept):
@@ -69,7 +71,7 @@ class SmoothMotion:
         low_pass = csr_array((np.tile(kernel, len(kept)), columns.ravel(), ends), shape=(len(kept), base))
         late = np.stack([smooth.tau[np.maximum(kept - k, 0)] for k in range(edge)], 1)
         return SmoothMotion(
-            smooth.t[kept], smooth.q[kept], smooth.dq[kept], ddq[kept], smooth.tau[kept],
+            smooth.t[kept], smooth.q[kept], dq[kept], ddq[kept], smooth.tau[kept],
             np.concatenate(fast), np.concatenate(bristle), low_pass, late,
         )  # fmt: skip
 
