@@ -82,11 +82,11 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
             j, way = _farthest_beyond(mass, acceleration, drive, edges, side)
             if j < 0 or events > 4 * n:  # who stopped that often in a millisecond stays for the rest of it
                 break
-            if coming[j] == 0.0:
-                side[j], now[j], took_part = way, rest[j, int(way > 0.0)], True
-            else:  # slow, but not at rest
-                side[j] = np.sign(coming[j])
-        if slow:  # an impulse stops those that are held, and the others feel it
+            side[j] = way if coming[j] == 0.0 else np.sign(coming[j])
+            on = side[j] * dq[j] > 0.0  # it slides as it did
+            now[j] = friction[j] if on else rest[j, int(side[j] > 0.0)]
+            took_part |= not on
+        if slow:  # an impulse stops those that are held and not at rest, and the others feel it
             slow = False
             for j in range(n):
                 rhs[j] = 0.0
@@ -100,15 +100,19 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
         for j in range(n):
             took_part |= side[j] == HELD
             if abs(side[j]) == 1.0:
-                if side[j] * coming[j] < 0.0:
+                if side[j] * (coming[j] + span * acceleration[j]) < 0.0:
+                    until = -coming[j] / acceleration[j] if side[j] * coming[j] > 0.0 else 0.0
+                    if until < span:
+                        span, first = until, j
+                elif side[j] * coming[j] < 0.0 < span:  # by an impulse
                     span, first = 0.0, j
-                elif side[j] * (coming[j] + span * acceleration[j]) < 0.0:
-                    span, first = -coming[j] / acceleration[j], j
         for j in range(n):
             coming[j] += span * acceleration[j]
         if first < 0:
             return took_part
-        coming[first], side[first], took_part = 0.0, HELD, True
+        if span > 0.0:
+            coming[first] = 0.0
+        slow, side[first], took_part = coming[first] != 0.0, HELD, True
         left -= span
         events += 1
 
