@@ -55,6 +55,7 @@ def save_parameters(
         "breakaway_negative": fixed.breakaway[:, 0].tolist(),
         "breakaway_positive": fixed.breakaway[:, 1].tolist(),
         "dq_min": fixed.dq_min,
+        "hold": fixed.hold,
         "inertia": fixed.inertia.tolist(),
     }
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in LATER}
@@ -117,6 +118,7 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
         breakaway=np.stack(edges, -1),
         delay=float(fixed["delay"]),
         lag=float(fixed["lag"]),
+        hold=fixed.get("hold", "command"),  # files of before know of no other
     )
     everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}
     space = parameter_space(robot, nominal, everything)

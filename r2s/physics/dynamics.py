@@ -5,10 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from r2s.errors import UserError
+from r2s.errors import UserError, choices, nearest
 from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
+
+
+HOLDS = ("command", "net")
 
 
 @dataclass(frozen=True)
@@ -18,14 +21,17 @@ class Dynamics:
     Attributes:
         phi: (..., n, K), the parameters of `family`; the paper's are Nm, s/rad, rad/s of eq. (5).
         offset: (..., n) Nm, added to every command.
-        breakaway: (..., n, 2) Nm, negative and positive edge of the dead zone, of command and offset together.
-        dq_min: rad/s, speed below which the dead zone may hold.
+        breakaway: (..., n, 2) Nm, negative and positive edge of what a joint at rest is held between.
+        dq_min: rad/s, speed below which it may be held.
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
         load: (..., n), friction per torque that gravity loads the joint with.
         drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's.
         gain: (..., n), relative error of the link-side torque sensor. Only a measured torque knows it.
         family: of the friction.
+        hold: which torque the edges are of. "command" is the paper's eq. (6): command and offset are nullified while
+            they are within the edges. "net" is stiction: a joint stays where it is while all that acts on it, the
+            other joints' motion included, is within the edges (r2s/physics/stick_slip.py).
         delay, lag: (...) s, of the actuation: pure, and first order. The simulator does not apply them: whoever
             makes the commands does (`Motors` of r2s/physics/actuation.py).
     """
@@ -41,8 +47,15 @@ class Dynamics:
     drag: np.ndarray
     gain: np.ndarray
     family: Family = SIGMOID
+    hold: str = "command"
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.hold not in HOLDS:
+            raise UserError(
+                f"friction.hold: '{self.hold}'; allowed: {choices(HOLDS)}{nearest(str(self.hold), HOLDS)}"
+            )
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
@@ -88,6 +101,7 @@ def nominal_dynamics(
     breakaway_positive: Sequence[float] | float = 0.0,
     breakaway_negative: Sequence[float] | float = 0.0,
     dq_min: float = 0.01,
+    hold: str = "command",
     inertia_scale: Sequence[float] | float = 1.0,
 ) -> Dynamics:
     """Return the dynamics that `conf/friction` and `conf/inertia` describe: a number per joint, or one for all.
@@ -122,6 +136,7 @@ def nominal_dynamics(
         offset=joints("friction.offset", offset),
         breakaway=np.stack([low, high], -1),
         inertia=robot.inertia * scale[:, None, None],
+        hold=hold,
     )
 
 

@@ -38,6 +38,8 @@ class Family:
             with a memory how far the bristles are bent.
         native: the law for one joint and one step of h seconds, compiled by numba.njit:
             (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's own, 0 after a reset.
+        sharp: `native` of a law with a jump at rest, the jump left as one; for `hold` = "net" of Dynamics, which solves
+            it. None: `native` serves there, too.
         start: level (..., n) Nm at 1 rad/s -> the K parameters that are not optional, in a list.
         held: phi (..., n, K) -> (..., n, 2) Nm, the negative and the positive torque that the law holds at rest,
             which takes a memory. None: it holds nothing, and the dead zone of `passive_torque` does.
@@ -58,6 +60,7 @@ class Family:
     bounds: tuple[tuple[float, float], ...] = ()
     optional: tuple[str, ...] = ()
     held: Callable[[np.ndarray], np.ndarray] | None = None
+    sharp: Callable[..., tuple[float, float]] | None = None
 
     def __post_init__(self) -> None:
         where, k = f"friction family '{self.name}'", len(self.names)
@@ -75,6 +78,16 @@ class Family:
     def has_memory(self) -> bool:
         """Whether the law holds a joint at rest by itself; then it needs no dead zone."""
         return self.held is not None
+
+    def at_rest(self, phi: np.ndarray) -> np.ndarray:
+        """Return (..., n, 2) Nm: friction as sliding just begins, of the negative and of the positive direction.
+
+        It is 0 for a law without a jump. phi: (..., n, K).
+        """
+        if self.sharp is None:
+            return np.zeros((*phi.shape[:-1], 2))
+        still = np.zeros(phi.shape[:-1])
+        return np.stack([self.torque(still, phi, bristle=still + sign) for sign in (-1.0, 1.0)], -1)
 
     def scale(self, name: str) -> tuple[str, str]:
         """Return how a parameter is measured and searched: its unit, and "logarithmic" or "linear"."""
@@ -169,6 +182,12 @@ def _coulomb_native(p, v, h, memory):
     return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + p[2]
 
 
+@njit(cache=True)
+def _coulomb_sharp(p, v, h, memory):
+    sign = np.sign(v)
+    return p[0] * (1.0 + sign * p[1]) * sign + p[2] * v, p[2]
+
+
 def _coulomb_start(level: np.ndarray) -> list[np.ndarray]:
     return [level, np.zeros_like(level), np.zeros_like(level)]
 
@@ -182,6 +201,7 @@ COULOMB = Family(
     law=_coulomb_law,
     law_slope=_coulomb_slope,
     native=_coulomb_native,
+    sharp=_coulomb_sharp,
     start=_coulomb_start,
 )
 
@@ -207,6 +227,13 @@ def _stribeck_native(p, v, h, memory):
     return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + p[2]
 
 
+@njit(cache=True)
+def _stribeck_sharp(p, v, h, memory):
+    sign = np.sign(v)
+    level, bump = p[0] * (1.0 + sign * p[1]), p[3] * np.exp(-((v / p[4]) ** 2))
+    return level * (1.0 + bump) * sign + p[2] * v, p[2] - level * bump * 2.0 * abs(v) / p[4] ** 2
+
+
 def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
     return [*_coulomb_start(level), np.full_like(level, 0.1), np.full_like(level, 0.1)]
 
@@ -220,6 +247,7 @@ STRIBECK = Family(
     law=_stribeck_law,
     law_slope=_stribeck_slope,
     native=_stribeck_native,
+    sharp=_stribeck_sharp,
     start=_stribeck_start,
 )
 

@@ -1,8 +1,9 @@
-"""Friction inside MuJoCo's physics step: a compiled passive force that reads `jnt_user`.
+"""Friction inside MuJoCo's physics step: a compiled force that reads `jnt_user`.
 
-`install()` puts the laws of friction.py into MuJoCo as a native passive force: `mujoco.batch.Batch` then gives every
+`install()` puts the laws of friction.py into MuJoCo as a native callback: `mujoco.batch.Batch` then gives every
 simulation its own arm at full speed. The same callback holds the driver's soft limits (limits.py), which need
-feedback every millisecond.
+feedback every millisecond. It is the control callback, the last before accelerations, because who is held by the net
+torque (stick_slip.py) depends on all other forces.
 
 The force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
 qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D: exact to first order, and stable
@@ -20,6 +21,7 @@ from numba import njit
 from numba.extending import is_jitted
 
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
+from r2s.physics.stick_slip import TINY, coming_velocity, element, turns
 
 GRAVITY = 9.81  # m/s^2, of an upright base
 
@@ -28,25 +30,28 @@ MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(MOMENT + 3, MOMENT + 8)  # of soft limits; 0: there are none
+NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds; REST: friction as sliding begins
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(REST_POS + 1, REST_POS + 6)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 
 
-_laws: list[Family] = list(FAMILIES)  # the place of a family is its number in `jnt_user`
+# the place of a law is its number in `jnt_user`
+_laws: list[Callable] = [*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None)]
 
 
-def number(family: Family) -> int:
-    """Return what `jnt_user` calls a family; one that is new is compiled into the physics step first (seconds)."""
-    if family not in _laws:
-        _laws.append(family)
+def number(family: Family, hold: str) -> int:
+    """Return what `jnt_user` calls a family's law; one that is new is compiled into the physics step first (seconds)."""
+    law = family.native if hold == "command" or family.sharp is None else family.sharp
+    if law not in _laws:
+        _laws.append(law)
         install()
-    return _laws.index(family)
+    return _laws.index(law)
 
 
 def install() -> None:
     """Put the native laws into MuJoCo, once per process. Models without our marker in `jnt_user` are untouched."""
-    _callback(tuple(f.native for f in _laws))
+    _callback(tuple(_laws))
 
 
 def _either(number: int, own: Callable, others: Callable) -> Callable:
@@ -69,7 +74,7 @@ def _no_law(asked, p, v, h, memory):
 
 @cache
 def _callback(laws: tuple[Callable, ...]) -> Any:
-    """Compile the passive force of these laws, in the order of their numbers, and put it into MuJoCo."""
+    """Compile the force of these laws, in the order of their numbers, and put it into MuJoCo."""
     from llvmlite import ir
     from numba import carray, cfunc, types
     from numba.extending import intrinsic
@@ -82,7 +87,7 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
     qpos_at, qvel_at = at["qpos"] // 8, at["qvel"] // 8
     applied_at, passive_at = at["qfrc_applied"] // 8, at["qfrc_passive"] // 8
-    memory_at = at["userdata"] // 8
+    memory_at, bias_at, mass_at = at["userdata"] // 8, at["qfrc_bias"] // 8, at["M"] // 8
     xpos_at, xmat_at = at["xpos"] // 8, at["xmat"] // 8
     anchor_at, axis_at, nbody_at = at["xanchor"] // 8, at["xaxis"] // 8, at["nbody"] // 8
     model_words, data_words = (
@@ -97,8 +102,15 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
 
         return types.CPointer(types.float64)(types.int64), codegen
 
+    @intrinsic
+    def stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its time
+        def codegen(context, builder, signature, args):
+            return builder.alloca(ir.DoubleType(), args[0])
+
+        return types.CPointer(types.float64)(types.int64), codegen
+
     @cfunc(types.void(types.CPointer(types.int64), types.CPointer(types.int64)))
-    def passive(model_ptr, data_ptr):
+    def friction_force(model_ptr, data_ptr):
         model = carray(model_ptr, (model_words,))
         if model[nuser_at] != WIDTH:
             return
@@ -115,14 +127,21 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
         anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
         axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
+        net = user[0, NET] != 0.0  # of all joints of an arm, or of none
+        if net:
+            bias = carray(as_doubles(data[bias_at]), (n,))  # type: ignore[call-arg]
+            mass = carray(as_doubles(data[mass_at]), (n * (n + 1) // 2,))  # type: ignore[call-arg]
+            work = carray(stack((n + 13) * n), (n + 13, n))  # type: ignore[call-arg]
+            speeds, drives, frictions, loads, coming = work[n + 4], work[n + 5], work[n + 6], work[n + 7], work[n + 8]
+            h, dq_min, slow = user[0, STEP], max(user[0, DQ_MIN], TINY), False
         # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
         em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(n - 1, -1, -1):
             if user[j, MARK] != MARKER:
                 return
-            v = qvel[j]
+            v = 0.0 if net and abs(qvel[j]) < TINY else qvel[j]
             friction, slope = law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
-            pull = user[j, OFFSET]
+            pull, loaded = user[j, OFFSET], 0.0
             if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
                 pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
             if user[j, LINK] != 0.0:
@@ -142,28 +161,50 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
                 lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
                 load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
-                sign = np.tanh(v / WIDTH_DQ)
-                friction += user[j, LOAD] * abs(load) * sign
-                slope += user[j, LOAD] * abs(load) * (1.0 - sign * sign) / WIDTH_DQ
+                loaded = user[j, LOAD] * abs(load)
+                sign = np.sign(v) if net else np.tanh(v / WIDTH_DQ)
+                friction += loaded * sign
+                slope += 0.0 if net else loaded * (1.0 - sign * sign) / WIDTH_DQ
             slope = max(slope, 0.0)  # an implicit falling branch would take inertia away
             # mj_passive has already subtracted dof_damping * v with the slope of the step before: put it right
             force = (damping[j] - user[j, DAMPING]) * v - friction
             damping[j] = user[j, DAMPING] + slope
             drive = applied[j] + pull
-            held = abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+            held = not net and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
             if user[j, DQ_DAMPING] > 0.0 and abs(v) > user[j, DQ_SOFT]:
                 damping[j] += user[j, DQ_DAMPING]
                 force -= user[j, DQ_DAMPING] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
             beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
             force -= user[j, Q_STIFFNESS] * beyond
             qfrc_passive[j] += force + (-applied[j] if held else pull)
+            if net:
+                speeds[j], frictions[j], loads[j] = v, friction, loaded
+                drives[j] = qfrc_passive[j] + applied[j] - bias[j]
+                slow |= abs(v) <= dq_min
+        if not net or not (slow or turns(mass, damping, h, speeds, drives, work)):
+            return
+        rest, edges = work[n + 9 : n + 11].reshape(n, 2), work[n + 11 : n + 13].reshape(n, 2)
+        for j in range(n):
+            drives[j] += frictions[j]
+            rest[j, 0], rest[j, 1] = user[j, REST_NEG] - loads[j], user[j, REST_POS] + loads[j]
+            edges[j, 0] = min(user[j, BREAK_NEG], rest[j, 0])
+            edges[j, 1] = max(user[j, BREAK_POS], rest[j, 1])
+        if coming_velocity(mass, damping, h, speeds, drives, frictions, rest, edges, dq_min, work, coming):
+            for j in range(n):  # the force that takes MuJoCo's implicit step there
+                qfrc_passive[j] = bias[j] - applied[j] + damping[j] * (coming[j] - qvel[j])
+            for k in range(n):
+                change = (coming[k] - qvel[k]) / h
+                if change != 0.0:
+                    for j in range(n):
+                        qfrc_passive[j] += element(mass, j, k) * change
 
-    mujoco.set_mjcb_passive(passive.ctypes)
-    return passive  # kept alive by the cache: MuJoCo holds only the address
+    mujoco.set_mjcb_control(friction_force.ctypes)
+    return friction_force  # kept alive by the cache: MuJoCo holds only the address
 
 
 _MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "userdata", "xpos", "xmat", "xanchor", "xaxis")
+_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "userdata", "M")
+_DATA_FIELDS += ("xpos", "xmat", "xanchor", "xaxis")
 
 
 def _struct_offsets() -> dict[str, int]:

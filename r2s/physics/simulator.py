@@ -151,11 +151,13 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     errors = d.mass - robot.mass, moment - nominal
     arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
     rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
-    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family)
+    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family, d.hold)
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
     rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
-    rows[..., f.DQ_MIN] = 0.0 if d.family.has_memory else d.dq_min  # which holds by itself: no dead zone
+    if not d.family.has_memory:  # which holds by itself: no dead zone
+        rows[..., f.DQ_MIN], rows[..., f.NET] = d.dq_min, d.hold == "net"
+        rows[..., f.REST_NEG : f.REST_POS + 1] = d.family.at_rest(d.phi)
     rows[..., f.DAMPING] = model.dof_damping
     rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = d.drag
     rows[..., f.LOAD], rows[..., f.BODY] = d.load, model.jnt_bodyid
