@@ -1,0 +1,201 @@
+"""Identification of arms that another simulator made, with everything known of them.
+
+`python benchmarks/independent.py [--arms five|drawn|all] [--five FOLDER] [--drawn FOLDER] [--seeds 0-23] [--quick]`
+runs stage=identify with its defaults on one arm after the other, in run folders runs/identify/independent_<arm>;
+those that are finished are not run again. What is known of an arm is in its truth.json: only the judge reads it.
+
+    five    sigmoid, coulomb, stribeck, lugre and paper: FOLDER/<name>, which are not part of this repository
+    drawn   arms of benchmarks/independent_arms.py by seed; they are made where FOLDER/<seed> is missing
+
+`--quick` is a toy: search=toy on the first arm of each kind. `--tag WORD` names other run folders. Words with = go to
+run.py as they are. Without either, and with all arms, docs/independent.md is written.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from common import MACHINE, ROBOT, ROOT, markdown
+from independent_arms import make
+from independent_judge import judge
+
+FIVE = ("sigmoid", "coulomb", "stribeck", "lugre", "paper")
+
+
+def ramps_of(path: Path) -> Path:
+    """Return the ramps of a file in the arms' format as a file of r2s's own format, beside the runs."""
+    from r2s.recordings.ramps import Ramps
+    from r2s.recordings.recording import Recording
+
+    out = ROOT / "runs" / "bench" / f"ramps_{path.parent.name}.npz"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with np.load(path) as z:
+        t, q, dq, tau, joint, sign = (z[k] for k in ("t", "q", "dq", "tau_J_d", "joint", "sign"))
+    starts = np.flatnonzero(np.diff(t, prepend=t[0] + 1) < 0)
+    trajectory = np.cumsum(np.isin(np.arange(len(t)), starts)) - 1
+    motion = Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=trajectory, name=ROBOT.name)
+    Ramps(motion, joint[starts] - 1, sign[starts]).save(out)
+    return out
+
+
+def identified(arm: Path, name: str, words: list[str]) -> Path | None:
+    """Run stage=identify on an arm unless it is done; return its run folder, None where it failed."""
+    folder = ROOT / "runs" / "identify" / name
+    data = ["data=recording", "data.torque=commanded", f"data.path={arm / 'train.npz'}"]
+    data += [f"data.validation={arm / 'validation.npz'}", f"data.ramps={ramps_of(arm / 'ramps.npz')}"]
+    command = [sys.executable, "run.py", "stage=identify", *data, f"name={name}", "only_missing=true", *words]
+    failed = subprocess.run(command, cwd=ROOT).returncode
+    return None if failed else folder
+
+
+def row(name: str, r: dict) -> dict[str, str]:
+    """Return the line of an arm in the table."""
+    f, p = np.array(r["friction"]), np.array(r["plain"])
+    truth = f"{r['true family']}{', paper' if r['paper'] else ''}"
+    return {
+        "arm": name,
+        "family": f"{truth} → {r['family']}",
+        "friction - offset, %": f"{f.max():.1f} ({np.median(f):.1f})",
+        "plain, %": f"{p.max():.1f} ({np.median(p):.1f})",
+        "offset, mNm": f"{np.max(r['offset']):.0f}",
+        "edges, mNm": f"{np.nanmax(r['edges']):.0f} ({np.nanmedian(r['edges']):.0f})",
+        "delay + lag, ms": f"{r['late']:.2f} of {r['true late']:.2f}",
+        "0.5 s, mm": f"{r['ee']:.1f} of {r['true ee']:.1f}",
+        "friction within, %": f"{100 * np.mean(r['friction within']):.0f}",
+        "delay within": "yes" if r["late within"] else "no",
+        "seconds": f"{r['seconds']:.0f}",
+    }
+
+
+def asked(five: dict[str, dict], every: dict[str, dict]) -> list[tuple[str, str, str, bool]]:
+    """Return what is asked, on which arms, what was seen, and whether that is enough."""
+    out = []
+
+    def add(what: str, bar: str, seen: str, enough: bool) -> None:
+        out.append((what, bar, seen, bool(enough)))
+
+    for where, arms in (("the five", five), ("all", every)):
+        if not arms or (where == "all" and len(every) == len(five)):
+            continue
+        rows = list(arms.values())
+        worst = np.array([np.max(r["friction"]) for r in rows])
+        middle = np.array([np.median(r["friction"]) for r in rows])
+        over = [n for n, r in arms.items() if np.max(r["friction"]) > np.max(r["plain"])]
+        name = f"friction minus offset, {where}"
+        add(f"{name}: worst joint", "<= 3 %", f"{worst.max():.1f} %", worst.max() <= 3)
+        add(f"{name}: median joint, worst arm", "<= 1 %", f"{middle.max():.1f} %", middle.max() <= 1)
+        add(f"{name}: worse than plain regression", "none", ", ".join(over) or "none", not over)
+        told = [np.max(r["offset"]) for r in rows if r["true family"] == "sigmoid"]
+        if told:
+            add(f"offset of eq. (5), {where}", "<= 20 mNm", f"{max(told):.0f} mNm", max(told) <= 20)
+        edges = np.concatenate([np.ravel(r["edges"]) for r in rows])
+        edges = edges[~np.isnan(edges)]
+        seen = f"{edges.max():.0f} mNm, {100 * (edges <= 30).mean():.0f} % within"
+        add(f"edges as commands, {where}", "<= 30 mNm", seen, edges.max() <= 30)
+        late = max(abs(r["late"] - r["true late"]) for r in rows)
+        add(f"delay + lag, {where}", "<= 0.3 ms", f"{late:.2f} ms", late <= 0.3)
+        ratio = max(r["ee"] / r["true ee"] for r in rows)
+        add(f"end effector after 0.5 s, {where}", "<= 1.25 of the truth's", f"{ratio:.2f}", ratio <= 1.25)
+        wrong = [n for n, r in arms.items() if not r["right"]]
+        add(f"wrong family, {where}", "none", ", ".join(wrong) or "none", not wrong)
+    rows = list(every.values())
+    for what, inside in (
+        ("delay + lag", np.mean([r["late within"] for r in rows])),
+        ("friction minus offset", np.mean([np.mean(r["friction within"]) for r in rows])),
+    ):
+        add(f"95 % interval of {what} has the truth", "90-98 %", f"{100 * inside:.1f} %", 0.9 <= inside <= 0.98)
+    return out
+
+
+def report(results: dict[str, dict], words: list[str]) -> str:
+    """Return docs/independent.md."""
+    five = {n: r for n, r in results.items() if n in FIVE}
+    table = pd.DataFrame([row(n, r) for n, r in results.items()]).set_index("arm")
+    bars = pd.DataFrame(asked(five, results), columns=["what", "asked", "seen", "met"]).set_index("what")
+    bars["met"] = bars["met"].map({True: "yes", False: "no"})
+    seconds = np.array([r["seconds"] for r in results.values()])
+    said = " ".join(["python benchmarks/independent.py", *words])
+    took = f"{np.median(seconds):.0f} s in the median, {seconds.max():.0f} s at most"
+    return f"""# Arms of another simulator: what identification finds of them
+
+`{said}` on {MACHINE}: {len(results)} simulated Pandas, each recorded for 20 s and ramped 14 times, identified with
+the defaults of stage=identify, one after the other, {took}. The arms share no code with r2s: rigid
+bodies of their own, Runge-Kutta at 0.1 ms, stick and slip located in time (benchmarks/independent_dynamics.py).
+Friction, offsets, breakaway, delay, lag and inertia are drawn; nothing is set for any of them.
+
+{markdown(bars)}
+
+## Each arm
+
+{markdown(table)}
+
+- friction - offset: all that drags on a sliding joint beside the rigid links. The largest error from 0.05 rad/s to the
+  95 % quantile of the speeds visited in a direction, in % of the mean magnitude of the true friction there: worst
+  joint, and in brackets the median joint. plain: the same of least squares with a delay, tensor scales, and Coulomb
+  and viscous friction of each direction.
+- offset: worst joint. Where friction has a free level in either direction the two cannot be told apart, so it is asked
+  of eq. (5) only.
+- edges: commands at which a resting joint lets go, at the posture of the ramps: the worst of those that a ramp
+  reached, and the median. Onset of motion is read late by up to 6 mNm (eq. 5) or 60 mNm (Coulomb, Stribeck), and
+  bristles yield before they let go (-20 to 44 mNm).
+- 0.5 s: mean error of the end effector in open-loop replays of motion that was not fitted, of the identified arm and
+  of the truth in the same simulator, as far as its families express it.
+- within: the truth within the 95 % interval; of friction minus offset at five speeds in both directions.
+"""
+
+
+def seeds_of(text: str) -> list[int]:
+    """Return the seeds of 0-23 or 1,4,7."""
+    ranges = [[int(end) for end in part.split("-")] for part in text.split(",")]
+    return [seed for r in ranges for seed in range(r[0], r[-1] + 1)]
+
+
+def main() -> None:
+    """Identify and judge every arm, and write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--arms", choices=("five", "drawn", "all"), default="all")
+    parser.add_argument("--five", type=Path, help="folder of the five arms")
+    parser.add_argument("--drawn", type=Path, default=ROOT / "runs" / "independent_arms")
+    parser.add_argument("--seeds", type=seeds_of, default="0-23", help="of drawn arms: 0-23, or 1,4,7")
+    parser.add_argument("--quick", action="store_true", help="a toy, of the first arms")
+    parser.add_argument("--tag", default="", help="of the run folders")
+    own, words = parser.parse_known_args()
+    if wrong := [w for w in words if "=" not in w or w.startswith("-")]:
+        parser.error(f"what is {wrong[0]}?")
+    if own.arms != "drawn" and own.five is None:
+        parser.error("--five FOLDER is where the five arms are")
+    arms = {name: own.five / name for name in FIVE} if own.arms != "drawn" else {}
+    if own.quick:
+        arms, own.seeds, own.tag = dict(list(arms.items())[:1]), own.seeds[:1], own.tag or "toy"
+        words.append("search=toy")
+    if own.arms != "five":
+        arms |= {str(seed): own.drawn / str(seed) for seed in own.seeds}
+    results = {}
+    for name, arm in arms.items():
+        if name.isdigit() and not (arm / "truth.json").is_file():
+            make(arm, int(name))
+        label = "_".join(w for w in ("independent", own.tag, name) if w)
+        run = identified(arm.resolve(), label, words)
+        if run is None:
+            print(f"{name}: failed", flush=True)
+            continue
+        results[name] = judge(run, arm)
+        (run / "judged.json").write_text(json.dumps(results[name], indent=1))
+        print(", ".join(f"{k} {v}" for k, v in row(name, results[name]).items()), flush=True)
+    if not results:
+        sys.exit("no arm was identified")
+    page = report(results, words)
+    print(page)
+    if len(results) < len(arms):
+        sys.exit(f"failed: {', '.join(n for n in arms if n not in results)}")
+    if own.arms == "all" and not own.quick and not own.tag:
+        (ROOT / "docs" / "independent.md").write_text(page)
+        print("written: docs/independent.md")
+
+
+if __name__ == "__main__":
+    main()
