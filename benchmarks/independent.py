@@ -1,14 +1,14 @@
 """Identification of arms that another simulator made, with everything known of them.
 
-`python benchmarks/independent.py [--arms five|drawn|all] [--five FOLDER] [--drawn FOLDER] [--seeds 0-23] [--quick]`
+`python benchmarks/independent.py [--five FOLDER] [--arms five|drawn|all|NAME,...] [--drawn FOLDER] [--seeds 0-23]`
 runs stage=identify with its defaults on one arm after the other, in run folders runs/identify/independent_<arm>;
 those that are finished are not run again. What is known of an arm is in its truth.json: only the judge reads it.
 
     five    sigmoid, coulomb, stribeck, lugre and paper: FOLDER/<name>, which are not part of this repository
     drawn   arms of benchmarks/independent_arms.py by seed; they are made where FOLDER/<seed> is missing
 
-`--quick` is a toy: search=toy on the first arm of each kind. `--tag WORD` names other run folders. Words with = go to
-run.py as they are. Without either, and with all arms, docs/independent.md is written.
+`--quick` is a toy: search=toy on the first arm of each kind. `--tag WORD` names other run folders. Words with = go
+to run.py as they are. With all arms and none of these docs/independent.md is written.
 """
 
 import argparse
@@ -118,14 +118,16 @@ def report(results: dict[str, dict], words: list[str]) -> str:
     bars = pd.DataFrame(asked(five, results), columns=["what", "asked", "seen", "met"]).set_index("what")
     bars["met"] = bars["met"].map({True: "yes", False: "no"})
     seconds = np.array([r["seconds"] for r in results.values()])
+    words = ["--five FOLDER", *words]
     said = " ".join(["python benchmarks/independent.py", *words])
     took = f"{np.median(seconds):.0f} s in the median, {seconds.max():.0f} s at most"
     return f"""# Arms of another simulator: what identification finds of them
 
-`{said}` on {MACHINE}: {len(results)} simulated Pandas, each recorded for 20 s and ramped 14 times, identified with
-the defaults of stage=identify, one after the other, {took}. The arms share no code with r2s: rigid
-bodies of their own, Runge-Kutta at 0.1 ms, stick and slip located in time (benchmarks/independent_dynamics.py).
-Friction, offsets, breakaway, delay, lag and inertia are drawn; nothing is set for any of them.
+`{said}` on {MACHINE}: {len(results)} simulated Pandas,
+each recorded for 20 s and ramped 14 times, and identified with the defaults of stage=identify, one after the other:
+{took}. The arms share no code with r2s: rigid bodies of their own, Runge-Kutta at
+0.1 ms, stick and slip located in time (benchmarks/independent_dynamics.py). Friction, offsets, breakaway, delay, lag
+and inertia are drawn; nothing is set for any of them.
 
 {markdown(bars)}
 
@@ -133,12 +135,12 @@ Friction, offsets, breakaway, delay, lag and inertia are drawn; nothing is set f
 
 {markdown(table)}
 
-- friction - offset: all that drags on a sliding joint beside the rigid links. The largest error from 0.05 rad/s to the
-  95 % quantile of the speeds visited in a direction, in % of the mean magnitude of the true friction there: worst
+- friction - offset: all that drags on a sliding joint beside the rigid links. The largest error from 0.05 rad/s to
+  the 95 % quantile of the speeds visited in a direction, in % of the mean magnitude of the true friction there: worst
   joint, and in brackets the median joint. plain: the same of least squares with a delay, tensor scales, and Coulomb
   and viscous friction of each direction.
-- offset: worst joint. Where friction has a free level in either direction the two cannot be told apart, so it is asked
-  of eq. (5) only.
+- offset: worst joint. Where friction has a free level in either direction the two cannot be told apart, so it is
+  asked of eq. (5) only.
 - edges: commands at which a resting joint lets go, at the posture of the ramps: the worst of those that a ramp
   reached, and the median. Onset of motion is read late by up to 6 mNm (eq. 5) or 60 mNm (Coulomb, Stribeck), and
   bristles yield before they let go (-20 to 44 mNm).
@@ -157,7 +159,7 @@ def seeds_of(text: str) -> list[int]:
 def main() -> None:
     """Identify and judge every arm, and write the page."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--arms", choices=("five", "drawn", "all"), default="all")
+    parser.add_argument("--arms", default="all", help="five, drawn, all, or names such as sigmoid,paper,3")
     parser.add_argument("--five", type=Path, help="folder of the five arms")
     parser.add_argument("--drawn", type=Path, default=ROOT / "runs" / "independent_arms")
     parser.add_argument("--seeds", type=seeds_of, default="0-23", help="of drawn arms: 0-23, or 1,4,7")
@@ -166,14 +168,16 @@ def main() -> None:
     own, words = parser.parse_known_args()
     if wrong := [w for w in words if "=" not in w or w.startswith("-")]:
         parser.error(f"what is {wrong[0]}?")
-    if own.arms != "drawn" and own.five is None:
-        parser.error("--five FOLDER is where the five arms are")
-    arms = {name: own.five / name for name in FIVE} if own.arms != "drawn" else {}
+    drawn = [str(seed) for seed in own.seeds]
+    names = {"five": [*FIVE], "drawn": drawn, "all": [*FIVE, *drawn]}.get(own.arms, own.arms.split(","))
+    if wrong := [n for n in names if n not in FIVE and not n.isdigit()]:
+        parser.error(f"no arm {wrong[0]}; there are {', '.join(FIVE)} and seeds")
     if own.quick:
-        arms, own.seeds, own.tag = dict(list(arms.items())[:1]), own.seeds[:1], own.tag or "toy"
-        words.append("search=toy")
-    if own.arms != "five":
-        arms |= {str(seed): own.drawn / str(seed) for seed in own.seeds}
+        first = [n for n in names if n in FIVE][:1] + [n for n in names if n.isdigit()][:1]
+        names, own.tag, words = first, own.tag or "toy", [*words, "search=toy"]
+    if own.five is None and any(n in FIVE for n in names):
+        parser.error("--five FOLDER is where the five arms are")
+    arms = {n: (own.five if n in FIVE else own.drawn) / n for n in names}
     results = {}
     for name, arm in arms.items():
         if name.isdigit() and not (arm / "truth.json").is_file():
@@ -192,7 +196,7 @@ def main() -> None:
     print(page)
     if len(results) < len(arms):
         sys.exit(f"failed: {', '.join(n for n in arms if n not in results)}")
-    if own.arms == "all" and not own.quick and not own.tag:
+    if own.arms == "all" and not own.tag and not words:
         (ROOT / "docs" / "independent.md").write_text(page)
         print("written: docs/independent.md")
 

@@ -236,17 +236,19 @@ def let_go(arm, s):
 
 
 @njit(cache=True)
-def come_to_rest(arm, s, j):
-    """Let joint j rest if it holds there; return whether it does."""
-    before, net = s.dq[j], np.empty(N)
-    s.dq[j] = 0.0
-    s.stuck[j] = 1
+def would_hold(arm, s, j):
+    """Return whether joint j, put to rest as it is, would hold."""
+    before, moving, net = s.dq[j], s.stuck[j], np.empty(N)
+    s.dq[j], s.stuck[j] = 0.0, 1
     needed(arm, s, s.drive, net)
-    if outside(arm, j, net) == 0.0:
-        return True
-    s.stuck[j] = 0
-    s.dq[j] = before
-    return False
+    s.dq[j], s.stuck[j] = before, moving
+    return outside(arm, j, net) == 0.0
+
+
+@njit(cache=True)
+def slow(arm, s, j, later):
+    """Return whether a sliding joint is so slow, and `later` s from now so long released, that it may rest."""
+    return abs(s.dq[j]) <= arm.v_stick and s.since[j] + later > SETTLE
 
 
 @njit(cache=True)
@@ -254,14 +256,16 @@ def event(arm, s, out, command, h, drive, net):
     """Return whether within h s a joint stops or lets go; drive (N,) and net (N,) become those after h s."""
     lagged(s.drive, command, arm.lag, h, drive)
     advance(arm, s.q, s.dq, s.bristle, s.stuck, s.way, s.drive, command, h, out)
-    held = False
+    if arm.kind == LUGRE:
+        return False
+    then, held = State(out[0], out[1], out[2], s.stuck, s.way, s.since, drive, s.line), False
     for j in range(N):
         if s.stuck[j]:
             held = True
-        elif arm.kind != LUGRE and out[1, j] * s.way[j] < 0.0:
+        elif out[1, j] * s.way[j] < 0.0 or (slow(arm, then, j, h) and would_hold(arm, then, j)):
             return True
     if held:
-        needed(arm, State(out[0], out[1], out[2], s.stuck, s.way, s.since, drive, s.line), drive, net)
+        needed(arm, then, drive, net)
         for j in range(N):
             if s.stuck[j] and outside(arm, j, net) != 0.0:
                 return True
@@ -301,10 +305,12 @@ def piece(arm, s, command, seconds):
             over = s.dq[j] * s.way[j] < 0.0
             if over:
                 s.dq[j] = 0.0
-            slow = abs(s.dq[j]) <= arm.v_stick and s.since[j] > SETTLE
-            if (over or slow) and not come_to_rest(arm, s, j) and over:
-                s.way[j] = -s.way[j]
-                s.since[j] = 0.0
+            if over or slow(arm, s, j, 0.0):
+                if would_hold(arm, s, j):
+                    s.dq[j], s.stuck[j] = 0.0, 1
+                elif over:
+                    s.way[j] = -s.way[j]
+                    s.since[j] = 0.0
 
 
 @njit(cache=True)
