@@ -3,9 +3,10 @@
 `judge` compares a run folder of stage=identify with an arm's folder (benchmarks/independent_arms.py has its format);
 `plain_regression` is what thirty lines of least squares find of the same recording.
 
-Friction and offset of a sliding joint cannot be told apart where friction has two free levels; their difference, all
-that drags on it beside the rigid links, can. What else an identified arm has of that kind (load, drag, gravity that
-is not compensated) is part of it, at the mean over the postures of the training motion.
+Friction and offset of a sliding joint cannot be told apart where friction has two free levels; their difference can.
+It is judged twice: by itself, as the parameters have it, for the arms have nothing else of the kind; and with all
+that an identified arm may have beside it (load, drag, gravity that is not compensated), at the mean over the postures
+of the training motion, which is what it feels in a simulator.
 """
 
 import json
@@ -30,6 +31,7 @@ FASTEST = 0.95  # quantile of the speeds visited in a direction
 SPEEDS, CHECKED = 40, 5  # of a direction: where friction is compared, and where its interval is
 POSTURES = 200
 WAYS = (1, -1)
+DQ_MIN = 0.01  # rad/s, of the truth in r2s's simulator: as identified arms have it
 REACHED = 5e-3  # rad in its own direction: the ramp got there
 
 
@@ -64,14 +66,10 @@ def true_dynamics(truth: dict) -> Dynamics:
     )
 
 
-DQ_MIN = 0.01
-
-
 def visited(q: np.ndarray) -> np.ndarray:
     """Return (2, 7) rad/s, the fastest speed that counts in both directions of a motion q (T, 7) rad at 1 kHz."""
     dq = savgol_filter(q, 31, 3, deriv=1, delta=1e-3, axis=0)
-    top = np.array([[np.quantile(x[way * x > SLOWEST], FASTEST) for x in (way * dq).T] for way in WAYS])
-    return top
+    return np.array([[np.quantile(x[x > SLOWEST], FASTEST) for x in way * dq.T] for way in WAYS])
 
 
 def speeds(top: np.ndarray, count: int) -> np.ndarray:
@@ -101,17 +99,20 @@ class Pull:
         """Return (..., 7) Nm that adds to friction, whichever way the joint slides."""
         return d.load * self._load
 
-    def drags(self, d: Dynamics, dq: np.ndarray) -> np.ndarray:
-        """Return friction minus offset at dq (..., 7) rad/s; a batch (S,) of dynamics gives (S, ..., 7)."""
-        if d.phi.ndim == 2:
-            return d.friction(dq) + np.sign(dq) * self.load(d) - self.constant(d)
-        return np.stack([self.drags(d.one(k), dq) for k in range(len(d.phi))])
+
+def drags(d: Dynamics, dq: np.ndarray, at: Pull | None = None) -> np.ndarray:
+    """Return friction minus offset at dq (..., 7) rad/s, with `at` all that pulls; S dynamics give (S, ..., 7)."""
+    if d.phi.ndim > 2:
+        return np.stack([drags(d.one(k), dq, at) for k in range(len(d.phi))])
+    if at is None:
+        return d.friction(dq) - d.offset
+    return d.friction(dq) + np.sign(dq) * at.load(d) - at.constant(d)
 
 
-def edges(d: Dynamics, at: Pull) -> np.ndarray:
-    """Return (7, 2) Nm: the commands at which a resting joint lets go, negative and positive, at a posture."""
+def edges(d: Dynamics, at: Pull | None = None) -> np.ndarray:
+    """Return (7, 2) Nm: the commands at which a resting joint lets go, negative and positive; `at` as in `drags`."""
     held = d.family.held(d.phi) if d.family.held is not None else d.breakaway
-    return held - at.constant(d)[:, None]
+    return held - (d.offset if at is None else at.constant(d))[:, None]
 
 
 def reached(ramps: dict[str, np.ndarray]) -> np.ndarray:
@@ -133,38 +134,44 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
         q = z["q"]
     with np.load(arm / "ramps.npz") as z:
         ramps = {k: z[k] for k in z.files}
-    pull, top = Pull(q[:: len(q) // POSTURES]), visited(q)
-    v = speeds(top, SPEEDS)
-    right = friction(truth, v)
-    level = np.abs(right).mean((0, 1))
-    off = np.abs(pull.drags(found, v) - (right - truth["offset"])).max((0, 1)) / level
-    plain = np.abs(plain_regression(arm / "train.npz")(v) - (right - truth["offset"])).max((0, 1)) / level
-    some = speeds(top, CHECKED)
-    low, high = np.quantile(pull.drags(draws, some), (0.025, 0.975), axis=0)
-    wanted = friction(truth, some) - truth["offset"]
-    late, true_late = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
-    between = np.quantile(np.atleast_1d(late), (0.025, 0.975))
+    top = visited(q)
+    v, some = speeds(top, SPEEDS), speeds(top, CHECKED)
+    level = np.abs(friction(truth, v)).mean((0, 1))
     told = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
     pose = np.median(ramps["q"], axis=0)[None]
-    edge = np.where(reached(ramps), np.abs(edges(found, Pull(pose)) - told), np.nan)
+
+    def off(drag: np.ndarray) -> list[float]:
+        return (100 * np.abs(drag - (friction(truth, v) - truth["offset"])).max((0, 1)) / level).tolist()
+
+    def against(at: Pull | None, at_ramps: Pull | None) -> dict:
+        low, high = np.quantile(drags(draws, some, at), (0.025, 0.975), axis=0)
+        wanted = friction(truth, some) - truth["offset"]
+        constant = found.offset if at is None else at.constant(found)
+        edge = np.where(reached(ramps), np.abs(edges(found, at_ramps) - told), np.nan)
+        return {
+            "friction": off(drags(found, v, at)),
+            "within": ((low <= wanted) & (wanted <= high)).mean((0, 1)).tolist(),
+            "offset": (1e3 * np.abs(constant - truth["offset"])).tolist(),
+            "edges": (1e3 * edge).tolist(),
+        }
+
+    late, true_late = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
+    between = np.quantile(np.atleast_1d(late), (0.025, 0.975))
     validation = read(arm / "validation.npz", torque="commanded")
     ahead = [_open_loop_ee(ROBOT, d, validation, threads)["0.5"] for d in (found, true_dynamics(truth))]
-    return {
+    return against(None, None) | {
         "true family": truth["family"],
         "paper": truth["paper"],
         "family": found.family.name,
         "right": found.family == FAMILY[truth["family"]],
-        "friction": (100 * off).tolist(),
-        "plain": (100 * plain).tolist(),
-        "offset": (1e3 * np.abs(pull.constant(found) - truth["offset"])).tolist(),
-        "edges": (1e3 * edge).tolist(),
+        "felt": against(Pull(q[:: len(q) // POSTURES]), Pull(pose)),
+        "plain": off(plain_regression(arm / "train.npz")(v)),
         "late": 1e3 * float(found.delay + found.lag),
         "true late": 1e3 * true_late,
-        "ee": ahead[0],
-        "true ee": ahead[1],
         "late within": bool(between[0] <= true_late <= between[1]),
         "late interval": (1e3 * between).tolist(),
-        "friction within": ((low <= wanted) & (wanted <= high)).mean((0, 1)).tolist(),
+        "ee": ahead[0],
+        "true ee": ahead[1],
         "seconds": meta["wall_clock_s"],
     }
 

@@ -57,7 +57,7 @@ def test_a_joint_that_another_one_pulls_lets_go():
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_half_the_step_moves_the_arm_the_same_way(seed):
-    """Through stops, reversals and releases; the fourth order and located events leave less than a tenth of the encoder."""
+    """Through stops, reversals and releases: within a tenth of the least bit of an encoder."""
     from independent_dynamics import cycle
 
     arm, _, _ = still(seed)
@@ -84,14 +84,25 @@ def test_delay_and_lag_are_those_that_are_asked_for():
 def test_the_truth_itself_is_judged_right():
     """Friction minus offset of eq. (5) is exact in r2s's family; edges are those of the truth."""
     from independent_arms import CENTRE, draw, friction
-    from independent_judge import SPEEDS, Pull, edges, speeds, true_dynamics
+    from independent_judge import SPEEDS, Pull, drags, edges, speeds, true_dynamics
 
     truth = draw(0)
-    found, at = true_dynamics(truth), Pull(CENTRE[None])
-    v = speeds(np.ones((2, 7)), SPEEDS)
-    np.testing.assert_allclose(at.drags(found, v), friction(truth, v) - truth["offset"], atol=1e-12)
+    found, v = true_dynamics(truth), speeds(np.ones((2, 7)), SPEEDS)
     told = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
-    np.testing.assert_allclose(edges(found, at), told, atol=1e-12)
+    for at in (None, Pull(CENTRE[None])):  # the truth has nothing beside friction and offset
+        np.testing.assert_allclose(drags(found, v, at), friction(truth, v) - truth["offset"], atol=1e-12)
+        np.testing.assert_allclose(edges(found, at), told, atol=1e-12)
+
+
+def test_the_speeds_that_count_are_those_of_either_direction():
+    from independent_judge import speeds, visited
+
+    t = np.arange(0, 10, 1e-3)[:, None]
+    top = visited(np.where(t % 2 < 1, 0.8 * (t % 1), 0.8 - 0.8 * (t % 1)) * np.linspace(0.5, 1.0, 7))
+    np.testing.assert_allclose(top, np.tile(0.8 * np.linspace(0.5, 1.0, 7), (2, 1)), rtol=1e-6)
+    v = speeds(top, 5)
+    np.testing.assert_allclose(v[:, 0], [[0.05] * 7, [-0.05] * 7])
+    np.testing.assert_allclose(v[:, -1], [top[0], -top[1]])
 
 
 def test_plain_regression_finds_coulomb_friction(tmp_path):
