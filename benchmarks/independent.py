@@ -7,8 +7,9 @@ those that are finished are not run again. What is known of an arm is in its tru
     five    sigmoid, coulomb, stribeck, lugre and paper: FOLDER/<name>, which are not part of this repository
     drawn   arms of benchmarks/independent_arms.py by seed; they are made where FOLDER/<seed> is missing
 
-`--quick` is a toy: search=toy on the first arm of each kind. `--tag WORD` names other run folders. Words with = go
-to run.py as they are. With all arms and none of these docs/independent.md is written.
+After a change of the identification give other run folders a name by `--tag WORD`. `--quick` is a toy: search=toy on
+the first arm of each kind. Words with = go to run.py as they are. Without either, all arms (20 drawn ones or more)
+write docs/independent.md.
 """
 
 import argparse
@@ -176,8 +177,8 @@ def main() -> None:
     if wrong := [n for n in names if n not in FIVE and not n.isdigit()]:
         parser.error(f"no arm {wrong[0]}; there are {', '.join(FIVE)} and seeds")
     if own.quick:
-        first = [n for n in names if n in FIVE][:1] + [n for n in names if n.isdigit()][:1]
-        names, own.tag, words = first, own.tag or "toy", [*words, "search=toy"]
+        names = [n for n in names if n in FIVE][:1] + [n for n in names if n.isdigit()][:1]
+        own.tag, words = own.tag or "toy", [*words, "search=toy"]
     if own.five is None and any(n in FIVE for n in names):
         parser.error("--five FOLDER is where the five arms are")
     arms = {n: (own.five if n in FIVE else own.drawn) / n for n in names}
@@ -195,11 +196,13 @@ def main() -> None:
         print(", ".join(f"{k} {v}" for k, v in row(name, results[name]).items()), flush=True)
     if not results:
         sys.exit("no arm was identified")
+    if len(commits := {r["commit"] for r in results.values()}) > 1:
+        print(f"these runs are of {len(commits)} commits: give all of them one --tag")
     page = report(results, words)
     print(page)
     if len(results) < len(arms):
         sys.exit(f"failed: {', '.join(n for n in arms if n not in results)}")
-    if own.arms == "all" and not own.tag and not words:
+    if own.arms == "all" and not words and len(drawn) >= 20:
         (ROOT / "docs" / "independent.md").write_text(page)
         print("written: docs/independent.md")
 

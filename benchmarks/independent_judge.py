@@ -173,6 +173,7 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
         "ee": ahead[0],
         "true ee": ahead[1],
         "seconds": meta["wall_clock_s"],
+        "commit": (meta.get("git") or {}).get("commit"),
     }
 
 
