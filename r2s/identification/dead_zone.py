@@ -1,16 +1,56 @@
-"""The edges of the dead zone from a recording: a scan, because the error has no gradient by them."""
+"""What holds a joint at rest: whose torque its edges are of, and the edges, from a recording.
+
+A scan, because the error has no gradient by them.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Report
 from r2s.identification.replay_residual import ReplayResidual
-from r2s.physics.dynamics import Dynamics
+from r2s.identification.windows import cut_windows, replay
+from r2s.physics.dynamics import HOLDS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
 TRUST = 0.01  # and by how much less the error must be to go that far
+
+CREEP = 2e-3  # rad/s, below which stiction may hold: above what a step of 1 ms leaves of a stop, below any motion
+HORIZON = 0.5  # s, of the replays that a rule is chosen by: long enough for stops
+
+
+def stiction(
+    robot: Robot,
+    dynamics: Dynamics,
+    recording: Recording,
+    largest: float | None,
+    report: Report,
+    *,
+    window_s: float,
+    stride: int,
+    nthread: int,
+) -> dict[str, np.ndarray | float]:
+    """Return the rule that holds joints at rest, {"hold": its place in HOLDS, "dq_min": rad/s, "edges": (n, 2) Nm}.
+
+    Of the paper's rule and of stiction that one is kept which replays the recording's stops better. `largest` and
+    the others: see `scan_breakaway`.
+    """
+    how = {"window_s": window_s, "stride": stride, "nthread": nthread, "report": report}
+    trials = []
+    for hold in HOLDS:
+        dq_min = dynamics.dq_min if hold == "command" else min(dynamics.dq_min, CREEP)
+        trial = replace(dynamics, hold=hold, dq_min=dq_min)
+        if largest is not None:  # not measured: each rule gets its own
+            trial = replace(trial, breakaway=scan_breakaway(robot, trial, recording, largest, **how))
+        trials.append(trial)
+    windows = cut_windows(recording, HORIZON, limit=60)
+    error = np.stack([np.abs(replay(robot, t, windows, nthread) - windows.q).mean((0, 1)) for t in trials])
+    best = int((error / error.mean(0)).sum(1).argmin())
+    chosen = trials[best]
+    return {"hold": float(best), "dq_min": chosen.dq_min, "edges": chosen.breakaway}
 
 
 def scan_breakaway(

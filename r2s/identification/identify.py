@@ -17,20 +17,23 @@ import pandas as pd
 
 from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_recording
-from r2s.identification.dead_zone import scan_breakaway
+from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, searched
 from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
+from r2s.identification.static_friction import StaticFriction
+from r2s.identification.term_selection import demanded
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
-from r2s.physics.dynamics import Dynamics, of_family
+from r2s.physics.dynamics import HOLDS, Dynamics, of_family
 from r2s.physics.friction import FAMILIES
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
+STANDSTILL = 0.02  # rad/s: what friction is of a joint that is slower, or stands, its velocity does not tell
 CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -67,7 +70,8 @@ def identify(
     """
     check_recording(robot, recording)
     names = [f.name for f in FAMILIES]
-    bounds, prior, terms, family = settings.bounds, settings.prior, settings.terms, settings.family
+    bounds, prior, family = settings.bounds, settings.prior, settings.family
+    terms = list(settings.terms)
     folds = settings.folds
     began, history = time.perf_counter(), []
 
@@ -93,58 +97,104 @@ def identify(
         families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
         family = names[int(chosen["best"])]
     nominal = of_family(nominal, family)
+    commanded = recording.torque == "commanded"
+    level = how | {"slowest": STANDSTILL if commanded else 0.0}
+    if settings.extra:
+        base = searched(robot, nominal, bounds, terms, recording)
+
+        def choose() -> dict[str, Any]:
+            more = demanded(base, recording, bounds, prior, settings.extra, folds, level, told)
+            return {"entered": [name in more for name in settings.extra]}
+
+        entered = np.asarray(step("terms", choose)["entered"], dtype=bool)
+        terms = with_terms(terms, [name for name, enters in zip(settings.extra, entered, strict=True) if enters])
     space = searched(robot, nominal, bounds, terms, recording)
-    quick = TorqueResidual(robot, space, recording, **how)
+    quick = TorqueResidual(robot, space, recording, **level)
     data: ReplayResidual | TorqueResidual = quick
-    if recording.torque == "commanded":
-        batch = min(len(space.start) + 1, 64)
-        slowest = 0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min  # bristles have no dead zone
+    started_on_level = getattr(searches[0], "level", "") == "torque"
+    # how far the bristles are bent where a window starts nobody measured: replays would put right what is right
+    if commanded and not (nominal.family.has_memory and started_on_level):
         data = ReplayResidual(
             *(robot, space, recording),
             window_s=settings.window_s,
             stride=settings.stride,
-            slowest=slowest,
+            slowest=0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min,  # bristles have no dead zone
             edges=None if ramps is None else _reached(breakaway(ramps), np.array([-np.inf, np.inf])),
-            batch=batch,
+            batch=min(len(space.start) + 1, 64),
             nthread=nthread,
         )
+    at_rest = None if ramps is None else StaticFriction(robot, ramps, breakaway(ramps))
+    rising = at_rest if "rise" in space.blocks else None
     kept = np.zeros(robot.n, dtype=bool)
     if settings.keep_nominal:
         kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
-    problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool))
+    problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool), rising)
     u = problem.start
+    lag = space.where("lag") if "lag" in space.blocks else None
+    refused = False
+
+    def ended(name: str, search: Search, u: np.ndarray, report: Report = told) -> np.ndarray:
+        return np.asarray(step(name, lambda: {"u": search(problem, u, report)})["u"])
+
     for k, search in enumerate(searches):
-        u = np.asarray(step(f"search {k + 1}", lambda s=search, u=u: {"u": s(problem, u, told)})["u"])  # type: ignore[misc]
+        on_level = getattr(search, "level", "") == "torque"
+        if lag is not None and (on_level or data is quick):
+            problem.believe(lag, NONE)  # filtered torque feels a lag as it feels a delay
+        elif lag is not None:
+            problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool), rising)
+        v = ended(f"search {k + 1}", search, u)
+        if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
+            refused, problem, data = True, Problem(quick, quick, prior, np.asarray(kept, dtype=bool), rising), quick
+            if lag is not None:
+                problem.believe(lag, NONE)
+            break
+        u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
-        problem.adapt(u, fitted=k == len(searches) - 1)
+        problem.adapt(u, fitted=k == len(searches) - 1 or on_level)
     last = searches[-1]
-    if last.local:  # a local search goes on from where it was, weighed by what is left unexplained
+    if last.local and data is not quick:  # it goes on from where it was, weighed by what is left unexplained
 
         def again(row: dict) -> None:
             told(row | {"search": f"{row['search']}, reweighed"})
 
-        for k in range(REWEIGH):
-            local = partial(without_lag, last) if k == REWEIGH - 1 and "lag" in space.blocks else last
-            u = np.asarray(step(f"reweighed {k + 1}", lambda s=local, u=u: {"u": s(problem, u, again)})["u"])  # type: ignore[misc]
-            problem.adapt(u, fitted=True)
-        if "lag" in space.blocks and u[lag := space.where("lag")] == problem.start[lag]:
+        local = last if lag is None else partial(without_lag, last)
+        u = ended("reweighed", local, u, again)  # type: ignore[arg-type]
+        problem.adapt(u, fitted=True)
+        if lag is not None and np.array_equal(u[lag], problem.start[lag]):
             problem.believe(lag, NONE)
+    elif data is quick:
+        problem.adapt(u, fitted=True)
+        u = ended("level", LeastSquares(max_evaluations=12, ftol=1e-5, level="torque"), u)
     dynamics, edges = space.dynamics(space.from_unit(u)), None
-    window_s, stride = settings.window_s, settings.stride
-    scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=told)
-    if ramps is not None:
+    if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
-        command = _reached(edges, nominal.breakaway)
-        if not nominal.family.has_memory:
-            dynamics = replace(dynamics, breakaway=command + dynamics.offset[:, None])
-            found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, None)})
-            command = np.asarray(found["edges"]) - dynamics.offset[:, None]
-        space = replace(space, break_command=command)
-    elif settings.breakaway and recording.torque == "commanded":
-        found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, settings.breakaway)})
-        space = replace(space, nominal=replace(nominal, breakaway=np.asarray(found["edges"])))
+        at_rest = StaticFriction(robot, ramps, edges)
+        dynamics = replace(dynamics, breakaway=at_rest.edges(dynamics, nominal.breakaway))
+        space = replace(space, break_command=dynamics.breakaway - dynamics.offset[:, None])
+    if commanded and not nominal.family.has_memory and (ramps is not None or settings.breakaway):
+        largest = settings.breakaway if ramps is None else None
+        how_long = {"window_s": settings.window_s, "stride": settings.stride, "nthread": nthread}
+        found = step("stiction", lambda: stiction(robot, dynamics, recording, largest, told, **how_long))
+        rule, dq_min = HOLDS[int(found["hold"])], float(found["dq_min"])
+        edges_found = np.asarray(found["edges"])
+        space = replace(space, nominal=replace(nominal, breakaway=edges_found, hold=rule, dq_min=dq_min))
     sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
-    return conclude(problem, space, sure, pd.DataFrame(history), families, None if edges is None else edges.spread)
+    spread = None if edges is None else edges.spread
+    return conclude(problem, space, sure, pd.DataFrame(history), families, spread, refused)
+
+
+def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Return the terms and `more`; a link has a tensor, so `link` takes the place of `inertia_scale`."""
+    return [name for name in terms if not (name == "inertia_scale" and "link" in more)] + list(more)
+
+
+def worse_on_level(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
+    """Say whether v (P,) explains torque clearly worse than u (P,), the fit to it.
+
+    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P.
+    """
+    rise = (problem.quick(v[None])[0] ** 2).sum() - (problem.quick(u[None])[0] ** 2).sum()
+    return bool(rise > len(u))
 
 
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:

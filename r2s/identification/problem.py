@@ -13,6 +13,7 @@ from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import ParameterSpace, check_parameters, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.static_friction import StaticFriction
 from r2s.identification.torque_residual import STEP, TorqueResidual
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
@@ -95,6 +96,7 @@ class Problem:
         prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
             the scale is logarithmic). Blocks that are not named are uniform in their bounds.
         kept: (n,) bool, joints whose friction and offset stay nominal.
+        at_rest: what is known of friction at standstill.
     """
 
     def __init__(
@@ -103,7 +105,9 @@ class Problem:
         quick: TorqueResidual,
         prior: Mapping[str, float],
         kept: np.ndarray | None = None,
+        at_rest: StaticFriction | None = None,
     ):
+        self.at_rest = at_rest
         self.data, self.quick_data, self.space = data, quick, data.space
         space = data.space
         self.start = space.to_unit(space.start)
@@ -127,7 +131,7 @@ class Problem:
         return float((self.residual(u[None]) ** 2).sum())
 
     def residual(self, u: np.ndarray) -> np.ndarray:
-        """Return (C, R + P) for u (C, P) on the unit cube: data, then prior, in standard deviations."""
+        """Return (C, R + B) for u (C, P) on the unit cube: data, then beliefs, in standard deviations."""
         return self._with_prior(self.data, u)
 
     def quick(self, u: np.ndarray) -> np.ndarray:
@@ -136,10 +140,22 @@ class Problem:
 
     def quick_jacobian(self, u: np.ndarray) -> np.ndarray:
         """Return (R + P, P), the Jacobian of `quick` at u (P,)."""
-        return np.concatenate([self.quick_data.jacobian(u), np.diag(self.weight)])
+        return np.concatenate([self.quick_data.jacobian(u), self._belief_jacobian(u)])
 
     def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:
-        return np.concatenate([data(self.space.from_unit(u)), (u - self.start) * self.weight], axis=1)
+        return np.concatenate([data(self.space.from_unit(u)), self._belief(u)], axis=1)
+
+    def _belief(self, u: np.ndarray) -> np.ndarray:
+        """Return (C, B), what is believed without the motion, in standard deviations: the prior, then standstill."""
+        prior = (u - self.start) * self.weight
+        if self.at_rest is None:
+            return prior
+        return np.concatenate([prior, self.at_rest.residual(self.space, self.space.from_unit(u))], axis=1)
+
+    def _belief_jacobian(self, u: np.ndarray) -> np.ndarray:
+        h = np.where(u > 0.5, -STEP, STEP)
+        r = self._belief(np.concatenate([u[None], u + np.diag(h)]))
+        return ((r[1:] - r[0]) / h[:, None]).T
 
     def adapt(self, u: np.ndarray, fitted: bool) -> None:
         """Let the residuals find their weights about u (P,)."""
@@ -147,7 +163,7 @@ class Problem:
             data.adapt(self.space.from_unit(u), fitted)
 
     def jacobian(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual (R + P,) and its Jacobian (R + P, P) at u (P,)."""
+        """Return the residual (R + B,) and its Jacobian (R + B, P) at u (P,)."""
         if self.data is self.quick_data:
             return self.quick(u[None])[0], self.quick_jacobian(u)
         h = np.where(u > 0.5, -STEP, STEP)  # always into the cube

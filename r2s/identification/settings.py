@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from r2s.errors import UserError, check_number, choices
-from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import check_bounds, check_parameters
-from r2s.identification.problem import check_choices, check_prior, optional_friction
+from r2s.identification.problem import check_choices, check_prior, optional_friction, parts
 
 
 @dataclass(frozen=True)
@@ -18,6 +17,7 @@ class Settings:
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
         terms: what is searched beside friction: viscous, offset, inertia_scale or link, delay, lag, load, drag_sin,
             drag_cos, gain.
+        extra: terms that enter where motion left out demands them; `link` then takes the place of `inertia_scale`.
         family: of the friction; auto keeps the one with the smallest error on motion left out.
         window_s: length of a replayed window, s (commanded torque).
         stride: ms that compared angles are means of (commanded torque).
@@ -41,13 +41,14 @@ class Settings:
     breakaway: float | None = 1.5
     folds: int = 4
     keep_nominal: bool = False
+    extra: Sequence[str] = ()
 
     def __post_init__(self):
-        check_choices(self.family, self.terms)
+        check_choices(self.family, [*self.terms, *self.extra])
         check_parameters("bounds", self.bounds)
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
-        terms = [name for term in self.terms for name in (LINK if term == "link" else [term])]
+        terms = [name for term in (*self.terms, *self.extra) for name in parts(term)]
         if missing := [name for name in terms if name not in {*self.bounds, *optional_friction()}]:
             raise UserError(f"identify.bounds: none for {choices(missing)}")
         check_number("identify.window_s", self.window_s, "(0, inf)")
@@ -56,5 +57,5 @@ class Settings:
         if self.breakaway is not None:
             check_number("identify.breakaway", self.breakaway, "[0, inf)")
         check_number("identify.folds", self.folds, "[1, inf)", whole=True)
-        if self.folds < 2 and (self.family == "auto" or self.keep_nominal):
+        if self.folds < 2 and (self.family == "auto" or self.keep_nominal or self.extra):
             raise UserError(f"identify.folds: {self.folds} is too few to leave motion out; at least 2 are needed")

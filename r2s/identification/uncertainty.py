@@ -29,6 +29,7 @@ class Identified:
             {name: part}), widest first.
         unseen: names that keep their nominal value, because the data hardly say anything of them.
         break_spread: (n, 2) Nm, repeatability of the breakaway, where it was measured.
+        refused: whether replays were refused, because they disagreed with the torque of joints that move.
     """
 
     space: ParameterSpace
@@ -38,6 +39,7 @@ class Identified:
     null_directions: list[tuple[float, dict[str, float]]]
     unseen: list[str]
     break_spread: np.ndarray | None = None
+    refused: bool = False
 
     @property
     def x(self) -> np.ndarray:
@@ -103,13 +105,13 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     j, r = j[order], r[order]
     gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
     score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
-    belief = np.diag(problem.weight**2)
-    pull = problem.weight**2 * (u - problem.start)
+    rest, known = jacobian[rows:], residual[rows:]
+    belief, pull = rest.T @ rest, rest.T @ known
     factor = max(1.0, float(np.sqrt(np.mean(r**2))))
     steps = np.empty((DRAWS, p))
     for k in range(DRAWS):
         times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
-        believed = pull - problem.weight * rng.standard_normal(p)
+        believed = pull - rest.T @ rng.standard_normal(len(rest))
         h = np.tensordot(times, gram, 1) + belief
         steps[k] = -np.linalg.solve(h, times @ score + believed)
     information = gram.sum(0)
@@ -127,6 +129,7 @@ def conclude(
     history: pd.DataFrame,
     families: dict[str, float],
     break_spread: np.ndarray | None,
+    refused: bool,
 ) -> Identified:
     """Return the result: what hardly any data spoke of goes back to nominal, and is named.
 
@@ -150,7 +153,7 @@ def conclude(
             null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts[:6] if abs(part) > 0.2}))
     names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
     found = Estimate(space.from_unit(u), low, high, identifiable, samples)
-    return Identified(space, found, history, families, null, names, break_spread)
+    return Identified(space, found, history, families, null, names, break_spread, refused)
 
 
 def _settled(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -207,12 +207,14 @@ COULOMB = Family(
 
 
 def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    level = p[0] * (1 + np.sign(sign) * p[1]) * (1 + p[3] * np.exp(-((dq / p[4]) ** 2)))
+    side = np.sign(sign)
+    level = p[0] * (1 + side * p[1]) * (1 + p[3] * (1 + side * p[-1]) * np.exp(-((dq / p[4]) ** 2)))
     return level * sign + p[2] * dq
 
 
 def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    level, bump = p[0] * (1 + np.sign(dq) * p[1]), p[3] * np.exp(-((dq / p[4]) ** 2))
+    side = np.sign(dq)
+    level, bump = p[0] * (1 + side * p[1]), p[3] * (1 + side * p[-1]) * np.exp(-((dq / p[4]) ** 2))
     fall = level * bump * -2 * dq / p[4] ** 2
     return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2]
 
@@ -220,8 +222,8 @@ def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np
 @njit(cache=True)
 def _stribeck_native(p, v, h, memory):
     sign = np.tanh(v / WIDTH_DQ)
-    level = p[0] * (1.0 + np.sign(v) * p[1])
-    bump = p[3] * np.exp(-((v / p[4]) ** 2))
+    side = np.sign(v)
+    level, bump = p[0] * (1.0 + side * p[1]), p[3] * (1.0 + side * p[5]) * np.exp(-((v / p[4]) ** 2))
     fall = level * bump * -2.0 * v / p[4] ** 2
     level *= 1.0 + bump
     return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + p[2]
@@ -230,7 +232,7 @@ def _stribeck_native(p, v, h, memory):
 @njit(cache=True)
 def _stribeck_sharp(p, v, h, memory):
     sign = np.sign(v)
-    level, bump = p[0] * (1.0 + sign * p[1]), p[3] * np.exp(-((v / p[4]) ** 2))
+    level, bump = p[0] * (1.0 + sign * p[1]), p[3] * (1.0 + sign * p[5]) * np.exp(-((v / p[4]) ** 2))
     return level * (1.0 + bump) * sign + p[2] * v, p[2] - level * bump * 2.0 * abs(v) / p[4] ** 2
 
 
@@ -240,10 +242,11 @@ def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
 
 STRIBECK = Family(
     name="stribeck",
-    names=(*COULOMB.names, "rise", "stribeck_velocity"),
-    units=(*COULOMB.units, "1", "rad/s"),
+    names=(*COULOMB.names, "rise", "stribeck_velocity", "rise_asymmetry"),
+    units=(*COULOMB.units, "1", "rad/s", "1"),
     logarithmic=("coulomb", "stribeck_velocity"),
-    formula="coulomb (1 ± asymmetry) (1 + rise exp(-(v / stribeck_velocity)²)) sign(v) + viscous v",
+    optional=("rise_asymmetry",),
+    formula="coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v / stribeck_velocity)²)) sign(v) + viscous v",
     law=_stribeck_law,
     law_slope=_stribeck_slope,
     native=_stribeck_native,
@@ -258,7 +261,8 @@ def _bristle_native(p, v, h, memory):
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
     memory[0] = z
-    level = p[0] * (1.0 + p[1] if z > 0 else 1.0 - p[1]) * (1.0 + p[3] * np.exp(-((v / p[4]) ** 2)))
+    side = 1.0 if z > 0 else -1.0
+    level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
     # what the coming step will do to it, at the present velocity
@@ -270,15 +274,17 @@ def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
 
 
 def _bristle_held(phi: np.ndarray) -> np.ndarray:
-    level, asymmetry, rise = (phi[..., k] for k in (0, 1, 3))
-    return np.stack([-level * (1 - asymmetry), level * (1 + asymmetry)], -1) * (1 + rise[..., None])
+    level, asymmetry, rise = (phi[..., k, None] for k in (0, 1, 3))
+    sides, other = np.array([-1.0, 1.0]), phi[..., 6, None] if phi.shape[-1] > 6 else 0.0
+    return sides * level * (1 + sides * asymmetry) * (1 + rise * (1 + sides * other))
 
 
 BRISTLE = Family(
     name="bristle",
-    names=(*STRIBECK.names, "presliding"),
-    units=(*STRIBECK.units, "rad"),
+    names=(*STRIBECK.names[:-1], "presliding", "rise_asymmetry"),
+    units=(*STRIBECK.units[:-1], "rad", "1"),
     logarithmic=(*STRIBECK.logarithmic, "presliding"),
+    optional=("rise_asymmetry",),
     formula="Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
     law=_stribeck_law,
     law_slope=_stribeck_slope,

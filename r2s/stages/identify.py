@@ -213,7 +213,7 @@ def make_settings(cfg, torque):
 
     words: dict[str, Any] = plain(cfg.identify)
     del words["validation_fraction"]
-    for key in ("terms", "prior"):
+    for key in ("terms", "prior", "extra"):
         words[key] = words[key][torque]
     return called(Settings, "identify", words | {"family": cfg.friction.family})
 
@@ -289,6 +289,7 @@ def identify(cfg, overrides):
             "unseen_and_left_nominal": found.unseen,
             "decided_by_the_prior": [{"share_of_prior_left": round(s, 2), **v} for s, v in found.null_directions],
             "families_compared": found.families,
+            "replays_refused": found.refused,
         }
         save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)

@@ -1,0 +1,56 @@
+"""What ramps say of friction: at breakaway a joint's friction is what it is as sliding begins."""
+
+import numpy as np
+
+from r2s.identification.breakaway import Breakaway
+from r2s.identification.parameters import ParameterSpace
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor
+from r2s.physics.robot import Robot
+from r2s.recordings.ramps import Ramps
+
+SURE = 0.05  # of its level, how well a ramp's release tells friction at standstill: creep and onset blur it
+
+
+class StaticFriction:
+    """K ramps in which a joint let go: the command, the posture, and whatever else pulled at the joint there.
+
+    Stribeck's friction rises towards standstill, where recordings of motion have little to say: rows of a fit.
+    """
+
+    def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
+        kept = np.flatnonzero(~np.isnan(edges.value))
+        q = np.stack([ramps.recording.q[s.start] for s in ramps.recording.stretches])[kept]
+        self.joint, self.side = edges.joint[kept], (edges.sign[kept] > 0).astype(int)
+        self.command, own = edges.value[kept], np.arange(len(kept))
+        still = np.zeros_like(q)
+        gravity = regressor(robot, q, still, still, GRAVITY)[own, self.joint].reshape(len(kept), -1)
+        self._gravity, self._nominal = gravity, LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
+        self._load = np.abs(gravity @ self._nominal)
+        self._q = q[own, self.joint]
+
+    def net(self, d: Dynamics) -> np.ndarray:
+        """Return (..., K) Nm: all that acted on the joint but friction as it let go."""
+        standard = LinkInertia(d.mass, d.com, d.inertia).standard()
+        left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
+        drag = d.drag[..., self.joint, :]
+        pull = d.offset[..., self.joint] + drag[..., 0] * np.sin(self._q) + drag[..., 1] * np.cos(self._q)
+        return self.command + pull - left
+
+    def edges(self, d: Dynamics, otherwise: np.ndarray) -> np.ndarray:
+        """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; `otherwise` without any."""
+        net, out = self.net(d), np.array(otherwise, dtype=float)
+        for j in range(len(out)):
+            for side in range(2):
+                mine = (self.joint == j) & (self.side == side)
+                if mine.any():
+                    out[j, side] = net[mine].mean()
+        return np.stack([np.minimum(out[:, 0], 0.0), np.maximum(out[:, 1], 0.0)], -1)
+
+    def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
+        """Return (C, K), net torque minus friction as sliding begins, in standard deviations, for x (C, P)."""
+        d = space.dynamics(x)
+        sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
+        sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)
+        friction = sides[..., self.joint, self.side] + sign * d.load[..., self.joint] * self._load
+        return (self.net(d) - friction) / (SURE * np.maximum(np.abs(self.command), 0.05))
