@@ -24,7 +24,7 @@ REST = 1e-12  # rad/s: what a joint that is held may show, of a thousandth of wh
 
 def by_events(mass, damping, v, drive, friction, rest, edges, dq_min):
     """Return the velocities (n,) after a step, and its events, by dense algebra; arguments as in coming_velocity."""
-    h, able = SIM_DT, (edges != 0).any(1)
+    h, able = SIM_DT, (edges != 0).any(0)
     side = np.where(able, np.where(np.abs(v) <= dq_min, 0.0, np.sign(v)), 2.0)
     w, now, left, slow = np.where(np.abs(v) < TINY, 0.0, v), friction.copy(), h, True
     for events in range(100):
@@ -33,12 +33,12 @@ def by_events(mass, damping, v, drive, friction, rest, edges, dq_min):
             implicit = (mass + h * np.diag(damping))[np.ix_(slides, slides)]
             a[slides] = np.linalg.solve(implicit, (drive - now)[slides])
             net = drive - mass @ a
-            beyond = np.where(slides, -np.inf, np.maximum(net - edges[:, 1], edges[:, 0] - net))
+            beyond = np.where(slides, -np.inf, np.maximum(net - edges[1], edges[0] - net))
             j = int(beyond.argmax())
             if beyond[j] <= 0:
                 break
             side[j] = np.sign(w[j] or net[j])
-            now[j] = friction[j] if side[j] * v[j] > 0 else rest[j, int(side[j] > 0)]
+            now[j] = friction[j] if side[j] * v[j] > 0 else rest[int(side[j] > 0), j]
         if slow:
             impulse = mass @ np.where(slides, 0.0, w)
             w[slides] += np.linalg.solve(implicit, impulse[slides])
@@ -75,9 +75,8 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
         pull = d.offset + d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos) + actual - nominal
         drive = torque + pull - bias - model.dof_damping * v
         ones = np.ones_like(v)
-        rest = np.stack([d.friction(0 * v, sign * ones) + sign * loaded for sign in (-1, 1)], -1)
-        rest = rest if d.family is not SIGMOID else np.zeros_like(rest) + loaded[:, None] * [-1, 1]
-        edges = np.stack([np.minimum(d.breakaway[:, 0], rest[:, 0]), np.maximum(d.breakaway[:, 1], rest[:, 1])], -1)
+        rest = np.stack([d.friction(0 * v, sign * ones) + sign * loaded for sign in (-1, 1)])
+        edges = np.stack([np.minimum(d.breakaway[:, 0], rest[0]), np.maximum(d.breakaway[:, 1], rest[1])])
         after, count = by_events(mass, damping, v, drive, friction, rest, edges, d.dq_min)
         forces = sum(map(np.abs, (torque, pull, friction, actual, nominal, damping * v, bias)))
         bound = (1 + count) * rounding(mass + SIM_DT * np.diag(damping), forces, v, after)
@@ -251,7 +250,7 @@ def moreau(mass, level, drive, v, dt, count, sweeps):
                 without = v[j]
                 for k in range(n):
                     without += dt * inverse[j, k] * (drive[k] - (friction[k] if k != j else 0.0))
-                friction[j] = min(max(without / (dt * inverse[j, j]), level[j, 0]), level[j, 1])
+                friction[j] = min(max(without / (dt * inverse[j, j]), level[0, j]), level[1, j])
         v = v + dt * inverse @ (drive - friction)
     return v
 
@@ -266,15 +265,15 @@ def test_events_are_where_time_stepping_puts_them():
     for _ in range(40):
         root = rng.normal(size=(n, n))
         mass = root @ root.T + 0.3 * np.eye(n)
-        level = np.stack([-rng.uniform(0.5, 3, n), rng.uniform(0.5, 3, n)], -1)
+        level = np.stack([-rng.uniform(0.5, 3, n), rng.uniform(0.5, 3, n)])
         drive = rng.uniform(-4, 4, n)
         v = 2e-3 * rng.normal(size=n) * (rng.random(n) < 0.7)
         out, work = np.empty(n), np.empty((n + 4, n))
-        friction = np.where(v > 0, level[:, 1], np.where(v < 0, level[:, 0], 0.0))
+        friction = np.where(v > 0, level[1], np.where(v < 0, level[0], 0.0))
         packed = mass[np.tril_indices(n)]
         assert coming_velocity(packed, np.zeros(n), SIM_DT, v, drive, friction, level, level, TINY, work, out) or v.all()
         expected = moreau(mass, level, drive, v, SIM_DT / parts, parts, 60)
-        late = SIM_DT / parts * np.abs(np.linalg.inv(mass)) @ np.ptp(level, axis=1)
+        late = SIM_DT / parts * np.abs(np.linalg.inv(mass)) @ np.ptp(level, axis=0)
         np.testing.assert_allclose(out, expected, rtol=0, atol=12 * late.max())
         seen += int(np.any((np.sign(out) != np.sign(v)) & (v != 0)))
     assert seen > 15
