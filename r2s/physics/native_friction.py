@@ -31,7 +31,9 @@ OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds; REST: friction as sliding begins
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(REST_POS + 1, REST_POS + 6)  # of soft limits; 0: there are none
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(
+    REST_POS + 1, REST_POS + 6
+)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 # Rows of what a step knows of its joints, two each of the last two: of the negative and the positive direction.
@@ -44,7 +46,7 @@ _laws: list[Callable] = [*(f.native for f in FAMILIES), *(f.sharp for f in FAMIL
 
 
 def number(family: Family, hold: str) -> int:
-    """Return what `jnt_user` calls a family's law; one that is new is compiled into the physics step first (seconds)."""
+    """Return what `jnt_user` calls a family's law; a new one is compiled into the physics step first (seconds)."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     if law not in _laws:
         _laws.append(law)
@@ -218,8 +220,10 @@ def _hold(mass, damping, bias, applied, qvel, user, joint, work, passive):
 
 
 _MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "userdata", "M")
-_DATA_FIELDS += ("xpos", "xmat", "xanchor", "xaxis")
+_DATA_FIELDS = (
+    *("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "M", "userdata"),
+    *("xpos", "xmat", "xanchor", "xaxis"),
+)
 
 
 def _struct_offsets() -> dict[str, int]:

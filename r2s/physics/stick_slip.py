@@ -1,9 +1,10 @@
 """Stick and slip of coupled joints within one step: who is held, lets go, stops or turns, and when.
 
 A joint at rest is held while the net torque on it, which is all but its own friction, the coupling to the others
-included, lies within its edges. Beyond them it slides against the friction of its direction. Torques are constant for a
-step; so are accelerations from event to event, and each event is found where it happens, as in Pfeiffer and Glocker
-1996, ch. 5 to 7. (Friction of the step's end, taken for all of it, is wrong by up to h times itself at every turn.)
+included, lies within its edges. Beyond them it slides against the friction of its direction. Torques are constant for
+a step; so are accelerations from event to event, and each event is found where it happens (event-driven integration:
+Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time stepping takes the friction of a step's
+end for all of it, and is wrong by up to h times that friction at every turn.
 
 Hard stops are MuJoCo's own: where a joint lies at one, they come on top of what is found here.
 """
