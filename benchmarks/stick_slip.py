@@ -41,9 +41,8 @@ def true_dynamics(truth: dict, recording: Recording) -> Dynamics:
         family, phi = SIGMOID, np.stack([f["phi1"], f["phi2"], f["phi3"]], -1)
     else:
         family = STRIBECK if "vs" in f else COULOMB
-        phi = np.stack(
-            [_closest(family, {k: v[j] for k, v in f.items()}, dq) for j, dq in enumerate(_speeds(recording))]
-        )
+        joints = [{name: values[j] for name, values in f.items()} for j in range(ROBOT.n)]
+        phi = np.stack([_closest(family, one, dq) for one, dq in zip(joints, _speeds(recording), strict=True)])
     return replace(
         Dynamics.of(ROBOT, phi, family, dq_min=0.01 if command else START),
         offset=np.array(truth["offset"]),
@@ -51,8 +50,8 @@ def true_dynamics(truth: dict, recording: Recording) -> Dynamics:
         mass=np.array(truth["mass"]),
         com=np.array(truth["com"]),
         inertia=np.array(truth["inertia"]),
-        # r2s feels for all of a step what the lag has come to at its end: less late than a lag is, by about half a step
-        delay=truth["delay_s"] + lag - SIM_DT / np.expm1(SIM_DT / lag),
+        # r2s feels during a step what the lag comes to at its end, which is too early by up to half a step
+        delay=truth["delay_s"] + (lag - SIM_DT / np.expm1(SIM_DT / lag) if lag else 0.0),
         lag=lag,
         hold="command" if command else "net",
     )
@@ -89,16 +88,15 @@ def speed(dynamics: Dynamics, tau: np.ndarray) -> tuple[float, float]:
 
 def main() -> None:
     """Print one line per arm, then the speeds."""
-    print(
-        f"{'arm':12}{'rule of the arm':>16}" + "".join(f"{f'{n}, {hold}, mm':>26}" for n in NAMES for hold in HOLDS)
-    )
+    columns = [f"{name}, {hold}, mm" for name in NAMES for hold in HOLDS]
+    print(f"{'arm':12}{'its rule':>10}" + "".join(f"{column:>26}" for column in columns))
     for folder in sorted(Path(sys.argv[1]).iterdir()):
         truth = json.loads((folder / "truth.json").read_text()) if (folder / "truth.json").is_file() else {}
-        if truth.get("family") not in ("sigmoid", "coulomb", "stribeck", "paper"):
+        if truth.get("family", "lugre") == "lugre":
             continue  # no family here has the bristle damping of a LuGre arm
         seen = {n: read(folder / f"{n}.npz", torque="commanded") for n in NAMES}
         true = true_dynamics(truth, seen["train"])
-        line = f"{folder.name:12}{true.hold:>16}"
+        line = f"{folder.name:12}{true.hold:>10}"
         for recording in seen.values():
             for hold in HOLDS:
                 line += f"{_open_loop_ee(ROBOT, replace(true, hold=hold), recording, 1)[HORIZON]:26.2f}"

@@ -289,7 +289,7 @@ def test_events_are_where_time_stepping_puts_them():
 
 @pytest.mark.parametrize("law", THREE, ids=named)
 def test_a_slow_joint_within_its_edges_comes_to_rest(panda, law):
-    """Below dq_min a joint stops in one step if nothing takes it beyond its edges; if its command does, it slides on."""
+    """Below dq_min a joint stops in one step while it is within its edges; if its command is beyond, it slides on."""
     phi = {"sigmoid": [0.4, 8.0, 0.0], "coulomb": [0.2, 0.0, 0.1], "stribeck": [0.2, 0.0, 0.1, 0.5, 0.1]}[law.name]
     edges = np.tile([-5.0, 5.0], (7, 1))
     edges[5] = -0.5, 0.5
