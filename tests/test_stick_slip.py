@@ -8,10 +8,21 @@ import pytest
 from conftest import conf
 from numba import njit
 from test_physics import (
-    THREE, arms_of, light, mass_matrix, named, rounding, set_links, some_dynamics, some_motion, weight, with_everything,
-)  # fmt: skip
+    THREE,
+    light,
+    mass_matrix,
+    named,
+    rounding,
+    set_links,
+    some_dynamics,
+    some_motion,
+    weight,
+    with_everything,
+)
 
 from r2s.errors import UserError
+from r2s.identification.parameter_file import load_parameters, save_parameters
+from r2s.identification.parameters import Estimate, parameter_space
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
 from r2s.physics.robot import SIM_DT
@@ -24,7 +35,7 @@ REST = 1e-12  # rad/s: what a joint that is held may show, of a thousandth of wh
 
 def by_events(mass, damping, v, drive, friction, rest, edges, dq_min):
     """Return the velocities (n,) after a step, and its events, by dense algebra; arguments as in coming_velocity."""
-    h, able = SIM_DT, (edges != 0).any(1)
+    h, able = SIM_DT, (edges != 0).any(0)
     side = np.where(able, np.where(np.abs(v) <= dq_min, 0.0, np.sign(v)), 2.0)
     w, now, left, slow = np.where(np.abs(v) < TINY, 0.0, v), friction.copy(), h, True
     for events in range(100):
@@ -33,12 +44,12 @@ def by_events(mass, damping, v, drive, friction, rest, edges, dq_min):
             implicit = (mass + h * np.diag(damping))[np.ix_(slides, slides)]
             a[slides] = np.linalg.solve(implicit, (drive - now)[slides])
             net = drive - mass @ a
-            beyond = np.where(slides, -np.inf, np.maximum(net - edges[:, 1], edges[:, 0] - net))
+            beyond = np.where(slides, -np.inf, np.maximum(net - edges[1], edges[0] - net))
             j = int(beyond.argmax())
             if beyond[j] <= 0:
                 break
             side[j] = np.sign(w[j] or net[j])
-            now[j] = friction[j] if side[j] * v[j] > 0 else rest[j, int(side[j] > 0)]
+            now[j] = friction[j] if side[j] * v[j] > 0 else rest[int(side[j] > 0), j]
         if slow:
             impulse = mass @ np.where(slides, 0.0, w)
             w[slides] += np.linalg.solve(implicit, impulse[slides])
@@ -75,9 +86,8 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
         pull = d.offset + d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos) + actual - nominal
         drive = torque + pull - bias - model.dof_damping * v
         ones = np.ones_like(v)
-        rest = np.stack([d.friction(0 * v, sign * ones) + sign * loaded for sign in (-1, 1)], -1)
-        rest = rest if d.family is not SIGMOID else np.zeros_like(rest) + loaded[:, None] * [-1, 1]
-        edges = np.stack([np.minimum(d.breakaway[:, 0], rest[:, 0]), np.maximum(d.breakaway[:, 1], rest[:, 1])], -1)
+        rest = np.stack([d.friction(0 * v, sign * ones) + sign * loaded for sign in (-1, 1)])
+        edges = np.stack([np.minimum(d.breakaway[:, 0], rest[0]), np.maximum(d.breakaway[:, 1], rest[1])])
         after, count = by_events(mass, damping, v, drive, friction, rest, edges, d.dq_min)
         forces = sum(map(np.abs, (torque, pull, friction, actual, nominal, damping * v, bias)))
         bound = (1 + count) * rounding(mass + SIM_DT * np.diag(damping), forces, v, after)
@@ -217,10 +227,7 @@ def test_a_joint_is_held_against_the_motion_of_the_others(panda, law):
 
 @pytest.mark.parametrize("law", THREE, ids=named)
 def test_friction_never_gives_energy(panda, law):
-    """Without command and offset kinetic energy falls in every step, with every stop; in the end the arm is at rest.
-
-    MuJoCo's semi-implicit step alone, without friction, gives and takes energy: of what it gives a step has its bound.
-    """
+    """Without command and offset kinetic energy never rises, stops included, and in the end all joints are held."""
     d = replace(some_dynamics(panda, 3, law=law), hold="net", dq_min=5e-3, offset=np.zeros((3, 7)))
     q, dq, _ = some_motion(panda, 3, 1)
     sim = Simulator(panda, d, 3, 1)
@@ -251,7 +258,7 @@ def moreau(mass, level, drive, v, dt, count, sweeps):
                 without = v[j]
                 for k in range(n):
                     without += dt * inverse[j, k] * (drive[k] - (friction[k] if k != j else 0.0))
-                friction[j] = min(max(without / (dt * inverse[j, j]), level[j, 0]), level[j, 1])
+                friction[j] = min(max(without / (dt * inverse[j, j]), level[0, j]), level[1, j])
         v = v + dt * inverse @ (drive - friction)
     return v
 
@@ -266,15 +273,80 @@ def test_events_are_where_time_stepping_puts_them():
     for _ in range(40):
         root = rng.normal(size=(n, n))
         mass = root @ root.T + 0.3 * np.eye(n)
-        level = np.stack([-rng.uniform(0.5, 3, n), rng.uniform(0.5, 3, n)], -1)
+        level = np.stack([-rng.uniform(0.5, 3, n), rng.uniform(0.5, 3, n)])
         drive = rng.uniform(-4, 4, n)
         v = 2e-3 * rng.normal(size=n) * (rng.random(n) < 0.7)
         out, work = np.empty(n), np.empty((n + 4, n))
-        friction = np.where(v > 0, level[:, 1], np.where(v < 0, level[:, 0], 0.0))
+        friction = np.where(v > 0, level[1], np.where(v < 0, level[0], 0.0))
         packed = mass[np.tril_indices(n)]
-        assert coming_velocity(packed, np.zeros(n), SIM_DT, v, drive, friction, level, level, TINY, work, out) or v.all()
+        coming_velocity(packed, np.zeros(n), SIM_DT, v, drive, friction, level, level, TINY, work, out)
         expected = moreau(mass, level, drive, v, SIM_DT / parts, parts, 60)
-        late = SIM_DT / parts * np.abs(np.linalg.inv(mass)) @ np.ptp(level, axis=1)
+        late = SIM_DT / parts * np.abs(np.linalg.inv(mass)) @ np.ptp(level, axis=0)
         np.testing.assert_allclose(out, expected, rtol=0, atol=12 * late.max())
         seen += int(np.any((np.sign(out) != np.sign(v)) & (v != 0)))
     assert seen > 15
+
+
+@pytest.mark.parametrize("law", THREE, ids=named)
+def test_a_slow_joint_within_its_edges_comes_to_rest(panda, law):
+    """Below dq_min a joint stops in one step while it is within its edges; if its command is beyond, it slides on."""
+    phi = {"sigmoid": [0.4, 8.0, 0.0], "coulomb": [0.2, 0.0, 0.1], "stribeck": [0.2, 0.0, 0.1, 0.5, 0.1]}[law.name]
+    edges = np.tile([-5.0, 5.0], (7, 1))
+    edges[5] = -0.5, 0.5
+    d = replace(Dynamics.of(panda, np.tile(phi, (7, 1)), law, dq_min=2e-3), breakaway=edges, hold="net")
+    slow = np.array([[1.9e-3, -1.9e-3, 2.1e-3, 0.0, 0.5, 1e-3, 0.0]])
+    tau = np.zeros((1, 1, 7))
+    tau[0, 0, 5] = 0.8
+    sim = Simulator(panda, d, 1, 1)
+    sim.reset(panda.q_home[None], slow)
+    dq = sim.rollout(tau, record=("qvel",))["qvel"][0, 0]
+    assert np.abs(dq[[0, 1, 3, 6]]).max() < REST
+    assert dq[4] > 0.3
+    assert dq[5] > 1e-3
+
+
+def test_threads_and_states_do_not_change_a_bit(panda):
+    """One thread and two give the same bits, and so does an arm that is put back to where it was."""
+    nsim = 9
+    dynamics = replace(some_dynamics(panda, nsim, law=STRIBECK), hold="net", dq_min=1e-3)
+    q, dq, tau = some_motion(panda, nsim, 120)
+    results = []
+    for nthread in (1, 2):
+        sim = Simulator(panda, dynamics, nsim, nthread)
+        sim.reset(q, dq)
+        sim.rollout(tau[:, :40])
+        state = sim.state()
+        first = sim.rollout(tau[:, 40:], record=("qpos", "qvel"))
+        sim.set_state(state)
+        results += [first, sim.rollout(tau[:, 40:], record=("qpos", "qvel"))]
+    for other in results[1:]:
+        assert all(np.array_equal(results[0][name], other[name]) for name in ("qpos", "qvel"))
+
+
+def test_what_has_no_edges_and_no_jump_is_the_same_by_either_rule(panda):
+    """A sigmoid without breakaway, and bristles, do not care for `hold`."""
+    nsim = 3
+    q, dq, tau = some_motion(panda, nsim, 100)
+    for law in (SIGMOID, BRISTLE):
+        d = some_dynamics(panda, nsim, law=law)
+        d = replace(d, breakaway=0 * d.breakaway if law is SIGMOID else d.breakaway)
+        paths = []
+        for hold in ("command", "net"):
+            sim = Simulator(panda, replace(d, hold=hold), nsim, 1)
+            sim.reset(q, dq)
+            paths.append(sim.rollout(tau)["qpos"])
+        assert np.array_equal(*paths)
+
+
+def test_the_rule_is_named(panda, tmp_path):
+    """The published arm keeps the paper's rule; another is named in yaml, kept by parameters.yaml, or refused."""
+    paper = nominal_dynamics(panda, **conf("friction/paper"))
+    assert paper.hold == "command"
+    net = nominal_dynamics(panda, **conf("friction/paper") | {"hold": "net"})
+    space = parameter_space(panda, net, {"offset": [-1.0, 1.0]})
+    x = space.start
+    save_parameters(tmp_path / "parameters.yaml", space, Estimate(x, x, x, np.ones(len(x), bool), x[None]), {})
+    again, x = load_parameters(tmp_path, panda)
+    assert again.dynamics(x).hold == "net"
+    with pytest.raises(UserError, match=r"^friction\.hold: 'nett'; allowed: command, net; did you mean 'net'\?$"):
+        nominal_dynamics(panda, **conf("friction/paper") | {"hold": "nett"})

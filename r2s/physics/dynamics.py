@@ -10,7 +10,6 @@ from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
 
-
 HOLDS = ("command", "net")
 
 

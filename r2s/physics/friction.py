@@ -38,8 +38,8 @@ class Family:
             with a memory how far the bristles are bent.
         native: the law for one joint and one step of h seconds, compiled by numba.njit:
             (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's own, 0 after a reset.
-        sharp: `native` of a law with a jump at rest, the jump left as one; for `hold` = "net" of Dynamics, which solves
-            it. None: `native` serves there, too.
+        sharp: `native` of a law with a jump at rest, with that jump; `hold` = "net" of Dynamics takes it, because it
+            solves for rest. None: the law has no jump, and `native` serves there, too.
         start: level (..., n) Nm at 1 rad/s -> the K parameters that are not optional, in a list.
         held: phi (..., n, K) -> (..., n, 2) Nm, the negative and the positive torque that the law holds at rest,
             which takes a memory. None: it holds nothing, and the dead zone of `passive_torque` does.

@@ -36,6 +36,9 @@ Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(
 )  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
+# Rows of what a step knows of its joints, two each of the last two: of the negative and the positive direction.
+SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES = 0, 1, 2, 3, 4, 5, 7
+ROWS = 9
 
 
 # the place of a law is its number in `jnt_user`
@@ -43,7 +46,7 @@ _laws: list[Callable] = [*(f.native for f in FAMILIES), *(f.sharp for f in FAMIL
 
 
 def number(family: Family, hold: str) -> int:
-    """Return what `jnt_user` calls a family's law; one that is new is compiled into the physics step first (seconds)."""
+    """Return what `jnt_user` calls a family's law; a new one is compiled into the physics step first (seconds)."""
     law = family.native if hold == "command" or family.sharp is None else family.sharp
     if law not in _laws:
         _laws.append(law)
@@ -111,7 +114,7 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
 
         return types.CPointer(types.float64)(types.int64), codegen
 
-    @cfunc(types.void(types.CPointer(types.int64), types.CPointer(types.int64)))
+    @cfunc(types.void(types.CPointer(types.int64), types.CPointer(types.int64)), error_model="numpy")
     def friction_force(model_ptr, data_ptr):
         model = carray(model_ptr, (model_words,))
         if model[nuser_at] != WIDTH:
@@ -133,9 +136,9 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         if net:
             bias = carray(as_doubles(data[bias_at]), (n,))  # type: ignore[call-arg]
             mass = carray(as_doubles(data[mass_at]), (n * (n + 1) // 2,))  # type: ignore[call-arg]
-            work = carray(stack((n + 13) * n), (n + 13, n))  # type: ignore[call-arg]
-            speeds, drives, frictions, loads, coming = work[n + 4], work[n + 5], work[n + 6], work[n + 7], work[n + 8]
-            h, dq_min, slow = user[0, STEP], max(user[0, DQ_MIN], TINY), False
+            work = carray(stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
+            joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
+            slow = False
         # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
         em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(n - 1, -1, -1):
@@ -180,33 +183,47 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             force -= user[j, Q_STIFFNESS] * beyond
             qfrc_passive[j] += force + (-applied[j] if held else pull)
             if net:
-                speeds[j], frictions[j], loads[j] = v, friction, loaded
-                drives[j] = qfrc_passive[j] + applied[j] - bias[j]
-                slow |= abs(v) <= dq_min
-        if not net or not (slow or turns(mass, damping, h, speeds, drives, work)):
-            return
-        rest, edges = work[n + 9 : n + 11].reshape(n, 2), work[n + 11 : n + 13].reshape(n, 2)
-        for j in range(n):
-            drives[j] += frictions[j]
-            rest[j, 0], rest[j, 1] = user[j, REST_NEG] - loads[j], user[j, REST_POS] + loads[j]
-            edges[j, 0] = min(user[j, BREAK_NEG], rest[j, 0])
-            edges[j, 1] = max(user[j, BREAK_POS], rest[j, 1])
-        if coming_velocity(mass, damping, h, speeds, drives, frictions, rest, edges, dq_min, work, coming):
-            for j in range(n):  # the force that takes MuJoCo's implicit step there
-                qfrc_passive[j] = bias[j] - applied[j] + damping[j] * (coming[j] - qvel[j])
-            for k in range(n):
-                change = (coming[k] - qvel[k]) / h
-                if change != 0.0:
-                    for j in range(n):
-                        qfrc_passive[j] += element(mass, j, k) * change
+                joint[SPEED, j], joint[FRICTION, j], joint[LOADED, j] = v, friction, loaded
+                joint[FORCE, j] = qfrc_passive[j] + applied[j] - bias[j]
+                slow |= abs(v) <= user[j, DQ_MIN] or v == 0.0
+        if net and (slow or turns(mass, damping, user[0, STEP], joint[SPEED], joint[FORCE], work)):
+            _hold(mass, damping, bias, applied, qvel, user, joint, work, qfrc_passive)
 
     mujoco.set_mjcb_control(friction_force.ctypes)
     return friction_force  # kept alive by the cache: MuJoCo holds only the address
 
 
+@njit(cache=True, error_model="numpy")
+def _hold(mass, damping, bias, applied, qvel, user, joint, work, passive):
+    """Change the passive force of a step so that it ends with the velocities that stick_slip.py finds.
+
+    Arguments are fields of MuJoCo, `joint` (ROWS, n) what the callback knows, and `work` (n + 4, n) anything.
+    """
+    n, h = len(qvel), user[0, STEP]
+    coming, rest, edges = joint[COMING], joint[REST : REST + 2], joint[EDGES : EDGES + 2]
+    for j in range(n):
+        joint[FORCE, j] += joint[FRICTION, j]
+        rest[0, j], rest[1, j] = user[j, REST_NEG] - joint[LOADED, j], user[j, REST_POS] + joint[LOADED, j]
+        edges[0, j], edges[1, j] = min(user[j, BREAK_NEG], rest[0, j]), max(user[j, BREAK_POS], rest[1, j])
+    dq_min = max(user[0, DQ_MIN], TINY)
+    if not coming_velocity(
+        mass, damping, h, joint[SPEED], joint[FORCE], joint[FRICTION], rest, edges, dq_min, work, coming
+    ):
+        return
+    for j in range(n):
+        passive[j] = bias[j] - applied[j] + damping[j] * (coming[j] - qvel[j])
+    for k in range(n):
+        change = (coming[k] - qvel[k]) / h
+        if change != 0.0:
+            for j in range(n):
+                passive[j] += element(mass, j, k) * change
+
+
 _MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = ("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "userdata", "M")
-_DATA_FIELDS += ("xpos", "xmat", "xanchor", "xaxis")
+_DATA_FIELDS = (
+    *("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "M", "userdata"),
+    *("xpos", "xmat", "xanchor", "xaxis"),
+)
 
 
 def _struct_offsets() -> dict[str, int]:

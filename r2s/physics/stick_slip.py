@@ -1,9 +1,10 @@
 """Stick and slip of coupled joints within one step: who is held, lets go, stops or turns, and when.
 
 A joint at rest is held while the net torque on it, which is all but its own friction, the coupling to the others
-included, lies within its edges. Beyond them it slides against the friction of its direction. Torques are constant for a
-step; so are accelerations from event to event, and each event is found where it happens, as in Pfeiffer and Glocker
-1996, ch. 5 to 7. (Friction of the step's end, taken for all of it, is wrong by up to h times itself at every turn.)
+included, lies within its edges. Beyond them it slides against the friction of its direction. Torques are constant for
+a step; so are accelerations from event to event, and each event is found where it happens (event-driven integration:
+Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time stepping takes the friction of a step's
+end for all of it, and is wrong by up to h times that friction at every turn.
 
 Hard stops are MuJoCo's own: where a joint lies at one, they come on top of what is found here.
 """
@@ -15,7 +16,7 @@ TINY = 1e-9  # rad/s, what round-off leaves of a joint that is held: it is at re
 HELD, FREE = 0.0, 2.0  # in place of a direction: at rest, and without edges to be held by
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def turns(mass, damping, h, dq, drive, work):
     """Return whether any joint comes through rest by sliding on; arguments as below, but friction is in `drive`."""
     n, change = len(dq), work[len(dq)]
@@ -42,7 +43,7 @@ def turns(mass, damping, h, dq, drive, work):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, work, coming):
     """Write the velocities (n,) at the end of a step into `coming`; return whether stiction had a part in them.
 
@@ -51,8 +52,8 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
     Args:
         mass: (n (n + 1) / 2,) kg m^2, the lower triangle, row by row. damping: (n,) Nm s/rad, implicit. h: s.
         dq, drive, friction: (n,) rad/s, Nm, Nm: velocity, all torques but friction, friction at dq.
-        rest: (n, 2) Nm, friction when sliding just begins, in the negative and in the positive direction.
-        edges: (n, 2) Nm, what holds a joint at rest, at least `rest`; 0, 0 where nothing does.
+        rest: (2, n) Nm, friction when sliding just begins, in the negative and in the positive direction.
+        edges: (2, n) Nm, what holds a joint at rest, at least `rest`; 0, 0 where nothing does.
         dq_min: rad/s, below which a joint whose net torque is within its edges comes to rest.
         work: (n + 4, n), anything. coming: (n,) rad/s.
     """
@@ -61,13 +62,13 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
     slow, held, within = False, 0, True
     for j in range(n):
         coming[j], now[j] = dq[j], friction[j]
-        if edges[j, 0] == 0.0 and edges[j, 1] == 0.0:
+        if edges[0, j] == 0.0 and edges[1, j] == 0.0:
             side[j] = FREE
         elif abs(dq[j]) <= dq_min:
             side[j] = HELD
             slow |= dq[j] != 0.0
             held += 1
-            within &= edges[j, 0] <= drive[j] <= edges[j, 1]
+            within &= edges[0, j] <= drive[j] <= edges[1, j]
         else:
             side[j] = np.sign(dq[j])
     if held == n and within and not slow:  # nothing moves
@@ -84,7 +85,7 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
                 break
             side[j] = way if coming[j] == 0.0 else np.sign(coming[j])
             on = side[j] * dq[j] > 0.0  # it slides as it did
-            now[j] = friction[j] if on else rest[j, int(side[j] > 0.0)]
+            now[j] = friction[j] if on else rest[int(side[j] > 0.0), j]
             took_part |= not on
         if slow:  # an impulse stops those that are held and not at rest, and the others feel it
             slow = False
@@ -117,13 +118,13 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
         events += 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def element(mass, i, k):
     """Return one element of the matrix whose lower triangle is `mass`."""
     return mass[i * (i + 1) // 2 + k] if i >= k else mass[k * (k + 1) // 2 + i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _factor(mass, damping, h, side, root):
     """Write Cholesky's root of mass + h damping of those that slide, its diagonal inverted."""
     for i in range(len(side)):
@@ -142,7 +143,7 @@ def _factor(mass, damping, h, side, root):
             root[i, i] = 1.0 / np.sqrt(d)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve(root, side, rhs, x):
     """Write the solution to x, which may be `rhs`; 0 for those held."""
     n = len(rhs)
@@ -163,7 +164,7 @@ def _solve(root, side, rhs, x):
             x[i] = s * root[i, i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _farthest_beyond(mass, acceleration, drive, edges, side):
     """Return which held joint's net torque is the farthest beyond its edges, -1 for none, and which way it points."""
     worst, at, way = 0.0, -1, 1.0
@@ -173,7 +174,7 @@ def _farthest_beyond(mass, acceleration, drive, edges, side):
             for k in range(len(side)):
                 if side[k] != HELD:
                     net -= element(mass, j, k) * acceleration[k]
-            beyond = max(net - edges[j, 1], edges[j, 0] - net)
+            beyond = max(net - edges[1, j], edges[0, j] - net)
             if beyond > worst:
                 worst, at, way = beyond, j, np.sign(net)
     return at, way
