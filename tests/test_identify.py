@@ -645,6 +645,9 @@ def test_what_is_left_out_is_not_fitted(clean):
             near = np.array([lookup[t] for t in rest.t.tolist()])
             low, high = (f(lookup[t] for t in out.t.tolist()) for f in (min, max))
             assert np.all((near <= low - 0.099) | (near >= high + 0.099))
+            if recording.period:  # on a circle: the last phases of a period are close to its first ones
+                assert np.all((low - near) % recording.period > 0.099)
+                assert np.all((near - high) % recording.period > 0.099)
             assert 0.15 < len(out.t) / len(clean.t) < 0.35
 
 

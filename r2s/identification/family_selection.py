@@ -18,16 +18,19 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 FAMILY_HZ = 50.0  # rows per second that families are compared on
+GUARD_S = 0.1  # s, rows this close to a block are nearly its own
 
 
 def left_out(recording: Recording, folds: int) -> list[tuple[Recording, Recording]]:
     """Return (rest, block) for blocks of time, or of phase where the motion repeats itself; 0.1 s apart."""
-    clock = recording.t % recording.period if recording.period else recording.t
+    period = recording.period or np.inf
+    clock = recording.t % period if recording.period else recording.t
     edges = np.quantile(clock, np.linspace(0, 1, folds + 1))
     pairs = []
     for low, high in pairwise(edges):
         out = (clock >= low) & (clock <= high)
-        near = (clock > low - 0.1) & (clock < high + 0.1)
+        # on a circle: after the last phase comes phase 0; without a period the way round is infinite
+        near = out | ((low - clock) % period < GUARD_S) | ((clock - high) % period < GUARD_S)
         pairs.append((recording.select(~near), recording.select(out)))
     return pairs
 
