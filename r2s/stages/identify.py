@@ -17,6 +17,7 @@ from r2s.stages.build import (
     plain,
 )
 
+KNOWN = 0.3  # share of a validation motion that may come in the training motion too, such as the way to a start
 WHY = {
     "arm": "only data=arm moves an arm",
     "inertia": "calibration= says what the links are",
@@ -143,8 +144,6 @@ def read_motion(robot, file, share):
     Args:
         share: of the recording that validates where there is no second one.
     """
-    from dataclasses import replace
-
     import numpy as np
 
     from r2s.identification.checks import check_recording
@@ -155,10 +154,14 @@ def read_motion(robot, file, share):
     how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
     recording = read(file.path, **how)
     check_recording(robot, recording)
+    if file.period is None and (again := recording.in_phase()) is not recording:
+        recording = again
+        if not file.validation:
+            print(
+                f"the motion repeats itself after {recording.period:.2f} s: what validates is held out in every "
+                "repetition"
+            )
     if not file.validation:
-        if file.period is None and (period := recording.repeats_after()):
-            print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
-            recording = replace(recording, period=period)
         return recording.split(share)
     if os.path.realpath(file.validation) == os.path.realpath(file.path):
         raise UserError("data.validation is the training file itself: it must hold other motion")
@@ -171,7 +174,25 @@ def read_motion(robot, file, share):
             f"data.validation: {same} of its {len(validation.t)} rows are rows of the training file; it must hold "
             "other motion"
         )
+    if (known := validation.known_from(recording)) > KNOWN:
+        raise UserError(
+            f"data.validation: {100 * known:.0f} % of its motion is that of the training file, recorded again; it "
+            "must hold other motion (to hold out a part of a repeated motion, leave data.validation=null)"
+        )
     return recording, validation
+
+
+def read_user_ramps(robot, file):
+    """Return the ramps of a `File`; its columns are named as those of the recording."""
+    from r2s.identification.checks import check_ramps
+    from r2s.recordings.ramps import read_ramps
+
+    columns = dict(file.columns)
+    if file.torque != "commanded":
+        columns["tau"] = None  # that names another torque; ramps are of the command
+    ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
+    check_ramps(robot, ramps)
+    return ramps
 
 
 def recorded(cfg, robot, run, motion):
@@ -184,7 +205,7 @@ def recorded(cfg, robot, run, motion):
         UserError: the arm stopped.
     """
     from r2s.arm.interface import ArmStopped
-    from r2s.recordings.ramps import Ramps
+    from r2s.recordings.ramps import read_ramps
     from r2s.recordings.readers import read
 
     def one(name, motion, seed):
@@ -199,7 +220,7 @@ def recorded(cfg, robot, run, motion):
         train = one("train", motion, cfg.data.excitation_seed)
         validation = one("validation", None, cfg.data.excitation_seed + 1)
         path = run.folder / "ramps.npz"
-        ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
+        ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot)
         if ramps is not None and not path.is_file():
             ramps.save(path)
     except ArmStopped as stop:
@@ -226,7 +247,6 @@ def identify(cfg, overrides):
     from r2s.identification.prediction import prediction_errors
     from r2s.physics.description import write_description
     from r2s.progress import Progress
-    from r2s.recordings.ramps import Ramps
     from r2s.recordings.readers import files_of
     from r2s.reporting import pages
     from r2s.reporting.identification_tables import identification_table
@@ -245,7 +265,7 @@ def identify(cfg, overrides):
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
         if file.ramps:
-            ramps = Ramps.load(file.ramps)
+            ramps = read_user_ramps(robot, file)
             inputs.append(file.ramps)
     else:
         called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
