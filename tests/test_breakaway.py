@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import conf
+from scipy.stats import t as student
 
 from r2s.arm import twin as hidden
 from r2s.arm.interface import ArmStopped
@@ -13,8 +14,9 @@ from r2s.arm.ramp import MARGIN, ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
-from r2s.identification.breakaway import breakaway
+from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_ramps
+from r2s.identification.repeatability import REPEATS, certainty
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.recordings.ramps import Ramps, read_ramps
 from r2s.recordings.readers import read
@@ -247,6 +249,53 @@ def test_what_does_not_move_is_listed_and_the_rest_survives():
     assert found.command[1, 1] == pytest.approx(0.41, abs=3e-3)
     assert found.spread[1, 1] == pytest.approx(0.02 / np.sqrt(2), abs=3e-3)
     assert np.isnan(found.command[0]).all()
+
+
+# --- how sure it is
+
+
+def seen(value):
+    """Return what ramps with these results (n, 2, K) Nm, NaN where a joint did not let go, say."""
+    n, _, repeats = value.shape
+    joint, side, pose = (x.ravel() for x in np.meshgrid(*(range(k) for k in value.shape), indexing="ij"))
+    count = (~np.isnan(value)).sum(-1)
+    spread = np.full((n, 2), np.nan)
+    spread[count > 1] = np.nanstd(value[count > 1], -1, ddof=1)
+    command = np.where(count > 0, np.nansum(value, -1) / np.maximum(count, 1), np.nan)
+    blank = np.zeros((n, 2))
+    ramped = np.full((n, 2), repeats)
+    return Breakaway(command, spread, count, ramped, blank, blank, value.ravel(), 0 * pose, joint, 2 * side - 1, pose)
+
+
+@pytest.mark.parametrize(("repeats", "unequal"), [(2, 0.0), (2, 0.5), (2, 0.8), (3, 0.5), (5, 0.5)])
+def test_intervals_of_repeated_ramps_hold_what_they_promise(panda, repeats, unequal):
+    """95 % of the intervals about the mean of a few ramps hold the truth, also where joints scatter unequally."""
+    rng, held = np.random.default_rng(0), []
+    for _ in range(400):
+        sigma = 1e-3 * panda.tau_max[:, None] * np.exp(unequal * rng.standard_normal((7, 2)))
+        found = seen(1.0 + sigma[..., None] * rng.standard_normal((7, 2, repeats)))
+        error, freedom = certainty(found, panda.tau_max)
+        held.append(np.abs(found.command - 1.0) < student.ppf(0.975, freedom) * error)
+    assert 0.94 < np.mean(held) < 0.99  # 5600 intervals: +- 0.003
+
+
+def test_one_ramp_is_not_a_certainty(panda):
+    """Without a repeat the width is the stated one; where only some joints were repeated, theirs in proportion."""
+    once = seen(np.ones((7, 2, 1)))
+    error, _ = certainty(once, panda.tau_max)
+    np.testing.assert_allclose(error, np.repeat(REPEATS * panda.tau_max[:, None], 2, 1))
+    value = np.full((7, 2, 2), np.nan)
+    value[..., 0] = 1.0
+    value[0] = [[0.9, 1.1], [0.9, 1.1]]
+    value[6, 1] = np.nan
+    error, freedom = certainty(seen(value), panda.tau_max)
+    assert np.isnan(error[6, 1])
+    spread = 0.2 / np.sqrt(2)
+    np.testing.assert_allclose(error[:4, 0], spread / np.sqrt([2, 1, 1, 1]))
+    np.testing.assert_allclose(error[4, 0], spread * panda.tau_max[4] / panda.tau_max[0])
+    assert freedom[:2, 0].tolist() == [3, 2]
+    same = certainty(replace(seen(np.ones((7, 2, 2))), resolution=np.full((7, 2), 3e-3)), panda.tau_max)
+    np.testing.assert_allclose(same.sigma, 3e-3 / np.sqrt(2))  # ramps that agree are as good as their fit
 
 
 # --- files and mistakes

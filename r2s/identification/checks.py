@@ -11,7 +11,13 @@ from r2s.recordings.recording import Recording
 
 
 def check_recording(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording is not of this arm, leaves its limits, hardly moves or is in other units."""
+    """Raise UserError if a user's recording does not fit the arm (`check_motion`) or is in other units."""
+    check_motion(robot, recording)
+    check_numbers(robot, recording)
+
+
+def check_motion(robot: Robot, recording: Recording) -> None:
+    """Raise UserError if the recording is not of this arm, leaves its limits or hardly moves."""
     if recording.n_joints != robot.n:
         raise UserError(f"the recording has {recording.n_joints} joints, {robot.name} has {robot.n}")
     _check_limits(robot, recording, "the recording")
@@ -21,7 +27,6 @@ def check_recording(robot: Robot, recording: Recording) -> None:
             f"the recording has not enough motion to identify anything: {recording.duration:.2f} s in which the "
             f"joint that moves most moves {moved.max():.4f} rad; at least 1 s and {MOVED:g} rad are needed"
         )
-    check_numbers(robot, recording)
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:

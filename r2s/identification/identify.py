@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.breakaway import Breakaway, breakaway
-from r2s.identification.checks import check_recording
+from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import scan_breakaway
 from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, searched
@@ -65,7 +65,7 @@ def identify(
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
     """
-    check_recording(robot, recording)
+    check_motion(robot, recording)
     names = [f.name for f in FAMILIES]
     bounds, prior, terms, family = settings.bounds, settings.prior, settings.terms, settings.family
     folds = settings.folds
@@ -104,7 +104,7 @@ def identify(
             window_s=settings.window_s,
             stride=settings.stride,
             slowest=slowest,
-            edges=None if ramps is None else _reached(breakaway(ramps), np.array([-np.inf, np.inf])),
+            edges=None if ramps is None else _not_held(breakaway(ramps).command),
             batch=batch,
             nthread=nthread,
         )
@@ -134,17 +134,18 @@ def identify(
     scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=told)
     if ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
-        command = _reached(edges, nominal.breakaway)
+        command = _commands(edges, dynamics)
         if not nominal.family.has_memory:
-            dynamics = replace(dynamics, breakaway=command + dynamics.offset[:, None])
+            dynamics = replace(space, break_command=command).dynamics(space.from_unit(u))
             found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, None)})
-            command = np.asarray(found["edges"]) - dynamics.offset[:, None]
+            fine = np.asarray(found["edges"]) - dynamics.offset[:, None]
+            command = np.where(edges.count > 0, fine, command)
         space = replace(space, break_command=command)
     elif settings.breakaway and recording.torque == "commanded":
         found = step("breakaway", lambda: {"edges": scan(robot, dynamics, recording, settings.breakaway)})
         space = replace(space, nominal=replace(nominal, breakaway=np.asarray(found["edges"])))
     sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
-    return conclude(problem, space, sure, pd.DataFrame(history), families, None if edges is None else edges.spread)
+    return conclude(problem, space, sure, pd.DataFrame(history), families, edges)
 
 
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
@@ -164,6 +165,15 @@ def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Rep
     return search(problem, start, report) if needed else u
 
 
-def _reached(edges: Breakaway, otherwise: np.ndarray) -> np.ndarray:
-    """Return (n, 2) Nm, the commands at which joints let go; `otherwise` where no ramp got that far."""
-    return np.where(np.isnan(edges.command), otherwise, edges.command)
+def _not_held(command: np.ndarray) -> np.ndarray:
+    """Return (n, 2) Nm, the commands at which joints let go; without end where no ramp got that far."""
+    return np.where(np.isnan(command), [-np.inf, np.inf], command)
+
+
+def _commands(edges: Breakaway, dynamics: Dynamics) -> np.ndarray:
+    """Return (n, 2) Nm, the commands at which joints let go; NaN, the nominal edge, where no ramp got that far.
+
+    Where the joint was held against more than the nominal edge and offset say, that much is known of the edge.
+    """
+    beyond = np.abs(edges.tried + dynamics.offset[:, None]) > np.abs(dynamics.breakaway)
+    return np.where(np.isnan(edges.command) & beyond & (edges.tried != 0), edges.tried, edges.command)

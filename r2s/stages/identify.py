@@ -310,6 +310,8 @@ def identify(cfg, overrides):
             "decided_by_the_prior": [{"share_of_prior_left": round(s, 2), **v} for s, v in found.null_directions],
             "families_compared": found.families,
         }
+        if found.edges is not None and found.edges.open:
+            note["breakaway_unknown"] = found.edges.open
         save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         write_description(run.folder / "model", robot, found.dynamics)
