@@ -221,6 +221,11 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
         for key in ("torque_rmse_Nm", "nominal_torque_rmse_Nm", "position_rmse_mrad", "nominal_position_rmse_mrad"):
             assert len(errors[side][key]) == 7
         assert "0.1" in errors[side]["ee_error_mm"]
+    first = []
+    for side in ("train", "validation"):
+        with np.load(identified / f"{side}.npz") as file:
+            first.append(file["dq"][0])
+    assert not np.any(first[0] == first[1])  # at rest there is only noise: each recording has its own
     parameters = yaml.safe_load((identified / "parameters.yaml").read_text())["parameters"]
     assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset", "delay"}
     assert parameters["phi1"]["unit"] == "Nm"

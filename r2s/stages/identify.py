@@ -108,16 +108,18 @@ class File:
             check_number("data.period", self.period, "(0, inf)")
 
 
-def record_motion(cfg, robot, motion, seed, label):
-    """Return the recording of a motion; without one, of the best that was found for data.seconds."""
+def record_motion(cfg, robot, motion, k, label):
+    """Return the k-th recording, of a motion; without one, of the best that was found for data.seconds."""
     from r2s.arm.tracking import record
     from r2s.excitation.fourier import fourier
     from r2s.progress import Progress
 
     progress = Progress(label)
     if motion is None:
-        motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=cfg.data.torque == "measured")
-    with opened_source(cfg, robot, seed) as arm:  # one client at a time, and the next recording is another
+        motion = fourier(
+            robot, duration=cfg.data.seconds, seed=cfg.data.excitation_seed + k, gravity=cfg.data.torque == "measured"
+        )
+    with opened_source(cfg, robot, k) as arm:  # one client at a time, and the next recording is another
         out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
     return motion, out
@@ -131,7 +133,7 @@ def record_ramps(cfg, robot):
     if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
         return None
     progress = Progress("ramp the joints until they move")
-    with opened_source(cfg, robot, cfg.data.excitation_seed + 2) as arm:
+    with opened_source(cfg, robot, 2) as arm:
         poses = poses_about(robot, cfg.data.ramp_poses)
         out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
     progress.close(f"{out.recording.duration:.1f} s of ramps")
@@ -208,17 +210,17 @@ def recorded(cfg, robot, run, motion):
     from r2s.recordings.ramps import read_ramps
     from r2s.recordings.readers import read
 
-    def one(name, motion, seed):
+    def one(name, motion, k):
         path = run.folder / f"{name}.npz"
         if not path.is_file():
-            motion, out = record_motion(cfg, robot, motion, seed, f"record {name} motion")
+            motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
             motion.save(run.folder / f"excitation_{name}.csv")
             out.save(path)
         return read(path, torque=cfg.data.torque)
 
     try:
-        train = one("train", motion, cfg.data.excitation_seed)
-        validation = one("validation", None, cfg.data.excitation_seed + 1)
+        train = one("train", motion, 0)
+        validation = one("validation", None, 1)
         path = run.folder / "ramps.npz"
         ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot)
         if ramps is not None and not path.is_file():
