@@ -73,7 +73,7 @@ MISTAKES = {
     ),
     "tau of two joints": (lambda r: {"tau": turned(r.tau, SWAP)}, "columns 4, 2 of tau fit joints 2, 4"),
     "dq in deg/s": (lambda r: {"dq": np.degrees(r.dq)}, "is 57.3 times the slope of its q: deg/s, not rad/s?"),
-    "dq in mrad/s": (lambda r: {"dq": 1e3 * r.dq}, "is 1e+03 times the slope of its q: mrad/s, not rad/s?"),
+    "dq in mrad/s": (lambda r: {"dq": 1e3 * r.dq}, "is 1000 times the slope of its q: mrad/s, not rad/s?"),
     "dq of one joint in deg/s": (
         lambda r: {"dq": r.dq * np.where(SIGNS < 0, 57.3, 1.0)},
         "dq of joint 3 is 57.3 times the slope of its q",
@@ -86,6 +86,11 @@ MISTAKES = {
     "-dq of one joint": (
         lambda r: {"dq": SIGNS * r.dq},
         "dq of joint 3 is of the other sign than the slope of its q",
+    ),
+    "dq of nothing": (lambda r: {"dq": 0 * r.dq}, "dq of joints 1, 2, 3, 4, 5, 6, 7 is 0 rad/s in every row"),
+    "dq of something else": (
+        lambda r: {"dq": np.where(SIGNS < 0, np.sin(5.1 * r.t)[:, None], r.dq)},
+        "dq of joint 3 does not follow the slope of its q",
     ),
     "dq shifted": (
         lambda r: {"dq": turned(r.dq, SHIFT)},

@@ -69,6 +69,12 @@ def check_numbers(robot: Robot, recording: Recording) -> None:
     if len(rows) < LEAST_ROWS:
         return
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int)]
+    dead = np.flatnonzero(moved & (np.ptp(recording.dq, axis=0) == 0))
+    if len(dead):
+        raise UserError(
+            f"the recording: dq of joint{_listed(dead)} is {recording.dq[0, dead[0]]:g} rad/s in every row, though q "
+            "moves; leave dq out of the file, and it is derived"
+        )
     _check_velocity(dq[rows], smooth.dq[rows])
     m = Moments(smooth.q[rows], dq[rows], smooth.derivative(dq)[rows], smooth.tau[rows])
     _check_torque(robot, m, recording, moved)
@@ -102,8 +108,14 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
         known = abs(np.log(near / abs(ratio))) < 0.3
         unit = f": {UNITS['dq'][near]}, not rad/s?" if known and UNITS["dq"][near] else ""
         unit = unit or (": q is not in rad, or t not in s?" if known else "")
-        what = what or f"{ratio:.3g} times"
+        what = what or f"{ratio:.{3 if abs(ratio) < 999.5 else 4}g} times"
         raise UserError(f"the recording: dq of joint{_listed(seen[bad])} is {what} the slope of its q{unit}")
+    strange = np.flatnonzero((own > WRONG) & (size[seen] > 3 * MOVING))
+    if len(strange):
+        raise UserError(
+            f"the recording: dq of joint{_listed(seen[strange])} does not follow the slope of its q "
+            f"({100 * own[strange[0]]:.0f} % is something else)"
+        )
 
 
 def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndarray) -> None:

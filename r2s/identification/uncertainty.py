@@ -57,9 +57,9 @@ class Identified:
     def saved(self) -> tuple[ParameterSpace, Estimate]:
         """What goes into parameters.yaml: the result, with ramped edges of the dead zone as blocks of their own.
 
-        Their interval is Student's (r2s/identification/repeatability.py). An edge that no ramp got to lies somewhere
-        from the command that the joint was held against to the bound; it is not identifiable, and has one value in
-        all draws.
+        Their interval is Student's (r2s/identification/repeatability.py), with what the offset adds. An edge that no
+        ramp got to lies somewhere from the command that the joint was held against to the bound; it is not
+        identifiable, and has one value in all draws.
         """
         if self.edges is None:
             return self.space, self.found
@@ -68,9 +68,10 @@ class Identified:
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # with the offset
         edges = np.where(got, edges + scale * np.random.default_rng(0).standard_t(freedom, edges.shape), x)
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
-        half = student.ppf(0.975, freedom) * scale
+        half = np.hypot(student.ppf(0.975, freedom) * scale, moves)
         held = self.edges.tried + self.dynamics.offset[:, None]
         low, high = np.where(got, x - half, held), np.where(got, x + half, held)
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -MOST_EDGE), np.minimum(high[:, 0], 0.0)

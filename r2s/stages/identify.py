@@ -17,7 +17,7 @@ from r2s.stages.build import (
     plain,
 )
 
-KNOWN = 0.3  # share of a validation motion that may come in the training motion too, such as the way to a start
+KNOWN = 0.2  # share of a validation motion that may come in the training motion too, such as the way to a start
 WHY = {
     "arm": "only data=arm moves an arm",
     "inertia": "calibration= says what the links are",
