@@ -14,6 +14,7 @@ TOLERANCE = 0.01  # rad RMS: what the same motion differs by
 MOVES = 3.0  # standard deviation of a joint's motion that counts, in tolerances: ten from end to end
 OVERLAP_S = 0.5  # of motion that comes again, at least
 PAUSE_S = 60.0  # a log that pauses for longer goes on with another motion
+COMPARED = 60  # tracks that each is compared with, and pieces that are looked for: time goes with them
 PIECE_S, PIECE_MOVES = 1.0, 0.3  # s, rad: the least of a piece of motion that is looked for in another recording
 
 
@@ -59,7 +60,7 @@ def comes_again(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
     for k, b in enumerate(tracks):
         if period is None and (lag := _own_lag(b, tolerance)):
             period = lag * STEP
-        for i, a in enumerate(tracks[:k]):
+        for i, a in enumerate(tracks[: min(k, COMPARED)]):
             if (other := _lag(a, b, tolerance)) is not None:
                 shift[k] = shift[i] + a.start + other * STEP - b.start
                 found = True
@@ -73,6 +74,7 @@ def comes_again(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
 def share_known(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return which share of the motion of `other` comes in `training` too, the same in every joint: 0 to 1."""
     pieces = [piece for track in other for piece in _pieces(track.q)]
+    pieces = pieces[:: 1 + len(pieces) // COMPARED]
     known = 0
     for piece in pieces:
         for track in training:
