@@ -18,8 +18,8 @@ from r2s.identification.prediction import prediction_errors
 
 def one(seed: int) -> dict:
     """Return what came out for one twin."""
-    train, validation = (record(Twin(ROBOT, seed), fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1))
-    ramps = ramp(Twin(ROBOT, seed), poses_about(ROBOT, 2))
+    train, validation = (record(Twin(ROBOT, seed, noise=s), fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1))
+    ramps = ramp(Twin(ROBOT, seed, noise=2), poses_about(ROBOT, 2))
     began = time.perf_counter()
     found = identify(ROBOT, OLD, train, searches("staged"), how(family="auto"), ramps=ramps)
     seconds = time.perf_counter() - began

@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import conf
+from scipy.stats import t as student
 
 from r2s.arm import twin as hidden
 from r2s.arm.interface import ArmStopped
@@ -12,9 +14,11 @@ from r2s.arm.ramp import MARGIN, ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
-from r2s.identification.breakaway import breakaway
+from r2s.identification.breakaway import Breakaway, breakaway
+from r2s.identification.checks import check_ramps
+from r2s.identification.repeatability import REPEATS, certainty
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.recordings.ramps import Ramps
+from r2s.recordings.ramps import Ramps, read_ramps
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
 
@@ -247,13 +251,60 @@ def test_what_does_not_move_is_listed_and_the_rest_survives():
     assert np.isnan(found.command[0]).all()
 
 
+# --- how sure it is
+
+
+def seen(value):
+    """Return what ramps with these results (n, 2, K) Nm, NaN where a joint did not let go, say."""
+    n, _, repeats = value.shape
+    joint, side, pose = (x.ravel() for x in np.meshgrid(*(range(k) for k in value.shape), indexing="ij"))
+    count = (~np.isnan(value)).sum(-1)
+    spread = np.full((n, 2), np.nan)
+    spread[count > 1] = np.nanstd(value[count > 1], -1, ddof=1)
+    command = np.where(count > 0, np.nansum(value, -1) / np.maximum(count, 1), np.nan)
+    blank = np.zeros((n, 2))
+    ramped = np.full((n, 2), repeats)
+    return Breakaway(command, spread, count, ramped, blank, blank, value.ravel(), 0 * pose, joint, 2 * side - 1, pose)
+
+
+@pytest.mark.parametrize(("repeats", "unequal"), [(2, 0.0), (2, 0.5), (2, 0.8), (3, 0.5), (5, 0.5)])
+def test_intervals_of_repeated_ramps_hold_what_they_promise(panda, repeats, unequal):
+    """95 % of the intervals about the mean of a few ramps hold the truth, also where joints scatter unequally."""
+    rng, held = np.random.default_rng(0), []
+    for _ in range(400):
+        sigma = 1e-3 * panda.tau_max[:, None] * np.exp(unequal * rng.standard_normal((7, 2)))
+        found = seen(1.0 + sigma[..., None] * rng.standard_normal((7, 2, repeats)))
+        error, freedom = certainty(found, panda.tau_max)
+        held.append(np.abs(found.command - 1.0) < student.ppf(0.975, freedom) * error)
+    assert 0.94 < np.mean(held) < 0.99  # 5600 intervals: +- 0.003
+
+
+def test_one_ramp_is_not_a_certainty(panda):
+    """Without a repeat the width is the stated one; where only some joints were repeated, theirs in proportion."""
+    once = seen(np.ones((7, 2, 1)))
+    error, _ = certainty(once, panda.tau_max)
+    np.testing.assert_allclose(error, np.repeat(REPEATS * panda.tau_max[:, None], 2, 1))
+    value = np.full((7, 2, 2), np.nan)
+    value[..., 0] = 1.0
+    value[0] = [[0.9, 1.1], [0.9, 1.1]]
+    value[6, 1] = np.nan
+    error, freedom = certainty(seen(value), panda.tau_max)
+    assert np.isnan(error[6, 1])
+    spread = 0.2 / np.sqrt(2)
+    np.testing.assert_allclose(error[:4, 0], spread / np.sqrt([2, 1, 1, 1]))
+    np.testing.assert_allclose(error[4, 0], spread * panda.tau_max[4] / panda.tau_max[0])
+    assert freedom[:2, 0].tolist() == [3, 2]
+    same = certainty(replace(seen(np.ones((7, 2, 2))), resolution=np.full((7, 2), 3e-3)), panda.tau_max)
+    np.testing.assert_allclose(same.sigma, 3e-3 / np.sqrt(2))  # ramps that agree are as good as their fit
+
+
 # --- files and mistakes
 
 
 def test_ramps_come_back_as_they_were(recorded, tmp_path):
     ramps, path = recorded[0], tmp_path / "ramps.npz"
     ramps.save(path)
-    again = Ramps.load(path)
+    again = read_ramps(path)
     for field in ("joint", "sign", "pose"):
         np.testing.assert_array_equal(getattr(again, field), getattr(ramps, field))
     for field in ("t", "q", "dq", "tau", "trajectory"):
@@ -262,11 +313,108 @@ def test_ramps_come_back_as_they_were(recorded, tmp_path):
     assert (again.recording.torque, again.recording.name) == ("commanded", ramps.recording.name)
     assert [p.name for p in tmp_path.iterdir()] == ["ramps.npz"]
     assert "ends in '.csv'" in message(ramps.save, tmp_path / "ramps.csv")
-    assert "no file" in message(Ramps.load, tmp_path / "ramp.npz")
+    assert "no file" in message(read_ramps, tmp_path / "ramp.npz")
     ramps.recording.save(tmp_path / "plain.npz")
     (tmp_path / "noise.npz").write_bytes(b"\x00\x01" * 99)
-    for name in ("plain.npz", "noise.npz"):
-        assert "is not a file of ramps by r2s" in message(Ramps.load, tmp_path / name)
+    for name, said in (("plain.npz", "no column 'joint': ramps need 'joint' (from 1)"), ("noise.npz", "not an .npz")):
+        assert said in message(read_ramps, tmp_path / name)
+
+
+def own_ramps(each=0.35, hz=500):
+    """Return a user's columns: five ramps of three joints, t from 0 in each."""
+    t = np.arange(0, each, 1 / hz)
+    ramps = []
+    for joint, sign in ((1, 1), (2, 1), (2, -1), (3, 1), (2, 1)):
+        made = by_hand(t, 0.2, flip=sign, seed=joint)
+        order = np.roll(np.arange(3), joint - 2)  # made of joint 2
+        rows = {"t": made.t, "q": made.q[:, order], "dq": made.dq, "tau_J_d": made.tau[:, order]}
+        ramps.append(rows | {"joint": np.full(len(made.t), joint), "sign": np.full(len(made.t), sign)})
+    return {k: np.concatenate([r[k] for r in ramps]) for k in ramps[0]}
+
+
+def in_file(path, columns):
+    """Write the columns as a user would: .npz, or one column a joint."""
+    if path.suffix == ".npz":
+        np.savez(path, **columns)
+        return path
+    flat = {}
+    for name, x in columns.items():
+        flat |= {name: x} if x.ndim == 1 else {f"{name}{j + 1}": x[:, j] for j in range(x.shape[1])}
+    frame = pd.DataFrame(flat)
+    frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+def test_ramps_of_a_users_own(tmp_path, suffix):
+    """Columns of any format, with and without dq; the third ramp of joint 2 is its second repeat upwards."""
+    columns = own_ramps()
+    for some in (columns, {k: v for k, v in columns.items() if k != "dq"}):
+        ramps = read_ramps(in_file(tmp_path / f"ramps{suffix}", some), n_joints=3)
+        assert ramps.joint.tolist() == [0, 1, 1, 2, 1]
+        assert ramps.sign.tolist() == [1, 1, -1, 1, 1]
+        assert ramps.pose.tolist() == [0, 0, 0, 0, 1]
+        np.testing.assert_allclose(breakaway(ramps).value, [0.4, 0.4, -0.4, 0.4, 0.4], atol=4e-3)
+
+
+def test_where_a_ramp_ends(tmp_path):
+    """At a clock that starts anew, a trajectory, a pause; joint and sign may be told once for each ramp."""
+    columns = own_ramps()
+    back = np.flatnonzero(np.diff(columns["t"]) < 0) + 1
+    edges = [0, *back, len(columns["t"])]
+    told = {k: columns[k][edges[:-1]] for k in ("joint", "sign")}
+    each = np.repeat(np.arange(5), np.diff(edges))
+    one = {k: np.ones(len(each)) for k in ("joint", "sign")} | {
+        k: np.concatenate([columns[k][: back[0]]] * 5) for k in ("q", "tau_J_d")
+    }
+    rows = np.tile(np.arange(back[0]), 5)
+    clock = columns["t"][: back[0]]
+    for change in (
+        told,
+        told | {"t": np.arange(len(each)) * 2e-3, "trajectory": 7 - each},
+        {k: v[: len(rows)] for k, v in one.items()} | {"t": np.tile(clock, 5)},
+        {k: v[: len(rows)] for k, v in one.items()} | {"t": np.concatenate([clock + 2 * k for k in range(5)])},
+    ):
+        some = {k: v for k, v in (columns | change).items() if k != "dq"}
+        assert len(read_ramps(in_file(tmp_path / "ramps.npz", some)).joint) == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: {k: v for k, v in c.items() if k != "joint"}, "no column 'joint': ramps need 'joint' (from 1)"),
+        (lambda c: {k: v for k, v in c.items() if k != "sign"} | {"sgn": c["sign"]}, "did you mean 'sgn'?"),
+        (lambda c: {k: v for k, v in c.items() if k != "tau_J_d"} | {"tau_J": c["tau_J_d"]}, "tau_J is measured"),
+        (lambda c: c | {"joint": c["joint"] - 1}, "joint of ramp 1 is 0, allowed 1 to 3"),
+        (lambda c: c | {"joint": c["joint"] + 1}, "joint of ramp 4 is 4, allowed 1 to 3"),
+        (lambda c: c | {"joint": 4 - c["joint"]}, "the command that changes is that of joint 1"),
+        (lambda c: c | {"joint": c["joint"] + 0.5}, "joint of ramp 1 is 1.5, allowed 1 to 3"),
+        (lambda c: c | {"sign": 2 * c["sign"]}, "sign of ramp 0 is 2, allowed -1 or 1"),
+        (lambda c: c | {"sign": -c["sign"]}, "sign -1, but its command does not fall: it goes the other way"),
+        (lambda c: c | {"sign": c["sign"][:9]}, "sign is (9,); it must have a value for each of"),
+        (lambda c: c | {"t": 1e3 * c["t"]}, "t must be in seconds"),
+        (lambda c: c | {"q": c["q"][:, :2], "tau_J_d": c["tau_J_d"][:, :2], "dq": c["dq"][:, :2]}, "q has 2 joints"),
+    ],
+)
+def test_a_wrong_file_of_ramps_gets_one_line(tmp_path, change, said):
+    path = in_file(tmp_path / "ramps.npz", change(own_ramps()))
+    text = message(read_ramps, path, n_joints=3)
+    assert text.startswith(str(path))
+    assert said in text
+
+
+def test_ramps_of_another_arm_or_in_other_units_are_refused(panda):
+    motion = by_hand(np.arange(0, 0.4, 1e-3), 0.2)
+    assert "the ramps have 3 joints, panda has 7" in message(check_ramps, panda, Ramps(motion, 1, 1))
+    at_home = {"q": panda.q_home + np.zeros((len(motion.t), 7)), "dq": np.zeros((len(motion.t), 7))}
+    tau = np.zeros((len(motion.t), 7))
+    tau[:, 3] = 1e3 * np.linspace(0, 0.8, len(tau))
+    ramps = Ramps(replace(motion, **at_home, tau=tau), 3, 1)
+    assert "command of joint 4 reaches 800 Nm, panda has at most 87; is it in mNm?" in message(
+        check_ramps, panda, ramps
+    )
+    turned = Ramps(replace(motion, **at_home | {"q": np.degrees(at_home["q"])}, tau=1e-3 * tau), 3, 1)
+    assert "degrees?" in message(check_ramps, panda, turned)
 
 
 def test_bad_input_is_named_in_one_line(panda, truth):

@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from multiprocessing import forkserver
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -25,6 +26,7 @@ from conftest import REAL, ROOT, conf
 
 from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
+from r2s.physics.robot import load_robot
 
 TOY = ["+experiment=toy"]
 
@@ -103,13 +105,23 @@ def root(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
-    """A commanded recording of two seconds, as CSV with q1..q7 columns."""
+    """A recording of two seconds of a Panda with viscous friction, as CSV with q1..q7 columns and both torques."""
     path = tmp_path_factory.mktemp("data") / "log.csv"
     t = np.arange(2000) * 1e-3
-    q = np.outer(1 - np.cos(2 * t), np.linspace(0.1, 0.2, 7)) + np.array([0, -0.8, 0, -2.3, 0, 1.6, 0.8])
-    dq = np.outer(2 * np.sin(2 * t), np.linspace(0.1, 0.2, 7))
-    head = ",".join(["t", *(f"{name}{j}" for name in ("q", "dq", "tau") for j in range(1, 8))])
-    np.savetxt(path, np.column_stack([t, q, dq, 2 * dq]), delimiter=",", header=head, comments="")
+    swing = np.linspace(0.1, 0.2, 7)
+    q = np.outer(1 - np.cos(2 * t), swing) + np.array([0, -0.8, 0, -2.3, 0, 1.6, 0.8])
+    dq, ddq = np.outer(2 * np.sin(2 * t), swing), np.outer(4 * np.cos(2 * t), swing)
+    torques = []
+    for gravity in (True, False):
+        model = load_robot(**conf("robot/panda")).model(gravity=gravity)
+        data, tau = mujoco.MjData(model), 2 * dq
+        for k in range(len(t)):
+            data.qpos, data.qvel, data.qacc = q[k], dq[k], ddq[k]
+            mujoco.mj_inverse(model, data)
+            tau[k] += data.qfrc_inverse
+        torques.append(tau)
+    head = ",".join(["t", *(f"{name}{j}" for name in ("q", "dq", "tau_J", "tau_J_d") for j in range(1, 8))])
+    np.savetxt(path, np.column_stack([t, q, dq, *torques]), delimiter=",", header=head, comments="")
     return path
 
 
@@ -216,6 +228,11 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
         for key in ("torque_rmse_Nm", "nominal_torque_rmse_Nm", "position_rmse_mrad", "nominal_position_rmse_mrad"):
             assert len(errors[side][key]) == 7
         assert "0.1" in errors[side]["ee_error_mm"]
+    first = []
+    for side in ("train", "validation"):
+        with np.load(identified / f"{side}.npz") as file:
+            first.append(file["dq"][0])
+    assert not np.any(first[0] == first[1])  # at rest there is only noise: each recording has its own
     parameters = yaml.safe_load((identified / "parameters.yaml").read_text())["parameters"]
     assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset", "delay"}
     assert parameters["phi1"]["unit"] == "Nm"
@@ -285,6 +302,9 @@ MISTAKES = {
     "stage=identify data=recording data.path=LOG data.torque=commanded data.validation=COPY": r"rows of the training",
     "stage=identify data=recording data.path=STILL data.torque=commanded": r"not enough motion",
     "stage=identify data=recording data.path=DEGREES data.torque=commanded": r"joint \d is at .*allows .*degrees",
+    "stage=identify data=recording data.path=MILLI data.torque=commanded": r"1000 times what panda needs.*mNm",
+    "stage=identify data=recording data.path=LOG data.torque=commanded data.validation=AGAIN": r"motion is that",
+    "stage=identify data=recording data.path=LOG data.torque=commanded data.ramps=LOG": r"no column 'joint'",
     "stage=identify friction.family=strbeck": r"no family 'strbeck'.*did you mean 'stribeck'",
     "stage=identify identify.terms.commanded=[ofset]": r"unknown term 'ofset'.*did you mean 'offset'",
     "stage=identify data.excitation=nowhere.csv": r"nowhere.csv",
@@ -366,10 +386,18 @@ def test_mistake_gets_one_line(mistake, recording, tmp_path):
     ):
         table = np.column_stack([values[:, :1], q, values[:, 8:]])
         np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
+    noise = np.random.default_rng(0).standard_normal(values.shape)
+    for name, table in (
+        ("milli", np.column_stack([values[:, :15], 1e3 * values[:, 15:]])),
+        ("again", values + noise * ([0] + [1e-4] * 7 + [1e-3] * 7 + [0.05] * 14)),
+    ):
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
     places = {
         "COPY": tmp_path / "copy.csv",
         "STILL": tmp_path / "still.csv",
         "DEGREES": tmp_path / "degrees.csv",
+        "MILLI": tmp_path / "milli.csv",
+        "AGAIN": tmp_path / "again.csv",
         "LOG": recording,
         "NAN": tmp_path / "nan.csv",
         "BACK": tmp_path / "back.csv",

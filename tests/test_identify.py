@@ -1,5 +1,6 @@
 """What was put into an arm is found again from its recording, by every search and for both kinds of torque."""
 
+import re
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
@@ -8,31 +9,35 @@ import numpy as np
 import pytest
 from conftest import REAL, conf
 from hydra.utils import instantiate
+from scipy.stats import t as student
 
 from r2s.arm.ramp import ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.tracking import record
 from r2s.errors import UserError
 from r2s.excitation.fourier import fourier
+from r2s.identification.breakaway import SIDES
 from r2s.identification.family_selection import left_out
 from r2s.identification.identify import identify
 from r2s.identification.link_inertia import LINK, inertia_scale
 from r2s.identification.parameters import parameter_space
 from r2s.identification.prediction import prediction_errors
 from r2s.identification.problem import searched
+from r2s.identification.repeatability import certainty
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.search.cmaes import CovarianceAdaptation
 from r2s.identification.search.genetic import Genetic
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
 from r2s.identification.torque_residual import TorqueResidual
-from r2s.identification.uncertainty import _settled
+from r2s.identification.uncertainty import _settled, posterior
 from r2s.identification.windows import cut_windows, replay
 from r2s.learning.randomization import Identified as Draws
 from r2s.learning.randomization import physical
 from r2s.physics.dynamics import nominal_dynamics, of_family
 from r2s.physics.friction import FAMILIES, family
 from r2s.physics.robot import load_robot
+from r2s.recordings.ramps import Ramps
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
 
@@ -162,9 +167,48 @@ def test_ramps_give_the_edges_of_the_dead_zone(found, truth):
     np.testing.assert_allclose(space.dynamics(saved.x).breakaway, edges, atol=1e-12)
     drawn = space.dynamics(saved.samples).breakaway
     np.testing.assert_allclose(drawn.mean(0), edges, atol=0.01)
-    assert np.all(drawn.std(0) >= 0.5 * found.break_spread)
     assert np.all(drawn[..., 0] <= 0)
     assert np.all(drawn[..., 1] >= 0)
+    ends = ("low", "high", "identifiable")
+    low, high, known = (np.stack([space.block(getattr(saved, k), f"breakaway_{s}") for s in SIDES], -1) for k in ends)
+    assert known.all()
+    sigma, freedom = certainty(found.edges, found.space.robot.tau_max)
+    repeats = student.ppf(0.975, freedom) * sigma
+    offset = (found.space.block(x, "offset") for x in (found.found.low, found.found.high))
+    moves = 0.5 * np.abs(np.subtract(*offset))[:, None]
+    np.testing.assert_allclose(0.5 * (high - low), np.hypot(repeats, moves), rtol=0.01)
+    assert np.mean((low < truth.breakaway) & (truth.breakaway < high)) > 0.8
+    assert 0.9 < np.mean((drawn >= low) & (drawn <= high)) < 0.99
+
+
+def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motion):
+    """Its nominal edge is no command: not reached, an interval up to the bound, and an edge that it was held against.
+
+    Joint 2 is held against more than is tried, joint 1 is not ramped upwards.
+    """
+    breaks = truth.breakaway.copy()
+    breaks[1] = -6.0, 6.0
+    stuck = ramp(SimulatedArm(arm, replace(truth, breakaway=breaks), **NOISE, seed=5), [arm.q_home], largest=1.5)
+    keep = (stuck.joint != 0) | (stuck.sign < 0)
+    rows = np.isin(stuck.recording.trajectory, np.flatnonzero(keep))
+    ramps = Ramps(stuck.recording.select(rows), stuck.joint[keep], stuck.sign[keep])
+    nominal = replace(wrong, breakaway=np.array([[-0.2, 0.25]] * 3))
+    result = run(arm, nominal, motion, [TORQUE], ramps=ramps)
+    assert list(result.edges.open) == ["joint 1, positive", "joint 2, negative", "joint 2, positive"]
+    assert result.edges.open["joint 1, positive"] == "not ramped"
+    assert re.fullmatch(r"not reached: held against 1\.(49|5) Nm", result.edges.open["joint 2, negative"])
+    edges, offset = result.dynamics.breakaway, result.dynamics.offset
+    assert edges[0, 1] == 0.25  # nominal, whatever the offset
+    held = result.edges.tried[1] + offset[1]
+    np.testing.assert_allclose(edges[1], held)
+    space, saved = result.saved
+    names = ["breakaway_negative[2]", "breakaway_positive[2]", "breakaway_positive[1]"]
+    at = [space.names.index(name) for name in names]
+    assert not saved.identifiable[at].any()
+    np.testing.assert_allclose(saved.low[at], [-10, held[1], max(offset[0], 0)])
+    np.testing.assert_allclose(saved.high[at], [held[0], 10, 10])
+    one = [space.names.index(name) for name in ("breakaway_negative[1]", "breakaway_positive[3]")]
+    assert np.all(saved.high[one] - saved.low[one] > 0.05)  # one ramp says nothing of the next one
 
 
 def test_breakaway_edges_are_found_without_ramps(directly, truth):
@@ -635,6 +679,25 @@ def test_a_prior_decides_where_the_data_cannot(arm, wrong, clean):
     assert np.abs(scales[1] - 1.0).min() > 0.1
 
 
+def test_rows_that_fill_a_window_up_make_nothing_surer():
+    """The spread of draws is not let below the residual's own variance, of the rows that say something."""
+    rng, windows, rows = np.random.default_rng(0), 40, 6
+    j, r = rng.standard_normal((windows * rows, 2)), 3.0 * rng.standard_normal(windows * rows)
+    steps = []
+    for filled in (0, 6):
+        full = np.zeros((windows, rows + filled, 3))
+        full[:, :rows] = np.column_stack([j, r]).reshape(windows, rows, 3)
+        full = full.reshape(-1, 3)
+        problem = SimpleNamespace(
+            jacobian=lambda u, full=full: (np.append(full[:, 2], u), np.concatenate([full[:, :2], np.eye(2)])),
+            clusters=np.repeat(np.arange(windows), rows + filled),
+            weight=np.ones(2),
+            start=np.zeros(2),
+        )
+        steps.append(posterior(problem, np.zeros(2), 0).steps)
+    np.testing.assert_allclose(steps[0], steps[1], rtol=1e-9)
+
+
 def test_what_is_left_out_is_not_fitted(clean):
     """Folds cover every moment once, and what is fitted keeps 0.1 s away; of repeated motion they are phases."""
     for recording, clock in ((clean, clean.t), (replace(clean, period=1.5), clean.t % 1.5)):
@@ -645,6 +708,9 @@ def test_what_is_left_out_is_not_fitted(clean):
             near = np.array([lookup[t] for t in rest.t.tolist()])
             low, high = (f(lookup[t] for t in out.t.tolist()) for f in (min, max))
             assert np.all((near <= low - 0.099) | (near >= high + 0.099))
+            if recording.period:  # on a circle: the last phases of a period are close to its first ones
+                assert np.all((low - near) % recording.period > 0.099)
+                assert np.all((near - high) % recording.period > 0.099)
             assert 0.15 < len(out.t) / len(clean.t) < 0.35
 
 

@@ -449,7 +449,7 @@ def test_impossible_dynamics_are_named(panda, change, words):
 
 
 def test_the_papers_randomization_stays_in_its_ranges(panda, paper):
-    """Phi within 10 %, tensor elements within 5 %, every tensor physical, each element a draw of its own."""
+    """Phi within 10 %, tensor elements within 5 %, every tensor physical, each phi and link a draw of its own."""
     m = 400
     drawn = Around(panda, paper, phi_relative=0.10, inertia_relative=0.05)(np.random.default_rng(0), m)
     phi = drawn.phi / paper.phi
@@ -466,6 +466,23 @@ def test_the_papers_randomization_stays_in_its_ranges(panda, paper):
     assert np.abs(correlation).max() < 0.25
     for name in ("offset", "breakaway", "dq_min"):
         assert np.array_equal(getattr(drawn, name), getattr(paper, name))
+
+
+def test_tensors_are_uniform_over_what_is_physical(panda, paper):
+    """What the docstring says of the Panda at 5 %: how alike elements are, and that each of them spans its range."""
+    m = 4000
+    drawn = Around(panda, paper, phi_relative=0.0, inertia_relative=0.05)(np.random.default_rng(0), m)
+    elements = (drawn.inertia / paper.inertia)[..., *np.triu_indices(3)]
+    span = elements.std(0) / (0.05 / np.sqrt(3))  # of a uniform draw
+    assert span.min() > 0.7
+    assert np.all(elements.min(0) < 0.953)
+    assert np.all(elements.max(0) > 1.047)
+    alike = np.abs([np.corrcoef(link.T) - np.eye(6) for link in elements.transpose(1, 0, 2)])
+    assert alike[0, 0, 3] == pytest.approx(0.97, abs=0.01)
+    assert np.all(alike[[1, 2, 4, 5]].max((1, 2)) < 0.6 + 0.05)
+    assert np.all(alike[[3, 6]].max((1, 2)) < 5 / np.sqrt(m))
+    across = np.corrcoef(elements.reshape(m, -1).T).reshape(7, 6, 7, 6)
+    assert max(np.abs(across[i, :, k]).max() for i in range(7) for k in range(i)) < 5 / np.sqrt(m)
 
 
 @pytest.mark.parametrize("inertia", ["nominal", "paper"])

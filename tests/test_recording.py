@@ -242,6 +242,66 @@ def test_one_trajectory_is_cut_once_with_a_gap():
     assert len(validation.t) == pytest.approx(1000, abs=2)
 
 
+@pytest.mark.parametrize("late", [0.0, 1.5])
+def test_repeats_whose_clock_restarts_are_held_out_by_phase(tmp_path, late):
+    """One motion three times, each from t = 0, the second started `late` into it: nothing held out is trained on."""
+    t = np.arange(0, 6, 5e-3)
+    starts = [t, t[t >= late] - late, t[: len(t) // 2]]
+    when = np.concatenate([t, t[t >= late], t[: len(t) // 2]])  # in terms of the motion
+    q = np.stack([np.sin(0.4 * when**2), np.cos(0.3 * when**2)], -1)
+    rng = np.random.default_rng(0)
+    q, dq, tau = (x + 1e-4 * rng.standard_normal(x.shape) for x in (q, 0 * q, q))
+    np.savez(tmp_path / "repeats.npz", t=np.concatenate(starts), q=q, dq=dq, tau_J=tau)
+    r = read(tmp_path / "repeats.npz", torque="measured")
+    assert [s.stop - s.start for s in r.stretches] == [len(x) for x in starts]
+    phased = r.in_phase()
+    np.testing.assert_allclose(phased.t, when, atol=0.02 if late else 1e-12)
+    assert phased.period == pytest.approx(6.0, abs=0.03)
+    train, validation = phased.split(0.25)
+    motion = dict(zip(q[:, 0].tolist(), when.tolist(), strict=True))
+    held, fitted = ([motion[x] for x in part.q[:, 0].tolist()] for part in (validation, train))
+    assert min(held) - max(fitted) > SPLIT_GUARD_S - 0.03
+    assert len(held) + len(fitted) > 0.9 * len(when)
+
+
+def test_repeats_started_by_hand_are_seen_and_other_motion_is_not():
+    """The same motion at 0, 11.3 and 30 s of one clock has one phase; trajectories of other motion keep the clock."""
+    t = np.arange(0, 5, 0.01)
+    clock = np.concatenate([t, t + 11.3, t + 30.0])
+    q = np.tile(np.stack([np.sin(0.4 * t**2), np.cos(0.3 * t**2)], -1), (3, 1))
+    made = {"dq": 0 * q, "tau": q, "torque": "measured", "trajectory": np.repeat([0, 1, 2], len(t))}
+    phased = Recording(clock, q, **made).in_phase()
+    assert np.ptp((phased.t % phased.period).reshape(3, -1), axis=0).max() < 0.03
+    other = np.concatenate([q[: len(t)], q[: len(t)] * [1.0, -1.0] + 0.2, 0.5 * q[: len(t)]])
+    apart = Recording(np.tile(t, 3), other, **made)
+    assert apart.in_phase() is apart
+
+
+def test_slow_motion_is_not_taken_for_repeated_motion():
+    """At 0.01 rad/s the arm is where it was half a second ago; that is no period."""
+    t = np.arange(0, 60, 0.02)
+    q = 0.01 * t[:, None] * [1.0, -1.0]
+    assert Recording(t, q, 0 * q, q, "measured").repeats_after() is None
+
+
+def test_motion_that_is_known_from_another_recording():
+    """The same with other noise, later, on another clock is known; a faster, a mirrored, another motion is not."""
+    t, rng = np.arange(0, 10, 2e-3), np.random.default_rng(0)
+
+    def moved(when, scale=(1.0, 1.0)):
+        q = np.stack([np.sin(0.3 * when**1.7), np.cos(0.2 * when**1.8)], -1) * scale
+        return Recording(t, q + 1e-3 * rng.standard_normal(q.shape), 0 * q, q, "measured")
+
+    first = moved(t)
+    again = moved(t)
+    assert again.known_from(first) == 1.0
+    late = again.select(again.t > 3.3)
+    assert replace(late, t=late.t + 100.0).known_from(first) == 1.0
+    for other in (moved(1.1 * t), moved(t, (1.0, -1.0)), moved(t + 7.0, (0.8, 1.0))):
+        assert other.known_from(first) < 0.2
+    assert moved(0 * t).known_from(first) == 0.0
+
+
 def test_a_split_that_cannot_be_is_refused():
     r = sine(np.arange(500) * 1e-3)
     assert "between 0 and 1" in message(r.split, 1.5)

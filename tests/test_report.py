@@ -19,7 +19,9 @@ import rerun as rr
 from matplotlib.image import imread
 from rerun.chunk import RrdReader
 from rich.console import Console
+from scipy.stats import t as student
 
+from r2s.identification.breakaway import Breakaway
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import Estimate, parameter_space
 from r2s.identification.prediction import prediction_errors
@@ -365,14 +367,21 @@ def test_breakaway_is_told_as_it_was_measured(panda, identified, recording):
     sections = everything(panda, scanned, recording, nominal=old)
     assert tables_of(sections, "Table II:")[0].loc["1"].tolist() == ["0", "-0.3", "0", "0.4"]
     assert "looked for in the recording" in words_of(sections)
-    spread = np.full((7, 2), 0.01)
-    spread[6, 1] = np.nan
-    ramped = tables_of(everything(panda, replace(scanned, break_spread=spread), recording, nominal=old), "Table II:")[
-        0
-    ]
-    assert ramped.loc["1", "negative\n95 % interval"] == "[-0.32, -0.28]"
+    spread, count, tried = np.full((7, 2), 0.01), np.full((7, 2), 2), np.zeros((7, 2))
+    spread[6, 1], spread[5, 1], count[6, 1], count[5, 1], tried[6, 1] = np.nan, np.nan, 0, 1, 0.7
+    rest = {"ramped": 0 * count + 2, "tried": tried, "resolution": 0 * tried, "command": edges}
+    rest |= dict.fromkeys(("value", "misfit", "joint", "sign", "pose"), np.zeros(0))
+    ramps = replace(scanned, edges=Breakaway(spread=spread, count=count, **rest))
+    ramped = tables_of(everything(panda, ramps, recording, nominal=old), "Table II:")[0]
+    half = student.ppf(0.975, 3) * 0.01 / np.sqrt(2)
+    assert ramped.loc["1", "negative\n95 % interval"] == f"[{-0.3 - half:.3g}, {-0.3 + half:.3g}]"
     assert ramped.loc["1", "positive\nrepeatability"] == "0.01"
-    assert ramped.loc["7", "positive\nrepeatability"] == ramped.loc["7", "positive\n95 % interval"] == "-"
+    assert ramped.loc["6", "positive\nrepeatability"] == "-"
+    assert ramped.loc["7", "positive\nrepeatability"] == "not reached"
+    assert ramped.loc["7", "positive\nnew"] == "0.4 ?"
+    assert ramped.loc["7", "positive\n95 % interval"] == f"[{0.7 + identified.dynamics.offset[6]:.3g}, 10]"
+    terminal = identification_tables(panda, ramps, {})["breakaway, Nm"]
+    assert terminal.loc["positive", "joint 7"] == "0.4\nnot reached\nheld against 0.7 Nm"
     measured = replace(recording, torque="measured")
     assert not tables_of(everything(panda, scanned, measured, nominal=old), "Table II:")
 

@@ -83,6 +83,15 @@ def test_an_episode_does_not_depend_on_the_one_before():
     assert not np.array_equal(second, drive(Twin(panda(), 2), 200))
 
 
+def test_two_recordings_of_a_robot_have_noise_of_their_own():
+    """The robot and its motion are those of the seed; the sensors' noise of another stream is another one."""
+    first, second = (drive(Twin(panda(), 2, noise=k), 200)[:, :14] for k in (0, 1))
+    assert np.array_equal(first, drive(Twin(panda(), 2), 200)[:, :14])
+    off = (first - second).reshape(len(first), 2, 7)
+    assert np.all(off.std(0) > 0)
+    assert np.abs(off[:, 0]).max() < 2e-4  # encoders
+
+
 def push(arm, target, cycles):
     for _ in range(cycles):
         arm.command(ramp(arm, target))

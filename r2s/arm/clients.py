@@ -33,22 +33,24 @@ def fr3(robot: Robot, *, address: str, realtime: bool = True) -> Iterator[FR3]:
         yield arm
 
 
-def panda_emulated(robot: Robot, *, seed: int = 0, realtime: bool = False) -> AbstractContextManager[Franka]:
-    """Open a Panda that is emulated: libfranka's version 5, the twin `seed` behind it."""
-    return _emulated(Panda, 5, robot, seed, realtime)
+def panda_emulated(
+    robot: Robot, *, seed: int = 0, realtime: bool = False, noise: int = 0
+) -> AbstractContextManager[Franka]:
+    """Open a Panda that is emulated: libfranka's version 5, the twin `seed` behind it with the stream `noise`."""
+    return _emulated(Panda, 5, partial(Twin, robot, seed, noise=noise), realtime)
 
 
-def fr3_emulated(robot: Robot, *, seed: int = 0, realtime: bool = False) -> AbstractContextManager[Franka]:
-    """Open an FR3 that is emulated: libfranka's version 10, the twin `seed` behind it."""
-    return _emulated(FR3, 10, robot, seed, realtime)
+def fr3_emulated(
+    robot: Robot, *, seed: int = 0, realtime: bool = False, noise: int = 0
+) -> AbstractContextManager[Franka]:
+    """Open an FR3 that is emulated: libfranka's version 10, the twin `seed` behind it with the stream `noise`."""
+    return _emulated(FR3, 10, partial(Twin, robot, seed, noise=noise), realtime)
 
 
 @contextmanager
-def _emulated(
-    client: Callable[..., Franka], version: int, robot: Robot, seed: int, realtime: bool
-) -> Iterator[Franka]:
-    emulator = Emulator(partial(Twin, robot, seed), version=version, realtime=realtime)
-    with emulator as address, closing(client(robot, address, clear=lambda reason: True)) as arm:
+def _emulated(client: Callable[..., Franka], version: int, twin: partial[Twin], realtime: bool) -> Iterator[Franka]:
+    emulator = Emulator(twin, version=version, realtime=realtime)
+    with emulator as address, closing(client(twin.args[0], address, clear=lambda reason: True)) as arm:
         yield arm
 
 

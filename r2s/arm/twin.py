@@ -40,7 +40,7 @@ STOP_MARGIN = 0.1  # rad from the position limits, where the arm stops itself, t
 class Twin:
     """An `Arm` (r2s/arm/interface.py) of which only the seed is known.
 
-    The same seed and the same calls give bit-identical states. Noise restarts at every `move_to`, from a
+    The same seed, noise and calls give bit-identical states. Noise restarts at every `move_to`, from a
     stream of its own for each episode: the k-th episode of a twin has the same noise whatever the episodes
     before it did, so an evaluation on a fresh twin is reproducible. Time and bristles restart too; the robot
     drawn stays.
@@ -50,18 +50,20 @@ class Twin:
         payload: kg in the hand, a point mass that the gravity compensation does not know of.
         stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque; None: rigid. The
             encoders are on the motors' side, so that q and dq lack what the load bends; the gears do not swing.
+        noise: of the sensors, another stream for each: two recordings of one robot have not the same noise.
 
     Raises:
         UserError: a payload that is negative, a stiffness that is not above 0, or either not finite.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None):
+    def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None, noise: int = 0):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
         check_number("arm.payload", payload, "[0, inf)")
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")
         self.robot = robot
-        self._seed = int(seed)
+        check_number("arm.noise", noise, "[0, inf)", whole=True)
+        self._seed, self._stream = int(seed), int(noise)
         rng = np.random.default_rng([self._seed, 0])
         links = _draw_links(robot, rng)
         self._engine = _engine(robot, links)
@@ -127,7 +129,7 @@ class Twin:
 
     def _start(self, q: np.ndarray) -> None:
         n = self.robot.n
-        self._rng = np.random.default_rng([self._seed, 1, self._episode])
+        self._rng = np.random.default_rng([self._seed, 1, self._episode, self._stream])
         self._cycle = 0
         q = q - self._hidden[COMPLIANCE] * self._engine.gravity_torque(q)  # the motors are where was asked for
         self._q, self._dq, self._tau_J_d = q, np.zeros(n), np.zeros(n)

@@ -27,11 +27,13 @@ from r2s.recordings.ramps import Ramps
 MOVED = 5e-3  # rad; real joints and the twin creep by 1 to 3 mrad before they let go
 MIN_ROWS = 10  # up to there
 ENCODER = 2e-5  # rad, what positions are good for: the scale of residuals
+RELEASE_S = 2e-3  # s, to which the moment of release is known
 STEP = 1e-3  # s, the longest step of the fitted motion
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), and of rest (rad) and drift (rad/s) beside it
 LOW = np.log(1e-2), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
 HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
 DRIFT = 3e-4  # rad/s: a joint at rest may still settle so fast
+SIDES = "negative", "positive"
 DAMPING = np.log(10.0), 1.5  # log lambda and its spread: a weak prior, where the motion is too short to tell
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # creep length, rad; time since release, in terms of the guess
 
@@ -44,7 +46,9 @@ class Breakaway:
         command: (n, 2) Nm, negative and positive direction, the mean over ramps; NaN where none got there. Plus the
             offset these are the dead zone's edges: ramps alone tell its width, not where its middle lies.
         spread: (n, 2) Nm, standard deviation over ramps: repeatability. NaN for fewer than two.
-        count: (n, 2) ramps that got there.
+        count: (n, 2) ramps that got there. ramped: (n, 2) ramps in all.
+        tried: (n, 2) Nm, where none got there the command that the joint was held against; 0 where none was ramped.
+        resolution: (n, 2) Nm, what the fit of one ramp is good for: `RELEASE_S` times its rate.
         value: (K,) Nm, of each ramp; NaN where its joint did not let go.
         misfit: (K,) rad RMS between positions and the fitted motion; much more than the encoder's noise (or, where
             stick-slip is real, than some 5e-5) says that the motion was another.
@@ -54,6 +58,9 @@ class Breakaway:
     command: np.ndarray
     spread: np.ndarray
     count: np.ndarray
+    ramped: np.ndarray
+    tried: np.ndarray
+    resolution: np.ndarray
     value: np.ndarray
     misfit: np.ndarray
     joint: np.ndarray
@@ -64,9 +71,19 @@ class Breakaway:
     def not_reached(self) -> list[str]:
         """The ramps whose joint did not let go, as "joint 3, positive, pose 1" (counted from 1)."""
         return [
-            f"joint {self.joint[k] + 1}, {'positive' if self.sign[k] > 0 else 'negative'}, pose {self.pose[k] + 1}"
+            f"joint {self.joint[k] + 1}, {SIDES[int(self.sign[k] > 0)]}, pose {self.pose[k] + 1}"
             for k in np.flatnonzero(np.isnan(self.value))
         ]
+
+    @property
+    def open(self) -> dict[str, str]:
+        """Return in words why an edge is not known: {"joint 3, positive": "not reached: held against 2.4 Nm"}."""
+        words = {}
+        for j, side in np.argwhere(self.count == 0):
+            tried = abs(self.tried[j, side])
+            held = f"held against {tried:.3g} Nm" if tried else "no ramp tells"
+            words[f"joint {j + 1}, {SIDES[side]}"] = f"not reached: {held}" if self.ramped[j, side] else "not ramped"
+        return words
 
 
 def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED) -> Breakaway:
@@ -92,22 +109,34 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
         raise UserError(f"breakaway: moved={moved} must be at least {10 * ENCODER:g} and less than 0.1 rad")
     r, stretches = ramps.recording, ramps.recording.stretches
     value, misfit = (np.full(len(stretches), np.nan) for _ in range(2))
+    most, blur = np.zeros(len(stretches)), np.zeros(len(stretches))
     for k, (rows, j, sign) in enumerate(zip(stretches, ramps.joint, ramps.sign, strict=True)):
         t, x, u = r.t[rows] - r.t[rows.start], sign * (r.q[rows, j] - r.q[rows.start, j]), sign * r.tau[rows, j]
         end = int(np.argmax(np.abs(x) >= moved)) + 1
+        if np.abs(x).max() < moved:
+            most[k] = max(_delayed(t, u, delay, lag).max(), 0.0)
         if x[end - 1] < moved or end < MIN_ROWS:
             continue
         value[k], misfit[k] = _release(t[:end], x[:end], _delayed(t, u, delay, lag)[:end])
         value[k] *= sign
+        blur[k] = RELEASE_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
     shape = r.n_joints, 2
-    command, spread, count = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, dtype=np.int64)
+    command, spread, tried, resolution = (np.full(shape, x) for x in (np.nan, np.nan, 0.0, 0.0))
+    count, ramped = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     for j in range(r.n_joints):
         for side, sign in enumerate((-1, 1)):
-            seen = value[(ramps.joint == j) & (ramps.sign == sign) & ~np.isnan(value)]
-            count[j, side] = len(seen)
+            own = (ramps.joint == j) & (ramps.sign == sign)
+            there = own & ~np.isnan(value)
+            seen = value[there]
+            count[j, side], ramped[j, side] = len(seen), own.sum()
+            if len(seen):
+                resolution[j, side] = np.sqrt((blur[there] ** 2).mean())
+            elif own.any():
+                tried[j, side] = sign * most[own].max()
             command[j, side] = seen.mean() if len(seen) else np.nan
             spread[j, side] = seen.std(ddof=1) if len(seen) > 1 else np.nan
-    return Breakaway(command, spread, count, value, misfit, ramps.joint, ramps.sign, ramps.pose)
+    cells = command, spread, count, ramped, tried, resolution
+    return Breakaway(*cells, value, misfit, ramps.joint, ramps.sign, ramps.pose)
 
 
 def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.breakaway import Breakaway, breakaway
-from r2s.identification.checks import check_recording
+from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, searched
@@ -68,7 +68,7 @@ def identify(
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
     """
-    check_recording(robot, recording)
+    check_motion(robot, recording)
     names = [f.name for f in FAMILIES]
     bounds, prior, family = settings.bounds, settings.prior, settings.family
     terms = list(settings.terms)
@@ -119,7 +119,7 @@ def identify(
             window_s=settings.window_s,
             stride=settings.stride,
             slowest=0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min,  # bristles have no dead zone
-            edges=None if ramps is None else _reached(breakaway(ramps), np.array([-np.inf, np.inf])),
+            edges=None if ramps is None else _not_held(breakaway(ramps).command),
             batch=min(len(space.start) + 1, 64),
             nthread=nthread,
         )
@@ -168,19 +168,21 @@ def identify(
     dynamics, edges = space.dynamics(space.from_unit(u)), None
     if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
-        at_rest = StaticFriction(robot, ramps, edges)
-        dynamics = replace(dynamics, breakaway=at_rest.edges(dynamics, nominal.breakaway))
-        space = replace(space, break_command=dynamics.breakaway - dynamics.offset[:, None])
+        command = _commands(edges, dynamics)
+        dynamics = replace(space, break_command=command).dynamics(space.from_unit(u))
+        dynamics = replace(dynamics, breakaway=StaticFriction(robot, ramps, edges).edges(dynamics))
+        command = np.where(edges.count > 0, dynamics.breakaway - dynamics.offset[:, None], command)
+        space = replace(space, break_command=command)
     if commanded and not nominal.family.has_memory and (ramps is not None or settings.breakaway):
         largest = settings.breakaway if ramps is None else None
         how_long = {"window_s": settings.window_s, "stride": settings.stride, "nthread": nthread}
         found = step("stiction", lambda: stiction(robot, dynamics, recording, largest, told, **how_long))
         rule, dq_min = HOLDS[int(found["hold"])], float(found["dq_min"])
-        edges_found = np.asarray(found["edges"])
-        space = replace(space, nominal=replace(nominal, breakaway=edges_found, hold=rule, dq_min=dq_min))
+        space = replace(space, nominal=replace(space.nominal, hold=rule, dq_min=dq_min))
+        if ramps is None:
+            space = replace(space, nominal=replace(space.nominal, breakaway=np.asarray(found["edges"])))
     sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
-    spread = None if edges is None else edges.spread
-    return conclude(problem, space, sure, pd.DataFrame(history), families, spread, refused)
+    return conclude(problem, space, sure, pd.DataFrame(history), families, edges, refused)
 
 
 def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
@@ -214,6 +216,15 @@ def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Rep
     return search(problem, start, report) if needed else u
 
 
-def _reached(edges: Breakaway, otherwise: np.ndarray) -> np.ndarray:
-    """Return (n, 2) Nm, the commands at which joints let go; `otherwise` where no ramp got that far."""
-    return np.where(np.isnan(edges.command), otherwise, edges.command)
+def _not_held(command: np.ndarray) -> np.ndarray:
+    """Return (n, 2) Nm, the commands at which joints let go; without end where no ramp got that far."""
+    return np.where(np.isnan(command), [-np.inf, np.inf], command)
+
+
+def _commands(edges: Breakaway, dynamics: Dynamics) -> np.ndarray:
+    """Return (n, 2) Nm, the commands at which joints let go; NaN, the nominal edge, where no ramp got that far.
+
+    Where the joint was held against more than the nominal edge and offset say, that much is known of the edge.
+    """
+    beyond = np.abs(edges.tried + dynamics.offset[:, None]) > np.abs(dynamics.breakaway)
+    return np.where(np.isnan(edges.command) & beyond & (edges.tried != 0), edges.tried, edges.command)

@@ -50,7 +50,8 @@ class ParameterSpace:
         nominal: the dynamics that fixed blocks keep and that a search starts from.
         robot: the arm; its links are what the inertia blocks are relative to.
         break_command: (n, 2) Nm, the commands at which resting joints were seen to let go. With them the dead zone's
-            edges move along with the offset (edge = command + offset). None: edges are nominal, or blocks.
+            edges move along with the offset (edge = command + offset); NaN where none was seen: there the edge is
+            nominal. None: edges are nominal, or blocks.
     """
 
     blocks: tuple[str, ...]
@@ -145,6 +146,7 @@ class ParameterSpace:
         edges = d.breakaway
         if self.break_command is not None:
             edges = self.break_command + out.offset[..., None]
+            edges = np.where(np.isnan(edges), d.breakaway, edges)
             edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
         pair = [value(f"breakaway_{side}", edges[..., i]) for i, side in enumerate(("negative", "positive"))]
         out = replace(out, breakaway=np.stack(pair, -1))

@@ -37,14 +37,11 @@ class StaticFriction:
         pull = d.offset[..., self.joint] + drag[..., 0] * np.sin(self._q) + drag[..., 1] * np.cos(self._q)
         return self.command + pull - left
 
-    def edges(self, d: Dynamics, otherwise: np.ndarray) -> np.ndarray:
-        """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; `otherwise` without any."""
-        net, out = self.net(d), np.array(otherwise, dtype=float)
-        for j in range(len(out)):
-            for side in range(2):
-                mine = (self.joint == j) & (self.side == side)
-                if mine.any():
-                    out[j, side] = net[mine].mean()
+    def edges(self, d: Dynamics) -> np.ndarray:
+        """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; d's own without any."""
+        net, out = self.net(d), d.breakaway.copy()
+        for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
+            out[j, side] = net[(self.joint == j) & (self.side == side)].mean()
         return np.stack([np.minimum(out[:, 0], 0.0), np.maximum(out[:, 1], 0.0)], -1)
 
     def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:

@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.stats import t as student
 
+from r2s.identification.breakaway import Breakaway
 from r2s.identification.parameters import Estimate, ParameterSpace
 from r2s.identification.problem import Problem
+from r2s.identification.repeatability import certainty
 from r2s.physics.dynamics import Dynamics
 
+MOST_EDGE = 10.0  # Nm, bound of an edge of the dead zone
 DRAWS = 512  # of the joint distribution
 UNSEEN = 0.9  # of its prior's deviation: a value with so much left is hardly seen
 SHARPER = 4.0  # a parameter is identifiable when the half width of its interval is this much below its prior's sigma
@@ -28,7 +32,7 @@ class Identified:
         null_directions: combinations of parameters that only the prior decides: (share of the prior's sigma left,
             {name: part}), widest first.
         unseen: names that keep their nominal value, because the data hardly say anything of them.
-        break_spread: (n, 2) Nm, repeatability of the breakaway, where it was measured.
+        edges: what ramps said of the breakaway, where there were any.
         refused: whether replays were refused, because they disagreed with the torque of joints that move.
     """
 
@@ -38,7 +42,7 @@ class Identified:
     families: dict[str, float]
     null_directions: list[tuple[float, dict[str, float]]]
     unseen: list[str]
-    break_spread: np.ndarray | None = None
+    edges: Breakaway | None = None
     refused: bool = False
 
     @property
@@ -53,22 +57,31 @@ class Identified:
 
     @property
     def saved(self) -> tuple[ParameterSpace, Estimate]:
-        """What goes into parameters.yaml: the result, with measured edges of the dead zone as blocks of their own."""
-        if self.break_spread is None:
+        """What goes into parameters.yaml: the result, with ramped edges of the dead zone as blocks of their own.
+
+        Their interval is Student's (r2s/identification/repeatability.py), with what the offset adds. An edge that no
+        ramp got to lies somewhere from the command that the joint was held against to the bound; it is not
+        identifiable, and has one value in all draws.
+        """
+        if self.edges is None:
             return self.space, self.found
-        d, f = self.dynamics, self.found
+        f, n = self.found, self.space.n
+        x = self.dynamics.breakaway
+        sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
+        got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
-        spread = np.nan_to_num(self.break_spread, nan=0.0)
-        rng = np.random.default_rng(0)
-        edges = edges + spread * rng.standard_normal(edges.shape)
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # with the offset
+        edges = np.where(got, edges + scale * np.random.default_rng(0).standard_t(freedom, edges.shape), x)
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
-        samples = np.concatenate([f.samples, edges[..., 0], edges[..., 1]], -1)
-        x = np.concatenate([f.x, d.breakaway[:, 0], d.breakaway[:, 1]])
-        half = 1.96 * np.concatenate([spread[:, 0], spread[:, 1]])
-        n, p = self.space.n, len(f.x)
-        low, high = np.concatenate([f.low, x[p:] - half]), np.concatenate([f.high, x[p:] + half])
-        known = np.concatenate([f.identifiable, np.ones(2 * n, dtype=bool)])
-        limit = np.full(n, 10.0)
+        half = np.hypot(student.ppf(0.975, freedom) * scale, moves)
+        held = self.edges.tried + self.dynamics.offset[:, None]
+        low, high = np.where(got, x - half, held), np.where(got, x + half, held)
+        low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -MOST_EDGE), np.minimum(high[:, 0], 0.0)
+        high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], MOST_EDGE), np.maximum(low[:, 1], 0.0)
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half of it is what there is to tell
+        columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
+        own = f.x, f.low, f.high, f.identifiable, f.samples
+        limit = np.full(n, MOST_EDGE)
         space = replace(
             self.space,
             blocks=(*self.space.blocks, "breakaway_negative", "breakaway_positive"),
@@ -76,7 +89,7 @@ class Identified:
             upper=np.concatenate([self.space.upper, 0 * limit, limit]),
             break_command=None,
         )
-        return space, Estimate(x, low, high, known, samples)
+        return space, Estimate(*(np.concatenate([a, *b], -1) for a, b in zip(own, columns, strict=True)))
 
 
 class Posterior(NamedTuple):
@@ -107,7 +120,8 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
     rest, known = jacobian[rows:], residual[rows:]
     belief, pull = rest.T @ rest, rest.T @ known
-    factor = max(1.0, float(np.sqrt(np.mean(r**2))))
+    told = j.any(1)  # rows that fill a window up have neither a residual nor a slope
+    factor = max(1.0, float(np.sqrt(np.mean(r[told] ** 2)))) if told.any() else 1.0
     steps = np.empty((DRAWS, p))
     for k in range(DRAWS):
         times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
@@ -128,7 +142,7 @@ def conclude(
     sure: Mapping[str, Any],
     history: pd.DataFrame,
     families: dict[str, float],
-    break_spread: np.ndarray | None,
+    edges: Breakaway | None,
     refused: bool,
 ) -> Identified:
     """Return the result: what hardly any data spoke of goes back to nominal, and is named.
@@ -153,7 +167,7 @@ def conclude(
             null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts[:6] if abs(part) > 0.2}))
     names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
     found = Estimate(space.from_unit(u), low, high, identifiable, samples)
-    return Identified(space, found, history, families, null, names, break_spread, refused)
+    return Identified(space, found, history, families, null, names, edges, refused)
 
 
 def _settled(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

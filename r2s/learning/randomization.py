@@ -21,9 +21,14 @@ TRIES = 64
 class Around:
     """Dynamics drawn around a centre: the paper's randomization at phi 0.10 and inertia 0.05.
 
-    phi (all 21) ~ center * U(1 - phi_relative, 1 + phi_relative)
-    I_xx I_yy I_zz I_xy I_xz I_yz (all 42) ~ center * U(1 - inertia_relative, 1 + inertia_relative)
-    Each element is a draw of its own; an unphysical tensor is drawn again.
+    phi (all 21) ~ center * U(1 - phi_relative, 1 + phi_relative), each a draw of its own
+    I_xx I_yy I_zz I_xy I_xz I_yz of a link ~ U of the physical tensors with every element within center * (1 -
+        inertia_relative, 1 + inertia_relative): each drawn by itself, and an unphysical tensor drawn again
+
+    The paper says within 5 % and no more, and more cannot hold: elements that vary independently make bodies that
+    cannot exist where the triangle inequality is tight. Of the Panda's links at 5 %, 4 and 7 keep every draw. Link 1,
+    a rod (I_zz is 0.013 I_xx), keeps 22 %, with I_xx and I_yy correlated by 0.97. Links 2, 3, 5 and 6 keep 47 to
+    63 %, and no two of their elements are correlated by more than 0.6. Each element still spans its 5 %.
 
     Attributes:
         robot: the arm.

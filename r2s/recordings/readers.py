@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from r2s.errors import UserError, choices, nearest
-from r2s.recordings.recording import Recording, declared_torque
+from r2s.recordings.recording import MIN_ROWS, Recording, declared_torque
 from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra
 
 HDF5 = (".h5", ".hdf5")
@@ -27,7 +27,8 @@ DEFAULT_COLUMNS = {  # the first name that the file has
 }
 FRANKA_TAU = {"measured": "tau_J", "commanded": "tau_J_d"}  # looked for before tau
 OPTIONAL = ("dq", "trajectory")
-
+NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
+RESTART_S = 0.1  # s, from its first moment: where a clock goes back to that starts anew
 
 Spec = str | list[str] | None
 
@@ -59,30 +60,48 @@ def read(
     topic, joints, model_joints: of a bag (.bag, .db3, .mcap or a ROS 2 bag's folder), see `bag_table`.
 
     Without dq in the file it is the central difference of q on the logged time (zero phase), each trajectory
-    by itself; without trajectory, gaps alone separate them. A file by `Recording.save` comes back as it was. The
+    by itself; without trajectory, gaps separate them, and (not in a bag) a clock that goes
+    back to where it began. A file by `Recording.save` comes back as it was. The
     logs of `franka::logToCSV` and of Franka's ROS messages hold both torques: `torque` picks one.
     """
     path = Path(path).expanduser()
     bag = {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints}
-    table = _load(path, bag)
+    table = load_table(path, bag)
     try:
-        return _recording(table, torque, columns or {}, n_joints, max_gap_s, period, name or path.stem)
+        how = n_joints, max_gap_s, period, name or path.stem
+        return from_table(table, torque, columns or {}, *how, restarting=not is_bag(path))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 
 
-def _recording(table: Table, torque, columns, n_joints, max_gap_s, period, name) -> Recording:
+def from_table(
+    table: Table,
+    torque: str | None,
+    columns: Mapping[str, Spec],
+    n_joints: int | None = None,
+    max_gap_s: float | None = None,
+    period: float | None = None,
+    name: str = "",
+    restarting: bool = False,
+) -> Recording:
+    """Return the recording that a file's columns hold; arguments as in `read`, errors without the file's name.
+
+    restarting: a clock that goes back to where it began starts a new trajectory. In a bag it does not: there
+        messages of two starts may be mixed.
+    """
     notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # what `Recording.save` says about the rows
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(torque, notes.get("torque"))
-    found = {field: _find(table, field, spec, torque) for field, spec in _specs(columns).items()}
+    found = {field: find_columns(table, field, spec, torque) for field, spec in _specs(columns).items()}
     arrays = {
-        field: _vector(table, names, n_joints, field) if field in ("q", "dq", "tau") else _scalar(table, names)
+        field: _vector(table, names, n_joints, field) if field in ("q", "dq", "tau") else scalar(table, names)
         for field, names in found.items()
         if names
     }
+    if restarting and "trajectory" not in arrays and (anew := restarts(arrays["t"])) is not None:
+        arrays["trajectory"] = anew
     if not np.any(arrays["tau"]):  # a position-controlled or simulated arm fills the field, with nothing
-        raise UserError(f"tau ({_listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
+        raise UserError(f"tau ({listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
@@ -93,6 +112,19 @@ def _recording(table: Table, torque, columns, n_joints, max_gap_s, period, name)
     if max_gap_s is not None and not saved:
         recording = recording.split_at_gaps(max_gap_s)
     return replace(recording, dq=recording.derivative(recording.q)) if derive_dq else recording
+
+
+def restarts(t: np.ndarray) -> np.ndarray | None:
+    """Return the trajectories (T,) of a clock t (T,) s that starts anew for each: None where it does not.
+
+    It goes back to where it began, and then counts on. What goes back otherwise is no restart but a disorder.
+    """
+    if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
+        return None
+    runs = np.diff([0, *back, len(t)])
+    if runs.min() < MIN_ROWS or np.abs(t[back] - t[0]).max() > RESTART_S:
+        return None
+    return np.repeat(np.arange(len(runs)), runs)
 
 
 def _agreed_torque(told: str | None, stored) -> str:
@@ -114,7 +146,7 @@ def _specs(columns: Mapping[str, Spec]) -> dict[str, Spec]:
     return {field: columns.get(field) for field in DEFAULT_COLUMNS}
 
 
-def _find(table: Table, field: str, spec: Spec, torque: str) -> list[str]:
+def find_columns(table: Table, field: str, spec: Spec, torque: str = "") -> list[str]:
     """Return the columns of a field; [] where an optional one is absent."""
     defaults = DEFAULT_COLUMNS[field]
     candidates = (FRANKA_TAU[torque], *defaults) if field == "tau" else defaults
@@ -173,12 +205,11 @@ def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError
         if field == "tau" and torque and other != torque and known and not nested:
             hint = f"; {column} is {other} torque"
     of = f" ({torque} torque)" if torque and field == "tau" else ""
-    return UserError(
-        f"no column '{name}' for {field}{of}; columns: {_listed(table)}{hint} (set data.columns.{field})"
-    )
+    return UserError(f"no column '{name}' for {field}{of}; columns: {listed(table)}{hint} (set data.columns.{field})")
 
 
-def _listed(names: Iterable[str], limit: int = 40) -> str:
+def listed(names: Iterable[str], limit: int = 40) -> str:
+    """Return names for an error message, not more than `limit` of them."""
     names = list(names)
     return choices(names[:limit]) + (f", ... ({len(names)} in all)" if len(names) > limit else "")
 
@@ -192,16 +223,16 @@ def _vector(table: Table, names: list[str], n_joints: int | None, field: str) ->
     value = parts[0] if parts[0].ndim > 1 else np.stack(parts, axis=1)
     if n_joints is not None and value.ndim == 2 and value.shape[1] != n_joints:
         raise UserError(
-            f"{field} has {value.shape[1]} joints ({_listed(names)}), the robot has {n_joints}; "
+            f"{field} has {value.shape[1]} joints ({listed(names)}), the robot has {n_joints}; "
             f"a list in data.columns.{field} picks columns"
         )
     return value
 
 
-def _scalar(table: Table, names: list[str]) -> np.ndarray:
+def scalar(table: Table, names: list[str]) -> np.ndarray:
     """Return the one column as (T,)."""
     if len(names) != 1:
-        raise UserError(f"t and trajectory are one column each, not {len(names)}: {_listed(names)}")
+        raise UserError(f"t and trajectory are one column each, not {len(names)}: {listed(names)}")
     value = _numbers(table, names[0])
     return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
 
@@ -225,8 +256,8 @@ def files_of(path: str | os.PathLike) -> list[Path]:
     return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
 
 
-def _load(path: Path, bag: Mapping[str, Any]) -> Table:
-    """Return all columns of the file; `bag` goes to `bag_table`."""
+def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
+    """Return all columns of the file, or raise a UserError that names it; `bag` goes to `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: there is no folder {path.parent}")

@@ -10,6 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import whole
+from r2s.recordings.repeats import TOLERANCE, comes_again, share_known, tracks_of
 
 TORQUES = ("measured", "commanded")
 MIN_ROWS = 10
@@ -203,32 +204,46 @@ class Recording:
         """(T, n) rad/s^2: `derivative` of dq. Noisy on raw data; `resample` and `smooth` come first."""
         return self.derivative(self.dq)
 
-    def repeats_after(self, tolerance: float = 0.01, overlap_s: float = 0.5) -> float | None:
+    def repeats_after(self, tolerance: float = TOLERANCE) -> float | None:
         """Return the period, s, after which the motion repeats itself, or None.
 
-        It repeats when, at some lag, at least `overlap_s` of the recording comes again within `tolerance` rad RMS per
-        joint while the arm moves through ten times that. What was recorded twice must not be split in two.
+        It repeats when, at some lag, at least 0.5 s of the recording comes again within `tolerance` rad RMS per
+        joint while the arm moves through ten times that. What was recorded twice must not be split in two. Where
+        the clock restarts, the repetitions may be trajectories: `in_phase` sets their clocks.
         """
-        dt = 0.02
-        if np.any(np.diff(self.t) <= 0):
-            return None  # clocks that restart have no common time
-        grid = np.arange(self.t[0], self.t[-1], dt)
-        q = np.full((len(grid), self.n_joints), np.nan)
-        for s in self.stretches:
-            inside = (grid >= self.t[s.start]) & (grid <= self.t[s.stop - 1])
-            q[inside] = np.stack([np.interp(grid[inside], self.t[s], x) for x in self.q[s].T], axis=1)
-        need, best = round(overlap_s / dt), (np.inf, 0)
-        for lag in range(need, len(q) - need):
-            both = ~np.isnan(q[lag:, 0]) & ~np.isnan(q[:-lag, 0])
-            if both.sum() < need:
+        return self._in_phase(tolerance)[0]
+
+    def in_phase(self, tolerance: float = TOLERANCE) -> "Recording":
+        """Return the recording with its `period`, if it repeats itself (`repeats_after`), else as it is.
+
+        The clocks of trajectories that restarted it, or were started by hand, are set so that the same motion has
+        the same phase in all of them.
+        """
+        period, t = self._in_phase(tolerance)
+        return self if period is None else replace(self, t=t, period=period)
+
+    def _in_phase(self, tolerance: float) -> tuple[float | None, np.ndarray]:
+        """Return the period, s, and the clock (T,) s that it is of."""
+        best, clock = None, self.t
+        runs, each = (tracks_of(self.t, self.q, self.stretches, each) for each in (False, True))
+        for tracks in (runs, each) if len(each) > len(runs) else (runs,):
+            period, shift = comes_again(tracks, tolerance)
+            if period is None:
                 continue
-            moved = np.ptp(q[lag:][both], axis=0).max()
-            error = np.sqrt(np.mean((q[lag:][both] - q[:-lag][both]) ** 2))
-            if error < tolerance and moved > 10 * tolerance:
-                best = min(best, (error, lag))
-            elif best[1]:
-                break  # past the first lag that fits
-        return best[1] * dt if best[1] else None
+            # a period of the log's clock may fit only some of the trajectories: those that a hand started
+            if best is None or np.abs((shift + 0.5 * best) % best - 0.5 * best).max() > SPLIT_GUARD_S / 2:
+                best, clock = period, self.t.copy()
+                for track, late in zip(tracks, shift, strict=True):
+                    for s in track.stretches:
+                        clock[s] += late
+        return best, clock
+
+    def known_from(self, training: "Recording") -> float:
+        """Return which share of this motion comes in `training` too, within 0.01 rad RMS of each joint: 0 to 1.
+
+        Motion that hardly moves says nothing, nor does when it came.
+        """
+        return share_known(*(tracks_of(r.t, r.q, r.stretches) for r in (training, self)))
 
     def split(self, validation_fraction: float, period: float | None = None) -> "tuple[Recording, Recording]":
         """Return (train, validation), about `validation_fraction` of the rows in the second, without a leak.

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
+from r2s.identification.breakaway import SIDES
 from r2s.identification.link_inertia import LINK, inertia_scale
 from r2s.identification.parameters import WHOLE_ARM
 from r2s.identification.uncertainty import Identified
@@ -30,8 +31,15 @@ def identification_tables(robot: Robot, identified: Identified, summary: Mapping
         tables["links, nominal → identified"] = _links(robot, identified)
     edges = identified.dynamics.breakaway
     if np.any(edges) and not identified.dynamics.family.has_memory:  # bristles hold without a dead zone
-        shown = {f"joint {j + 1}": [number(edge) for edge in edges[j]] for j in range(robot.n)}
-        tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(["negative", "positive"], name="edge"))
+        why = identified.edges.open if identified.edges is not None else {}
+        shown = {
+            f"joint {j + 1}": [
+                "\n".join([number(edge), *why.get(f"joint {j + 1}, {side}", "").split(": ")]).strip()
+                for side, edge in zip(SIDES, edges[j], strict=True)
+            ]
+            for j in range(robot.n)
+        }
+        tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(SIDES, name="edge"))
     return tables | error_tables(robot, summary)
 
 

@@ -43,22 +43,24 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: Identified, commande
         return ["Nominal: a link-side sensor does not feel at which torque of the motor a joint lets go."]
     old = nominal.breakaway
     columns: dict[str, list[str]] = {}
-    measured = found.break_spread is not None
+    ramped = found.edges
     for side, word in enumerate(("negative", "positive")):
         columns[f"{word}\nold"] = [number(x) for x in old[:, side]]
         columns[f"{word}\nnew"] = [number(x) for x in d.breakaway[:, side]]
-        if measured:
+        if ramped is not None:
             rows = values(*found.saved, f"breakaway_{word}")
-            spread = found.break_spread[:, side]  # type: ignore[index]
-            columns[f"{word}\n95 % interval"] = [
-                v.interval if np.isfinite(s) else "-" for v, s in zip(rows, spread, strict=True)
-            ]
-            columns[f"{word}\nrepeatability"] = [number(s, "{:.2g}") for s in spread]
+            columns[f"{word}\nnew"] = [v.found for v in rows]
+            columns[f"{word}\n95 % interval"] = [v.interval for v in rows]
+            spread = [number(s, "{:.2g}") for s in ramped.spread[:, side]]
+            why = [ramped.open.get(f"joint {j + 1}, {word}", "").split(":")[0] for j in range(robot.n)]
+            columns[f"{word}\nrepeatability"] = [w or s for w, s in zip(why, spread, strict=True)]
     how = "Not measured: no joint was ramped, and no edge was looked for in the recording. Nominal values."
-    if measured:
+    if ramped is not None:
         how = (
             "Torque at which a resting joint lets go, command and offset together, Nm: measured by ramping each "
-            "joint until it moved. Repeatability: standard deviation over ramps; -: fewer than two got there."
+            "joint until it moved. Repeatability: standard deviation over ramps; -: fewer than two got there. "
+            "Intervals are Student's, with the scatter of the joint's own ramps and of joints of its size. Not "
+            "reached: the joint was held until the ramp ended, so that the edge lies beyond."
         )
     elif not np.array_equal(old, d.breakaway):
         how = (

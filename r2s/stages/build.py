@@ -160,15 +160,19 @@ def make_draw(cfg, robot, center):
 
 
 @contextmanager
-def opened_arm(cfg, robot):
-    """Give the arm of conf/arm inside a `with`; one that has to be closed is a context manager itself."""
+def opened_arm(cfg, robot, noise=0):
+    """Give the arm of conf/arm inside a `with`; one that has to be closed is a context manager itself.
+
+    noise: which stream of noise the sensors of a twin have; a real arm has its own.
+    """
     from r2s.arm.interface import ArmStopped
 
     if "_target_" not in cfg.arm:
         raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(_arms())}")
     with ExitStack() as stack:
         try:
-            arm = part(cfg.arm, "arm", robot, beside=["soft_start_s"])
+            stream = {"noise": noise} if "noise" in inspect.signature(target(cfg.arm, "arm")).parameters else {}
+            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=["soft_start_s"])
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
@@ -180,10 +184,13 @@ def _arms():
 
 
 @contextmanager
-def opened_source(cfg, robot, seed):
-    """Give what is recorded: conf/arm, or with data=simulated an arm of known truth."""
+def opened_source(cfg, robot, noise):
+    """Give what is recorded: conf/arm, or with data=simulated an arm of known truth.
+
+    noise: 0, 1, 2, ... for each recording of a run: each has noise of its own.
+    """
     if cfg.data.kind != "simulated":
-        with opened_arm(cfg, robot) as arm:
+        with opened_arm(cfg, robot, noise) as arm:
             yield arm
         return
     from dataclasses import replace
@@ -191,8 +198,8 @@ def opened_source(cfg, robot, seed):
     from r2s.arm.simulated import SimulatedArm
 
     dynamics = replace(make_truth(cfg, robot), delay=cfg.data.delay, lag=cfg.data.lag)
-    noise = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
-    yield SimulatedArm(robot, dynamics, **noise, seed=seed)
+    sensors = {"position_noise": cfg.data.position_noise, "velocity_noise": cfg.data.velocity_noise}
+    yield SimulatedArm(robot, dynamics, **sensors, seed=cfg.data.excitation_seed + noise)
 
 
 def make_truth(cfg, robot):

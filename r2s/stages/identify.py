@@ -17,6 +17,7 @@ from r2s.stages.build import (
     plain,
 )
 
+KNOWN = 0.2  # share of a validation motion that may come in the training motion too, such as the way to a start
 WHY = {
     "arm": "only data=arm moves an arm",
     "inertia": "calibration= says what the links are",
@@ -107,16 +108,18 @@ class File:
             check_number("data.period", self.period, "(0, inf)")
 
 
-def record_motion(cfg, robot, motion, seed, label):
-    """Return the recording of a motion; without one, of the best that was found for data.seconds."""
+def record_motion(cfg, robot, motion, k, label):
+    """Return the k-th recording, of a motion; without one, of the best that was found for data.seconds."""
     from r2s.arm.tracking import record
     from r2s.excitation.fourier import fourier
     from r2s.progress import Progress
 
     progress = Progress(label)
     if motion is None:
-        motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=cfg.data.torque == "measured")
-    with opened_source(cfg, robot, seed) as arm:  # one client at a time, and the next recording is another
+        motion = fourier(
+            robot, duration=cfg.data.seconds, seed=cfg.data.excitation_seed + k, gravity=cfg.data.torque == "measured"
+        )
+    with opened_source(cfg, robot, k) as arm:  # one client at a time, and the next recording is another
         out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
     return motion, out
@@ -130,7 +133,7 @@ def record_ramps(cfg, robot):
     if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
         return None
     progress = Progress("ramp the joints until they move")
-    with opened_source(cfg, robot, cfg.data.excitation_seed + 2) as arm:
+    with opened_source(cfg, robot, 2) as arm:
         poses = poses_about(robot, cfg.data.ramp_poses)
         out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
     progress.close(f"{out.recording.duration:.1f} s of ramps")
@@ -143,8 +146,6 @@ def read_motion(robot, file, share):
     Args:
         share: of the recording that validates where there is no second one.
     """
-    from dataclasses import replace
-
     import numpy as np
 
     from r2s.identification.checks import check_recording
@@ -155,10 +156,14 @@ def read_motion(robot, file, share):
     how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
     recording = read(file.path, **how)
     check_recording(robot, recording)
+    if file.period is None and (again := recording.in_phase()) is not recording:
+        recording = again
+        if not file.validation:
+            print(
+                f"the motion repeats itself after {recording.period:.2f} s: what validates is held out in every "
+                "repetition"
+            )
     if not file.validation:
-        if file.period is None and (period := recording.repeats_after()):
-            print(f"the motion repeats itself after {period:.2f} s: what validates is held out in every repetition")
-            recording = replace(recording, period=period)
         return recording.split(share)
     if os.path.realpath(file.validation) == os.path.realpath(file.path):
         raise UserError("data.validation is the training file itself: it must hold other motion")
@@ -171,7 +176,25 @@ def read_motion(robot, file, share):
             f"data.validation: {same} of its {len(validation.t)} rows are rows of the training file; it must hold "
             "other motion"
         )
+    if (known := validation.known_from(recording)) > KNOWN:
+        raise UserError(
+            f"data.validation: {100 * known:.0f} % of its motion is that of the training file, recorded again; it "
+            "must hold other motion (to hold out a part of a repeated motion, leave data.validation=null)"
+        )
     return recording, validation
+
+
+def read_user_ramps(robot, file):
+    """Return the ramps of a `File`; its columns are named as those of the recording."""
+    from r2s.identification.checks import check_ramps
+    from r2s.recordings.ramps import read_ramps
+
+    columns = dict(file.columns)
+    if file.torque != "commanded":
+        columns["tau"] = None  # that names another torque; ramps are of the command
+    ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
+    check_ramps(robot, ramps)
+    return ramps
 
 
 def recorded(cfg, robot, run, motion):
@@ -184,22 +207,22 @@ def recorded(cfg, robot, run, motion):
         UserError: the arm stopped.
     """
     from r2s.arm.interface import ArmStopped
-    from r2s.recordings.ramps import Ramps
+    from r2s.recordings.ramps import read_ramps
     from r2s.recordings.readers import read
 
-    def one(name, motion, seed):
+    def one(name, motion, k):
         path = run.folder / f"{name}.npz"
         if not path.is_file():
-            motion, out = record_motion(cfg, robot, motion, seed, f"record {name} motion")
+            motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
             motion.save(run.folder / f"excitation_{name}.csv")
             out.save(path)
         return read(path, torque=cfg.data.torque)
 
     try:
-        train = one("train", motion, cfg.data.excitation_seed)
-        validation = one("validation", None, cfg.data.excitation_seed + 1)
+        train = one("train", motion, 0)
+        validation = one("validation", None, 1)
         path = run.folder / "ramps.npz"
-        ramps = Ramps.load(path) if path.is_file() else record_ramps(cfg, robot)
+        ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot)
         if ramps is not None and not path.is_file():
             ramps.save(path)
     except ArmStopped as stop:
@@ -226,7 +249,6 @@ def identify(cfg, overrides):
     from r2s.identification.prediction import prediction_errors
     from r2s.physics.description import write_description
     from r2s.progress import Progress
-    from r2s.recordings.ramps import Ramps
     from r2s.recordings.readers import files_of
     from r2s.reporting import pages
     from r2s.reporting.identification_tables import identification_table
@@ -245,7 +267,7 @@ def identify(cfg, overrides):
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
         if file.ramps:
-            ramps = Ramps.load(file.ramps)
+            ramps = read_user_ramps(robot, file)
             inputs.append(file.ramps)
     else:
         called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
@@ -291,6 +313,8 @@ def identify(cfg, overrides):
             "families_compared": found.families,
             "replays_refused": found.refused,
         }
+        if found.edges is not None and found.edges.open:
+            note["breakaway_unknown"] = found.edges.open
         save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         write_description(run.folder / "model", robot, found.dynamics)
