@@ -225,7 +225,7 @@ def test_exported_policy_is_the_trained_policy(trained):
     from r2s.tasks.reach import ReachTask
 
     config = yaml.safe_load((trained / "config.yaml").read_text())
-    task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["task"]["reach"])}))
+    task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["robot"]["reach"])}))
     policy = load_policy(trained, load_robot(**conf("robot/panda")), task)
     session = onnxruntime.InferenceSession(str(trained / "policy.onnx"))
     seen = torch.randn(5, 47)

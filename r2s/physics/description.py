@@ -16,6 +16,9 @@ from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
+ENDLESS = 1e16  # rad: SDF's word for no limit
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` of a URDF: a link without inertia gets 1 kg and 1 kg m^2 from DART
+
 
 @dataclass(frozen=True)
 class Link:
@@ -100,7 +103,7 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     links, hand = chain(robot, dynamics)
     root = ET.Element("mujoco", model=robot.name)
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast")
+    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast", gravity=_words(robot.gravity))
     parent, actuator = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     for i, link in enumerate(links):
         parent = ET.SubElement(parent, "body", {"name": link.name} | _place(link.origin))
@@ -110,7 +113,8 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
         own = {"damping": link.damping, "frictionloss": link.friction, "armature": link.armature}
         torque = _words(np.array([-robot.tau_max[i], robot.tau_max[i]]))
         joint = {"name": link.joint, "axis": _words(link.axis), "actuatorfrcrange": torque}
-        joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
+        if np.isfinite(robot.q_max[i]):
+            joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
         ET.SubElement(parent, "joint", joint | {k: repr(v) for k, v in own.items()})
         ET.SubElement(actuator, "motor", name=link.joint, joint=link.joint, ctrlrange=torque)
     ET.SubElement(parent, "site", {"name": "ee"} | _place(hand))
@@ -126,10 +130,10 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     links, hand = chain(robot, dynamics)
     _without_armature(links, "URDF")
     root = urdf(robot, links)
-    # a link without inertia gets 1 kg and 1 kg m^2 from DART
+    mass, moment = HAND
     inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
-    ET.SubElement(inertial, "mass", value="1e-9")
-    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(1e-12 * np.eye(3)).items()})
+    ET.SubElement(inertial, "mass", value=repr(mass))
+    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(moment * np.eye(3)).items()})
     _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", hand)
     _write(path, root)
 
@@ -144,14 +148,12 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
         ET.SubElement(inertial, "origin", xyz=_words(link.com), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(link.mass))
         ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(link.inertia).items()})
-        joint = _urdf_joint(root, link.joint, "revolute", parent, link.name, link.origin)
+        endless = not np.isfinite(robot.q_max[i])
+        kind = "continuous" if endless else "revolute"
+        joint = _urdf_joint(root, link.joint, kind, parent, link.name, link.origin)
         ET.SubElement(joint, "axis", xyz=_words(link.axis))
-        limit = {
-            "lower": robot.q_min[i],
-            "upper": robot.q_max[i],
-            "velocity": robot.dq_max[i],
-            "effort": robot.tau_max[i],
-        }
+        limit = {} if endless else {"lower": robot.q_min[i], "upper": robot.q_max[i]}
+        limit |= {"velocity": robot.dq_max[i], "effort": robot.tau_max[i]}
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
         ET.SubElement(joint, "dynamics", damping=repr(link.damping), friction=repr(link.friction))
         if robot.slowing is not None:  # Franka's own: not URDF, but libfranka does not connect without it
@@ -197,7 +199,8 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         _text(joint, parent=parent, child=link.name)
         axis = ET.SubElement(joint, "axis")
         _text(axis, xyz=_words(link.axis))
-        limit = {"lower": robot.q_min[i], "upper": robot.q_max[i], "effort": robot.tau_max[i]}
+        low, high = np.nan_to_num([robot.q_min[i], robot.q_max[i]], posinf=ENDLESS, neginf=-ENDLESS)
+        limit = {"lower": low, "upper": high, "effort": robot.tau_max[i]}
         if not world:
             limit["velocity"] = robot.dq_max[i]
         _text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})

@@ -21,14 +21,13 @@ from numba.extending import is_jitted
 
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 
-GRAVITY = 9.81  # m/s^2, of an upright base
-
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
-DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next twelve are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(MOMENT + 3, MOMENT + 8)  # of soft limits; 0: there are none
+GRAVITY = MOMENT + 3  # 3 wide
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(GRAVITY + 3, GRAVITY + 8)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 
@@ -65,6 +64,14 @@ def _either(number: int, own: Callable, others: Callable) -> Callable:
 @njit
 def _no_law(asked, p, v, h, memory):
     return 0.0, 0.0
+
+
+@njit(inline="always")
+def _weight(mass, hx, hy, hz, anchor, axis, gravity):
+    """Return Nm that gravity turns a joint with: axis . ((h - mass anchor) x gravity), of first moments h kg m."""
+    x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
+    level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
+    return level + gravity[2] * (axis[0] * y - axis[1] * x)
 
 
 @cache
@@ -115,8 +122,8 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
         anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
         axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
-        # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
-        em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        # mass and first moment of everything beyond a joint, errors and nominal
+        em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(n - 1, -1, -1):
             if user[j, MARK] != MARKER:
                 return
@@ -136,12 +143,15 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
                 em += m
                 ex += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ey += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
-                pull += GRAVITY * (axis[j, 1] * (ex - em * anchor[j, 0]) - axis[j, 0] * (ey - em * anchor[j, 1]))
+                ez += m * xpos[body, 2] + xmat[body, 6] * h0 + xmat[body, 7] * h1 + xmat[body, 8] * h2
+                gravity = user[j, GRAVITY : GRAVITY + 3]
+                pull += _weight(em, ex, ey, ez, anchor[j], axis[j], gravity)
                 m, h0, h1, h2 = user[j, MASS], user[j, MASS + 1], user[j, MASS + 2], user[j, MASS + 3]
                 lm += m
                 lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
-                load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
+                lz += m * xpos[body, 2] + xmat[body, 6] * h0 + xmat[body, 7] * h1 + xmat[body, 8] * h2
+                load = _weight(lm, lx, ly, lz, anchor[j], axis[j], gravity)
                 sign = np.tanh(v / WIDTH_DQ)
                 friction += user[j, LOAD] * abs(load) * sign
                 slope += user[j, LOAD] * abs(load) * (1.0 - sign * sign) / WIDTH_DQ
