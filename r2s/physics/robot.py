@@ -76,14 +76,14 @@ class Robot:
             dt: time step, s.
         """
         spec, _ = read_spec(self.mjcf)
-        spec.compile()  # gives the joints their ids
+        spec.compile()  # gives the joints their ids, and what is changed below takes them away
+        joints = sorted(spec.joints, key=lambda joint: joint.id)
         for item in [*spec.actuators, *spec.sensors, *spec.keys]:
             spec.delete(item)
         if self.ee_site not in [site.name for site in spec.sites]:
             spec.body(self.ee_site).add_site(name=self.ee_site)
         unit = np.degrees(1.0) if spec.compiler.degree else 1.0
-        for joint in spec.joints:
-            limits = np.array([self.q_min[joint.id], self.q_max[joint.id]])
+        for joint, limits in zip(joints, np.stack([self.q_min, self.q_max], -1), strict=True):
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
