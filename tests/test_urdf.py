@@ -163,15 +163,15 @@ def test_the_shapes_that_a_urdf_holds_are_there_for_clearances(write):
     assert model.body(model.geom_bodyid[1]).name == "upper"
 
 
-@pytest.mark.parametrize("name", ["panda", "kinova_gen3", "iiwa14", "xarm7"])
+@pytest.mark.parametrize("name", ["panda", "kinova_gen3", "ur10e", "iiwa14", "xarm7"])
 def test_what_we_write_as_urdf_comes_back(name, tmp_path):
-    """Written without friction and read again: masses, centres, tensors and how it moves, to 1e-9."""
+    """Written without friction and read again: masses, centres, tensors, rotors and how it moves, to 1e-9."""
     robot = load_robot(**conf(f"robot/{name}"))
     write_urdf(tmp_path / "arm.urdf", robot, nominal_dynamics(robot, **FRICTIONLESS))
     again = load_robot(str(tmp_path / "arm.urdf"), q_home=robot.q_home.tolist())
     assert again.ee_site == "ee"
     assert_same(robot, again)
-    for field in ("mass", "com", "inertia"):
+    for field in ("mass", "com", "inertia", "armature"):
         np.testing.assert_allclose(getattr(robot, field), getattr(again, field), rtol=0, atol=1e-9)
 
 

@@ -44,6 +44,8 @@ class TorqueResidual:
         self.commanded = recording.torque == "commanded"
         gravity = None if self.commanded else robot.gravity
         self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
+        if not self.commanded:  # a link-side sensor does not feel rotors
+            self._rest -= robot.armature * m.ddq
         self._y = y.reshape(*m.q.shape, -1)
         still = np.zeros_like(m.q)
         y = regressor(robot, m.q, still, still, robot.gravity)

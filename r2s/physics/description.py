@@ -15,6 +15,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.urdf import GEAR, ROTOR
 
 ENDLESS = 1e16  # rad: SDF's word for no limit
 HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` of a URDF: a link without inertia gets 1 kg and 1 kg m^2 from DART
@@ -90,11 +91,11 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 
 
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get the first alone."""
+    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get no SDF."""
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
-    if not robot.model(gravity=True).dof_armature.any():
-        write_urdf(folder / "arm.urdf", robot, dynamics)
+    write_urdf(folder / "arm.urdf", robot, dynamics)
+    if not robot.armature.any():
         write_sdf(folder / "arm.sdf", robot, dynamics)
 
 
@@ -124,12 +125,18 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF; a link `ee` sits at the end effector. Arguments as `chain`.
 
-    Raises:
-        UserError: the joints have armature, which URDF cannot say.
+    URDF has no armature: it is written as Drake's rotor inertia, which r2s and Drake read, and other readers lack.
     """
     links, hand = chain(robot, dynamics)
-    _without_armature(links, "URDF")
     root = urdf(robot, links)
+    for link in links:
+        if link.armature:
+            transmission = ET.SubElement(root, "transmission", name=f"{link.joint}_rotor")
+            _text(transmission, type="transmission_interface/SimpleTransmission")
+            ET.SubElement(transmission, "joint", name=link.joint)
+            actuator = ET.SubElement(transmission, "actuator", name=f"{link.joint}_motor")
+            ET.SubElement(actuator, ROTOR, value=repr(link.armature))
+            ET.SubElement(actuator, GEAR, value="1")
     mass, moment = HAND
     inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
     ET.SubElement(inertial, "mass", value=repr(mass))
@@ -175,7 +182,8 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         UserError: the joints have armature, which SDF cannot say.
     """
     links, hand = chain(robot, dynamics, friction=not world)
-    _without_armature(links, "SDF")
+    if any(link.armature for link in links):
+        raise UserError("robot.armature: the joints have some, which SDF cannot say; write it into the links")
     root = ET.Element("sdf", version="1.9")
     place = root
     if world:
@@ -291,11 +299,6 @@ def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.nd
     if rotation is not None:
         pose[:3, :3] = rotation
     return pose
-
-
-def _without_armature(links: list[Link], what: str) -> None:
-    if any(link.armature for link in links):
-        raise UserError(f"robot.mjcf: its joints have armature, which {what} cannot say; write it into the links")
 
 
 def _place(pose: np.ndarray) -> dict[str, str]:

@@ -35,6 +35,7 @@ class Robot:
         gravity: (3,) m/s^2 in the base frame.
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
+        armature: (n,) kg m^2, nominal inertia of each joint's rotor, as the joint feels it through the gear.
         slowing: where an arm allows less speed the closer a joint is to a position limit: deceleration (n,) rad/s^2
             and offset (n,) rad/s, of sqrt(2 deceleration way + offset^2) - offset. None: it does not.
     """
@@ -53,6 +54,7 @@ class Robot:
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
+    armature: np.ndarray
     slowing: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -83,7 +85,8 @@ class Robot:
         if self.ee_site not in [site.name for site in spec.sites]:
             spec.body(self.ee_site).add_site(name=self.ee_site)
         unit = np.degrees(1.0) if spec.compiler.degree else 1.0
-        for joint, limits in zip(joints, np.stack([self.q_min, self.q_max], -1), strict=True):
+        for joint, limits, rotor in zip(joints, np.stack([self.q_min, self.q_max], -1), self.armature, strict=True):
+            joint.armature = rotor
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -139,6 +142,7 @@ def load_robot(
     tau_max: list[float] | None = None,
     dtau_max: list[float] | float = 1000.0,
     gravity: list[float] | None = None,
+    armature: list[float] | float | None = None,
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; None is the embedded Panda. What is given here goes over the file's.
 
@@ -151,6 +155,7 @@ def load_robot(
         ee: the site, body or link that is the end effector; None: the only site, or the last link of a URDF.
         q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
         gravity: (3,) m/s^2 in the base frame; None: the file's, which in a URDF is an upright base's.
+        armature: kg m^2, of the rotors at the joints; None: the file's.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, limits or end effector that cannot be
@@ -213,6 +218,7 @@ def load_robot(
         mass=model.body_mass[model.jnt_bodyid].copy(),
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1),
+        armature=each("armature", armature, model.dof_armature),
     )
 
 

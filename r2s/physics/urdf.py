@@ -16,6 +16,9 @@ from r2s.errors import UserError, choices, nearest
 
 MOVING, FIXED = ("revolute", "continuous"), "fixed"
 ROUNDED = 1e-9  # of a tensor's largest moment
+DRAKE = "http://drake.mit.edu"  # whose elements of an actuator say what URDF has no word for
+ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
+ET.register_namespace("drake", DRAKE)
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers of an attribute; others are one
 
 
@@ -64,6 +67,7 @@ class _Reader:
         self.name = root.get("name") or path.stem
         self.links = self._named(root, "link")
         self.joints = self._named(root, "joint")
+        self.rotors = dict(self._rotor(element) for element in root.findall("transmission"))
         self.children: dict[str, list[ET.Element]] = {name: [] for name in self.links}
         self.above: dict[str, ET.Element] = {}
         for joint in self.joints.values():
@@ -121,6 +125,16 @@ class _Reader:
         self.above[child] = joint
         self.children[self._end(joint, "parent")].append(joint)
 
+    def _rotor(self, transmission: ET.Element) -> tuple[str, float]:
+        """Return the joint of a transmission, and the inertia of its rotors at the joint, kg m^2."""
+        what, joint = f"transmission '{transmission.get('name')}'", transmission.find("joint")
+        inertia = 0.0
+        for actuator in transmission.findall("actuator"):
+            rotor, gear = actuator.find(ROTOR), actuator.find(GEAR)
+            ratio = 1.0 if gear is None else self._number(gear, "value", what)
+            inertia += 0.0 if rotor is None else ratio**2 * self._number(rotor, "value", what)
+        return "" if joint is None else joint.get("name", ""), inertia
+
     def _end(self, joint: ET.Element, which: str) -> str:
         """Return the name of a joint's parent or child link."""
         element = joint.find(which)
@@ -168,6 +182,7 @@ class _Reader:
         if np.linalg.norm(along) < 1e-6:
             raise self._error(f"{what}: its axis is 0 0 0")
         hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=along)
+        hinge.armature = self.rotors.get(joint.get("name", ""), 0.0)
         hinge.damping[0] = self._number(dynamics, "damping", what, "0")
         hinge.frictionloss = self._number(dynamics, "friction", what, "0")
         low, high, effort, speed = (
