@@ -285,6 +285,8 @@ MISTAKES = {
     "dr=identified": r"give calibration=RUN_FOLDER",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
+    "robot.ee=end_efector": r"robot.ee: no site, body or link 'end_efector'.*did you mean 'end_effector'",
+    "stage=identify data=kinova_gen3 robot=panda": r"joint 4 is at .* panda allows",
     "calibration=nowhere": r"calibration: no parameters.yaml",
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
     "stage=compare runs=nowhere/*": r"nothing matches 'nowhere/\*'",
