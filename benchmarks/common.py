@@ -11,6 +11,7 @@ import pandas as pd
 import yaml
 
 ROOT = Path(__file__).parent.parent
+OF_THE_TASK = ("torque_fraction", "reach")  # what a robot's yaml says of tasks
 sys.path.insert(0, str(ROOT))
 
 from hydra.utils import instantiate  # noqa: E402
@@ -28,8 +29,9 @@ def conf(path: str) -> dict:
     """Read one file of conf/: the arguments of what its `_target_` names, for the Panda."""
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     if path.startswith("task/"):
-        document["torque_fraction"] = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())["torque_fraction"]
-    beside = {"_target_", "torque_fraction"} if path.startswith("robot/") else {"_target_"}
+        panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
+        document |= {k: panda[k] for k in OF_THE_TASK}
+    beside = {"_target_", *OF_THE_TASK} if path.startswith("robot/") else {"_target_"}
     return {k: v for k, v in document.items() if k not in beside}
 
 

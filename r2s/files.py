@@ -1,9 +1,17 @@
-"""Files that are there only once they are whole."""
+"""Files that are there only once they are whole, and those that come with r2s."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+OWN = "r2s:"  # a path that begins so is one of the package's own files, wherever that is installed
+
+
+def located(path: str | os.PathLike) -> Path:
+    """Return where a file is: `r2s:models/panda.xml` in the package, everything else as it is."""
+    name = os.fspath(path)
+    return Path(__file__).parent / name.removeprefix(OWN) if name.startswith(OWN) else Path(name)
 
 
 @contextmanager

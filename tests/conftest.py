@@ -28,9 +28,11 @@ def conf(path: str) -> dict:
     """Read one file of conf/ as plain YAML: the arguments of what its `_target_` names, for the Panda."""
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     group = path.split("/")[0]
+    of_the_task = ("torque_fraction", "reach")  # a robot's yaml says them
     if group == "task":
-        document["torque_fraction"] = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())["torque_fraction"]
-    beside = {"_target_", "torque_fraction"} if group == "robot" else {"_target_"}
+        panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
+        document |= {k: panda[k] for k in of_the_task}
+    beside = {"_target_", "defaults", *of_the_task} if group == "robot" else {"_target_"}
     return {k: v for k, v in document.items() if k not in beside} if isinstance(document, dict) else document
 
 

@@ -249,7 +249,7 @@ def test_exported_policy_is_the_trained_policy(trained):
     from r2s.tasks.reach import ReachTask
 
     config = yaml.safe_load((trained / "config.yaml").read_text())
-    task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["task"]["reach"])}))
+    task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["robot"]["reach"])}))
     policy = load_policy(trained, load_robot(**conf("robot/panda")), task)
     session = onnxruntime.InferenceSession(str(trained / "policy.onnx"))
     seen = torch.randn(5, 47)
@@ -312,6 +312,8 @@ MISTAKES = {
     "dr=identified": r"give calibration=RUN_FOLDER",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
+    "robot.ee=end_efector": r"robot.ee: no site, body or link 'end_efector'.*did you mean 'end_effector'",
+    "stage=identify data=kinova_gen3 robot=panda": r"joint 4 is at .* panda allows",
     "calibration=nowhere": r"calibration: no parameters.yaml",
     "stage=transfer policy=nowhere": r"policy: 'nowhere'",
     "stage=compare runs=nowhere/*": r"nothing matches 'nowhere/\*'",

@@ -164,4 +164,4 @@ def test_an_armature_is_said(tmp_path):
     path.write_text(ODD_ARM)
     robot = load_robot(str(path))
     with pytest.raises(UserError, match="armature"):
-        write_urdf(tmp_path / "odd.urdf", robot, identified(robot))
+        write_sdf(tmp_path / "odd.sdf", robot, identified(robot))

@@ -26,7 +26,7 @@ from r2s.excitation.safety import (
     check_torque,
     friction_margin,
 )
-from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor
+from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import load_robot
 from r2s.recordings.recording import Recording
 
@@ -92,7 +92,7 @@ def test_every_motion_keeps_what_is_allowed(duration, seed):
     np.testing.assert_allclose(np.gradient(e.dq, e.t, axis=0)[1:-1], e.ddq[1:-1], atol=0.1)
     links = LinkInertia(r.mass, r.com, r.inertia).standard()
     q, dq, ddq = e.q[::50], e.dq[::50], e.ddq[::50]
-    weight = np.einsum("tjkc,kc->tj", regressor(r, q, 0 * dq, 0 * ddq, GRAVITY), links)
+    weight = np.einsum("tjkc,kc->tj", regressor(r, q, 0 * dq, 0 * ddq, r.gravity), links)
     inertial = np.einsum("tjkc,kc->tj", regressor(r, q, dq, ddq), links)
     assert np.all(np.abs(weight) + np.abs(inertial) + friction_margin(r) <= TORQUE_SHARE * r.tau_max)
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from r2s.identification.link_inertia import links
-from r2s.physics.rigid_body import GRAVITY, LinkInertia, kinematics, regressor, rigid_body, six
+from r2s.physics.rigid_body import LinkInertia, kinematics, regressor, rigid_body, six
 from r2s.physics.robot import load_robot
+
+GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2, an upright base
 
 
 def numbers(values):
@@ -57,7 +59,7 @@ def motion(robot, seed, samples=12):
     """Return q, dq, ddq (T, n) within the limits."""
     rng = np.random.default_rng(seed)
     shape = (samples, robot.n)
-    return rng.uniform(robot.q_min, robot.q_max, shape), rng.normal(size=shape), 5 * rng.normal(size=shape)
+    return rng.uniform(*robot.q_range, shape), rng.normal(size=shape), 5 * rng.normal(size=shape)
 
 
 def inverse(model, q, dq, ddq):

@@ -56,7 +56,7 @@ def write(tmp_path):
 
 @pytest.fixture
 def arm(write):
-    return load_robot(write(ARM), ee_site="tool")
+    return load_robot(write(ARM), ee="tool")
 
 
 def test_the_hand_of_the_panda_is_where_franka_says(panda):
@@ -131,7 +131,7 @@ def test_the_compiled_arm_keeps_the_limits_and_drops_the_motors(arm):
 def test_what_is_given_goes_over_the_file(write):
     """Limits and start given to load_robot win over the file's, one number serves all joints."""
     robot = load_robot(
-        write(ARM), ee_site="wrist", q_min=[-1, -1, -1], tau_max=[5, 5, 5], q_home=[0.1, 0.2, 0.3], dq_max=1.5
+        write(ARM), ee="wrist", q_min=[-1, -1, -1], tau_max=[5, 5, 5], q_home=[0.1, 0.2, 0.3], dq_max=1.5
     )
     assert robot.ee_site == "wrist"
     assert robot.q_min.tolist() == [-1, -1, -1]
@@ -182,10 +182,10 @@ EMPTY = '<mujoco model="rock"><worldbody><body name="b"><geom size="1"/></body><
         (ARM[:-20], {}, ["robot.mjcf", "arm.xml", "not a valid MJCF"]),
         (ARM.replace('mass="2"', 'mass="two"'), {}, ["robot.mjcf", "mass"]),
         (SLIDE, {}, ["elbow", "mjJNT_SLIDE", "only hinges"]),
-        (TREE, {"ee_site": "tip"}, ["not a serial arm", "'right'", "'left'"]),
+        (TREE, {"ee": "tip"}, ["not a serial arm", "'right'", "'left'"]),
         (EMPTY, {}, ["arm.xml", "no joints"]),
-        (ARM, {"ee_site": "toool"}, ["robot.ee_site", "toool", "tool, wrist", "did you mean 'tool'?"]),
-        (ARM, {"ee_site": None}, ["robot.ee_site", "tool, wrist"]),
+        (ARM, {"ee": "toool"}, ["robot.ee", "toool", "tool, wrist", "did you mean 'tool'?"]),
+        (ARM, {"ee": None}, ["robot.ee", "tool, wrist"]),
         (WEAK, {}, ["robot.tau_max", "elbow"]),
         (ARM, {"q_min": [0.0, 0.0]}, ["robot.q_min", "2 values", "3 joints"]),
         (ARM, {"dq_max": [1.0] * 4}, ["robot.dq_max", "4 values", "3 joints"]),
@@ -196,7 +196,7 @@ EMPTY = '<mujoco model="rock"><worldbody><body name="b"><geom size="1"/></body><
 def test_what_is_wrong_with_a_file_is_said_in_one_line(write, text, change, words):
     """Every mistake raises a UserError of one line that names it."""
     with pytest.raises(UserError) as caught:
-        load_robot(write(text), **({"ee_site": "tool"} | change))
+        load_robot(write(text), **({"ee": "tool"} | change))
     message = str(caught.value)
     assert "\n" not in message
     for word in words:

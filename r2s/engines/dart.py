@@ -68,7 +68,7 @@ class DartEngine:
         site = model.site(robot.ee_site).id
         anchor, pose = links.moving_parent(model.site_bodyid[site])
         if anchor != bodies[-1]:
-            raise UserError(f"robot.ee_site: '{robot.ee_site}' does not sit on the arm's last link")
+            raise UserError(f"robot.ee: '{robot.ee_site}' does not sit on the arm's last link")
         self._tip = parent
         self._ee = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
         self._world = dart.simulation.World()

@@ -43,7 +43,7 @@ LONGEST_S = 120.0
 TOP_HZ = 1.0  # of its own time
 FALL = 1.5  # of the amplitude with the harmonic: position range from the low ones, acceleration from the high
 SHORTEST_S = 4.0  # fundamental period, at least
-RANGE = 0.8  # of the way from the centre to the nearer position limit
+RANGE = 0.8  # of the way from the centre to the nearer position limit, or of half a turn
 SPEED = 0.65  # of dq_max
 ACCELERATION = 0.7  # of ddq_max
 STUCK_S = 0.12  # a light joint may stick so long where it reverses, and then catches up: faster by that much
@@ -107,7 +107,7 @@ def fourier(
         raise UserError(f"excitation.duration={duration:g} s is not allowed; {shortest:g} to {LONGEST_S:g} s are")
     if effort < 0:
         raise UserError(f"excitation.effort={effort} must not be negative")
-    center = 0.5 * (robot.q_min + robot.q_max) if q_center is None else np.asarray(q_center, dtype=float)
+    center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)
     _check_center(robot, center)
     space = Space(robot, table=table, z_min=z_min)
     space.check(np.array([robot.q_home, center]), lambda k: ("at robot.q_home", "at excitation.q_center")[k])
@@ -145,7 +145,7 @@ def _information(
     """Return (B,) nats for B motions (B, T, n) at the times t (T,)."""
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)
-    y = regressor(robot, *flat, gravity=robot.model(gravity=True).opt.gravity).reshape(*shape, n, 10)
+    y = regressor(robot, *flat, gravity=robot.gravity).reshape(*shape, n, 10)
     speed, bend = dq / robot.dq_max, dq / (SLOPE * robot.dq_max)
     step, bump = np.tanh(bend), 1 / np.cosh(np.minimum(np.abs(bend), 50)) ** 2
     curves = FRICTION_PRIOR * np.stack([np.ones_like(dq), step, bend * bump, bump, speed], -1)
@@ -254,7 +254,7 @@ class _Family:
         """Return offset from the centre, velocity and acceleration, each (T, n), as large as a says."""
         r = self.robot
         q, dq, ddq = series
-        room = RANGE * np.array([r.q_max - self.center, self.center - r.q_min])
+        room = RANGE * np.minimum([r.q_max - self.center, self.center - r.q_min], np.pi)
         reach = np.maximum([q.max(0), -q.min(0)], 1e-9)
         scale = np.minimum((room / reach).min(0), SPEED * r.dq_max / np.maximum(np.abs(dq).max(0), 1e-9))
         hardest = np.minimum(ACCELERATION * r.ddq_max, (1 - SPEED) * r.dq_max / STUCK_S)

@@ -4,6 +4,7 @@ A scan, because the error has no gradient by them.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,8 +16,6 @@ from r2s.physics.dynamics import HOLDS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-MEASURED = 0.006  # Nm, first step of the scan about edges that ramps measured,
-TRUST = 0.01  # and by how much less the error must be to go that far
 
 CREEP = 2e-3  # rad/s, below which stiction may hold: above what a step of 1 ms leaves of a stop, below any motion
 HORIZON = 0.5  # s, of the replays that a rule is chosen by: long enough for stops
@@ -38,13 +37,13 @@ def stiction(
     Of the paper's rule and of stiction that one is kept which replays the recording's stops better. `largest` and
     the others: see `scan_breakaway`.
     """
-    how = {"window_s": window_s, "stride": stride, "nthread": nthread, "report": report}
+    scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=report)
     trials = []
     for hold in HOLDS:
         dq_min = dynamics.dq_min if hold == "command" else min(dynamics.dq_min, CREEP)
         trial = replace(dynamics, hold=hold, dq_min=dq_min)
         if largest is not None:  # not measured: each rule gets its own
-            trial = replace(trial, breakaway=scan_breakaway(robot, trial, recording, largest, **how))
+            trial = replace(trial, breakaway=scan(robot, trial, recording, largest))
         trials.append(trial)
     windows = cut_windows(recording, HORIZON, limit=60)
     error = np.stack([np.abs(replay(robot, t, windows, nthread) - windows.q).mean((0, 1)) for t in trials])
@@ -57,7 +56,7 @@ def scan_breakaway(
     robot: Robot,
     dynamics: Dynamics,
     recording: Recording,
-    largest: float | None,
+    largest: float,
     *,
     window_s: float,
     stride: int,
@@ -68,29 +67,25 @@ def scan_breakaway(
 
     The error jumps where a joint is held or let go one step sooner, so there is no gradient: each edge is scanned
     over [0, largest], all edges at once and each judged by its own joint, then again about the best, ever finer.
-    The coarse scan is done twice, because an edge looks different while the others are wrong. Without `largest` the
-    edges of `dynamics` were measured: only the fine scans are done, and where no hold tells them they stay.
+    The coarse scan is done twice, because an edge looks different while the others are wrong.
     """
-    top = largest or 2.0 * np.abs(dynamics.breakaway).max() + MEASURED
-    space = parameter_space(robot, dynamics, {"breakaway_negative": [-top, 0.0], "breakaway_positive": [0.0, top]})
+    space = parameter_space(
+        robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
+    )
     data = ReplayResidual(
         robot, space, recording, window_s=window_s, stride=stride, slowest=0.0, limit=50, nthread=nthread
     )
-    x, step, coarse, passes = space.start, top / 12, 2, 6
-    if largest is None:
-        step, coarse, passes = MEASURED, 0, 3
+    x, step, coarse, passes = space.start, largest / 12, 2, 6
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
     for k in range(passes):
-        offsets = np.linspace(0, top, 13) if k < coarse else step * np.arange(-2, 3)
+        offsets = np.linspace(0, largest, 13) if k < coarse else step * np.arange(-2, 3)
         base = np.zeros_like(x) if k < coarse else x
         trials = np.clip(base[:, None] + sign[:, None] * offsets, space.lower[:, None], space.upper[:, None])
         candidates = np.repeat(x[None], trials.size, axis=0).reshape(*trials.shape, -1)
         candidates[np.arange(len(x)), :, np.arange(len(x))] = trials
         cost = data.joint_error(candidates.reshape(-1, len(x))).reshape(*trials.shape, robot.n)
         own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
-        if largest is None:
-            own *= 1.0 + TRUST * ((trials - space.start[:, None]) / MEASURED) ** 2
         x = trials[np.arange(len(x)), own.argmin(1)]
         step /= 1 if k < coarse else 2.5
         row = {"pass": k + 1, "evaluations": data.candidates, "done": k + 1, "total": passes}

@@ -175,8 +175,8 @@ def identify(
         space = replace(space, break_command=command)
     if commanded and not nominal.family.has_memory and (ramps is not None or settings.breakaway):
         largest = settings.breakaway if ramps is None else None
-        how_long = {"window_s": settings.window_s, "stride": settings.stride, "nthread": nthread}
-        found = step("stiction", lambda: stiction(robot, dynamics, recording, largest, told, **how_long))
+        rule_of = partial(stiction, window_s=settings.window_s, stride=settings.stride, nthread=nthread)
+        found = step("stiction", lambda: rule_of(robot, dynamics, recording, largest, told))
         rule, dq_min = HOLDS[int(found["hold"])], float(found["dq_min"])
         space = replace(space, nominal=replace(space.nominal, hold=rule, dq_min=dq_min))
         if ramps is None:

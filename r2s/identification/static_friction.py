@@ -5,7 +5,7 @@ import numpy as np
 from r2s.identification.breakaway import Breakaway
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor
+from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
@@ -24,7 +24,7 @@ class StaticFriction:
         self.joint, self.side = edges.joint[kept], (edges.sign[kept] > 0).astype(int)
         self.command, own = edges.value[kept], np.arange(len(kept))
         still = np.zeros_like(q)
-        gravity = regressor(robot, q, still, still, GRAVITY)[own, self.joint].reshape(len(kept), -1)
+        gravity = regressor(robot, q, still, still, robot.gravity)[own, self.joint].reshape(len(kept), -1)
         self._gravity, self._nominal = gravity, LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(gravity @ self._nominal)
         self._q = q[own, self.joint]

@@ -13,7 +13,7 @@ from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
 from r2s.identification.smooth_motion import SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
-from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor, rigid_body
+from r2s.physics.rigid_body import LinkInertia, regressor, rigid_body
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
@@ -46,11 +46,13 @@ class TorqueResidual:
         self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
         self.seen = m.unmixed(np.abs(m.fast) >= slowest) if slowest else np.ones_like(m.q, dtype=bool)
         self.commanded = recording.torque == "commanded"
-        gravity = None if self.commanded else GRAVITY
+        gravity = None if self.commanded else robot.gravity
         self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
+        if not self.commanded:  # a link-side sensor does not feel rotors
+            self._rest -= robot.armature * m.ddq
         self._y = y.reshape(*m.q.shape, -1)
         still = np.zeros_like(m.q)
-        y = regressor(robot, m.q, still, still, GRAVITY)
+        y = regressor(robot, m.q, still, still, robot.gravity)
         self._gravity = y.reshape(*m.q.shape, -1)
         self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(self._gravity @ self._nominal)

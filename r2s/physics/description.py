@@ -15,6 +15,10 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.urdf import GEAR, ROTOR
+
+ENDLESS = 1e16  # rad: SDF's word for no limit
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` of a URDF: a link without inertia gets 1 kg and 1 kg m^2 from DART
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,11 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 
 
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get the first alone."""
+    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get no SDF."""
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
-    if not robot.model(gravity=True).dof_armature.any():
-        write_urdf(folder / "arm.urdf", robot, dynamics)
+    write_urdf(folder / "arm.urdf", robot, dynamics)
+    if not robot.armature.any():
         write_sdf(folder / "arm.sdf", robot, dynamics)
 
 
@@ -100,7 +104,7 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     links, hand = chain(robot, dynamics)
     root = ET.Element("mujoco", model=robot.name)
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast")
+    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast", gravity=_words(robot.gravity))
     parent, actuator = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     for i, link in enumerate(links):
         parent = ET.SubElement(parent, "body", {"name": link.name} | _place(link.origin))
@@ -110,7 +114,8 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
         own = {"damping": link.damping, "frictionloss": link.friction, "armature": link.armature}
         torque = _words(np.array([-robot.tau_max[i], robot.tau_max[i]]))
         joint = {"name": link.joint, "axis": _words(link.axis), "actuatorfrcrange": torque}
-        joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
+        if np.isfinite(robot.q_max[i]):
+            joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
         ET.SubElement(parent, "joint", joint | {k: repr(v) for k, v in own.items()})
         ET.SubElement(actuator, "motor", name=link.joint, joint=link.joint, ctrlrange=torque)
     ET.SubElement(parent, "site", {"name": "ee"} | _place(hand))
@@ -120,16 +125,22 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF; a link `ee` sits at the end effector. Arguments as `chain`.
 
-    Raises:
-        UserError: the joints have armature, which URDF cannot say.
+    URDF has no armature: it is written as Drake's rotor inertia, which r2s and Drake read, and other readers lack.
     """
     links, hand = chain(robot, dynamics)
-    _without_armature(links, "URDF")
     root = urdf(robot, links)
-    # a link without inertia gets 1 kg and 1 kg m^2 from DART
+    for link in links:
+        if link.armature:
+            transmission = ET.SubElement(root, "transmission", name=f"{link.joint}_rotor")
+            _text(transmission, type="transmission_interface/SimpleTransmission")
+            ET.SubElement(transmission, "joint", name=link.joint)
+            actuator = ET.SubElement(transmission, "actuator", name=f"{link.joint}_motor")
+            ET.SubElement(actuator, ROTOR, value=repr(link.armature))
+            ET.SubElement(actuator, GEAR, value="1")
+    mass, moment = HAND
     inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
-    ET.SubElement(inertial, "mass", value="1e-9")
-    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(1e-12 * np.eye(3)).items()})
+    ET.SubElement(inertial, "mass", value=repr(mass))
+    ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(moment * np.eye(3)).items()})
     _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", hand)
     _write(path, root)
 
@@ -144,14 +155,12 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
         ET.SubElement(inertial, "origin", xyz=_words(link.com), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(link.mass))
         ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(link.inertia).items()})
-        joint = _urdf_joint(root, link.joint, "revolute", parent, link.name, link.origin)
+        endless = not np.isfinite(robot.q_max[i])
+        kind = "continuous" if endless else "revolute"
+        joint = _urdf_joint(root, link.joint, kind, parent, link.name, link.origin)
         ET.SubElement(joint, "axis", xyz=_words(link.axis))
-        limit = {
-            "lower": robot.q_min[i],
-            "upper": robot.q_max[i],
-            "velocity": robot.dq_max[i],
-            "effort": robot.tau_max[i],
-        }
+        limit = {} if endless else {"lower": robot.q_min[i], "upper": robot.q_max[i]}
+        limit |= {"velocity": robot.dq_max[i], "effort": robot.tau_max[i]}
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
         ET.SubElement(joint, "dynamics", damping=repr(link.damping), friction=repr(link.friction))
         if robot.slowing is not None:  # Franka's own: not URDF, but libfranka does not connect without it
@@ -173,7 +182,8 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         UserError: the joints have armature, which SDF cannot say.
     """
     links, hand = chain(robot, dynamics, friction=not world)
-    _without_armature(links, "SDF")
+    if any(link.armature for link in links):
+        raise UserError("robot.armature: the joints have some, which SDF cannot say; write it into the links")
     root = ET.Element("sdf", version="1.9")
     place = root
     if world:
@@ -197,7 +207,8 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         _text(joint, parent=parent, child=link.name)
         axis = ET.SubElement(joint, "axis")
         _text(axis, xyz=_words(link.axis))
-        limit = {"lower": robot.q_min[i], "upper": robot.q_max[i], "effort": robot.tau_max[i]}
+        low, high = np.nan_to_num([robot.q_min[i], robot.q_max[i]], posinf=ENDLESS, neginf=-ENDLESS)
+        limit = {"lower": low, "upper": high, "effort": robot.tau_max[i]}
         if not world:
             limit["velocity"] = robot.dq_max[i]
         _text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})
@@ -288,11 +299,6 @@ def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.nd
     if rotation is not None:
         pose[:3, :3] = rotation
     return pose
-
-
-def _without_armature(links: list[Link], what: str) -> None:
-    if any(link.armature for link in links):
-        raise UserError(f"robot.mjcf: its joints have armature, which {what} cannot say; write it into the links")
 
 
 def _place(pose: np.ndarray) -> dict[str, str]:

@@ -23,17 +23,14 @@ from numba.extending import is_jitted
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.stick_slip import TINY, coming_velocity, element, turns
 
-GRAVITY = 9.81  # m/s^2, of an upright base
-
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
 MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
-DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next nine are in use
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next twelve are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds; REST: friction as sliding begins
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(
-    REST_POS + 1, REST_POS + 6
-)  # of soft limits; 0: there are none
+GRAVITY = REST_POS + 1  # 3 wide
+Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(GRAVITY + 3, GRAVITY + 8)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
 # Rows of what a step knows of its joints, two each of the last two: of the negative and the positive direction.
@@ -75,6 +72,14 @@ def _either(number: int, own: Callable, others: Callable) -> Callable:
 @njit
 def _no_law(asked, p, v, h, memory):
     return 0.0, 0.0
+
+
+@njit(inline="always")
+def _weight(mass, hx, hy, hz, anchor, axis, gravity):
+    """Return Nm that gravity turns a joint with: axis . ((h - mass anchor) x gravity), of first moments h kg m."""
+    x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
+    level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
+    return level + gravity[2] * (axis[0] * y - axis[1] * x)
 
 
 @cache
@@ -139,8 +144,8 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             work = carray(stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
             joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
             slow = False
-        # mass and first moment of everything beyond a joint, errors and nominal, horizontal parts
-        em, ex, ey, lm, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        # mass and first moment of everything beyond a joint, errors and nominal
+        em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(n - 1, -1, -1):
             if user[j, MARK] != MARKER:
                 return
@@ -160,12 +165,15 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
                 em += m
                 ex += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ey += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
-                pull += GRAVITY * (axis[j, 1] * (ex - em * anchor[j, 0]) - axis[j, 0] * (ey - em * anchor[j, 1]))
+                ez += m * xpos[body, 2] + xmat[body, 6] * h0 + xmat[body, 7] * h1 + xmat[body, 8] * h2
+                gravity = user[j, GRAVITY : GRAVITY + 3]
+                pull += _weight(em, ex, ey, ez, anchor[j], axis[j], gravity)
                 m, h0, h1, h2 = user[j, MASS], user[j, MASS + 1], user[j, MASS + 2], user[j, MASS + 3]
                 lm += m
                 lx += m * xpos[body, 0] + xmat[body, 0] * h0 + xmat[body, 1] * h1 + xmat[body, 2] * h2
                 ly += m * xpos[body, 1] + xmat[body, 3] * h0 + xmat[body, 4] * h1 + xmat[body, 5] * h2
-                load = GRAVITY * (axis[j, 1] * (lx - lm * anchor[j, 0]) - axis[j, 0] * (ly - lm * anchor[j, 1]))
+                lz += m * xpos[body, 2] + xmat[body, 6] * h0 + xmat[body, 7] * h1 + xmat[body, 8] * h2
+                load = _weight(lm, lx, ly, lz, anchor[j], axis[j], gravity)
                 loaded = user[j, LOAD] * abs(load)
                 sign = np.sign(v) if net else np.tanh(v / WIDTH_DQ)
                 friction += loaded * sign

@@ -12,7 +12,6 @@ import numpy as np
 
 from r2s.physics.robot import Robot
 
-GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2, an upright base
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 

@@ -165,6 +165,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.MASS_ERROR] = errors[0]
     rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = errors[1]
     rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
+    rows[..., f.GRAVITY : f.GRAVITY + 3] = robot.gravity
     # an arm in which links differ from nominal, or load counts, sums them up at every step; others are spared that
     differs = (d.load != 0) | (errors[0] != 0) | (errors[1] != 0).any(-1)
     rows[..., f.LINK] = differs.any(-1, keepdims=True)

@@ -126,7 +126,7 @@ def unread(name: str, cfg: Any) -> str | None:
 
 def make_robot(cfg):
     """Return the arm of conf/robot."""
-    return part(cfg.robot, "robot", beside=["torque_fraction"])
+    return part(cfg.robot, "robot", beside=["torque_fraction", "reach"])
 
 
 def make_dynamics(cfg, robot):

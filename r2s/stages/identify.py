@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from r2s.errors import UserError, check_number
+from r2s.files import located
 from r2s.stages.build import (
     called,
     console,
@@ -263,7 +264,9 @@ def identify(cfg, overrides):
     inputs, ramps, motion = [], None, None
     if cfg.data.kind == "recording":
         own = {f.name for f in fields(File)}  # an experiment may set what other kinds of data have
-        file = called(File, "data", {k: v for k, v in plain(cfg.data).items() if k in own})
+        given = {k: v for k, v in plain(cfg.data).items() if k in own}
+        given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
+        file = called(File, "data", given)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
         if file.ramps:

@@ -1,5 +1,6 @@
 """Reach a point and stay there: the region of goals, what a policy observes, its scale, and what a step is worth."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -15,6 +16,8 @@ from r2s.tasks.task import Episodes, State
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
 CLOSE_M = 1e-3  # at least this is a distance that others are divided by
+MIDDLE = 0.05, 0.95  # of random postures: between these quantiles of their distances goals lie by default
+POSTURES = 500  # that those are told from
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class ReachTask:
         torque_fraction: an action of 1 asks for this much of tau_max; one for all joints, or one each.
         cutoff_hz: low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
-        reach: (low, high) m, distance of goals from the shoulder (the second joint).
+        reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
+            MIDDLE of what the arm reaches.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
     """
 
@@ -35,7 +39,7 @@ class ReachTask:
     torque_fraction: float | tuple[float, ...] = 0.3
     cutoff_hz: float = 100.0
     start_spread: float = 0.1
-    reach: tuple[float, float] = (0.3, 0.75)
+    reach: tuple[float, float] | None = (0.3, 0.75)
     height: float = 0.1
     azimuth: float = 1.57
 
@@ -78,37 +82,31 @@ class ReachTask:
         """Return (count, n) rad: q_home + U(-start_spread, start_spread)."""
         return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
 
+    def region(self, robot: Robot) -> tuple[float, float]:
+        """Return (low, high) m, how far from the shoulder goals lie."""
+        if self.reach is not None:
+            return self.reach
+        postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
+        low, high = np.quantile([away for _, (_, away) in postures], MIDDLE)
+        return float(low) - 1e-6, float(high) + 1e-6  # of one joint all are as far
+
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
         """Return (count, 3) m: end-effector positions of random joint angles, so that every goal can be reached.
 
         Raises:
             UserError: hardly any position of the arm lies within the task's region.
         """
-        model = robot.model(gravity=False)
-        data = mujoco.MjData(model)
-        site = model.site(robot.ee_site).id
-        data.qpos = robot.q_home
-        mujoco.mj_kinematics(model, data)
-        shoulder = data.xanchor[min(1, robot.n - 1)].copy()
-        middle, half = 0.5 * (robot.q_min + robot.q_max), 0.45 * (robot.q_max - robot.q_min)
+        reach = self.region(robot)
         found: list[np.ndarray] = []
-        for tried in range(1, 1000 * count + 1001):
-            data.qpos = middle + half * rng.uniform(-1, 1, robot.n)
-            mujoco.mj_kinematics(model, data)
-            p = data.site_xpos[site]
-            away = np.linalg.norm(p - shoulder)
-            if (
-                self.reach[0] <= away <= self.reach[1]
-                and p[2] >= self.height
-                and abs(np.arctan2(p[1], p[0])) <= self.azimuth
-            ):
-                found.append(p.copy())
+        for tried, (p, away) in enumerate(_postures(robot, rng), 1):
+            if reach[0] <= away <= reach[1] and p[2] >= self.height and abs(np.arctan2(p[1], p[0])) <= self.azimuth:
+                found.append(p)
                 if len(found) == count:
                     return np.array(found)
-            if tried == 2000 and len(found) < 2:
+            if (tried == 2000 and len(found) < 2) or tried == 1000 * count + 1000:
                 break
         raise UserError(
-            f"task.reach {self.reach[0]:g} to {self.reach[1]:g} m, task.height {self.height:g} m: {robot.name} "
+            f"task.reach {reach[0]:g} to {reach[1]:g} m, task.height {self.height:g} m: {robot.name} "
             "hardly ever gets there; widen them"
         )
 
@@ -118,11 +116,12 @@ class ReachTask:
         Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
         decide about stopping at a goal vanish.
         """
-        n, far = robot.n, self.reach[1]
+        n, far = robot.n, self.region(robot)[1]
         centre = np.zeros(5 * n + 12)
-        centre[:n] = 0.5 * (robot.q_min + robot.q_max)
+        low, high = robot.q_range
+        centre[:n] = 0.5 * (low + high)
         places = [np.full(3, 0.5 * far)] * 3
-        scale = [0.3 * (robot.q_max - robot.q_min), np.full(n, 0.5), *places, np.full(n, 0.5)]
+        scale = [0.3 * (high - low), np.full(n, 0.5), *places, np.full(n, 0.5)]
         scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(n)]
         return centre, np.concatenate(scale)
 
@@ -143,6 +142,22 @@ class ReachTask:
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
         return measures(episodes)
+
+
+def _postures(robot: Robot, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, float]]:
+    """Yield end effectors (3,) m of random joint angles, and how far they are from the shoulder, m; without end."""
+    model = robot.model(gravity=False)
+    data, site = mujoco.MjData(model), model.site(robot.ee_site).id
+    data.qpos = robot.q_home
+    mujoco.mj_kinematics(model, data)
+    shoulder = data.xanchor[min(1, robot.n - 1)].copy()
+    low, high = robot.q_range
+    middle, half = 0.5 * (low + high), 0.45 * (high - low)
+    while True:
+        data.qpos = middle + half * rng.uniform(-1, 1, robot.n)
+        mujoco.mj_kinematics(model, data)
+        p = data.site_xpos[site].copy()
+        yield p, float(np.linalg.norm(p - shoulder))
 
 
 @njit(cache=True)

@@ -18,7 +18,6 @@ KINDS = ("late", "drop", "discontinuity", "joint_limit", "estop")
 PATIENCE = 20  # cycles without an answer, in a row, until Franka's arms stop themselves
 RATE_OVER = 100  # commands that control_command_success_rate looks back on
 INSIDE = 0.02  # rad from a position limit, to which an operator opens an arm that stopped beyond it
-GRAVITY = (0.0, 0.0, -9.81)  # m/s^2, which the client's model wants to know from the state
 _ERRORS = (  # the words of `Reflexes`, and libfranka's place of the same error
     ("steps", fci.TORQUE_DISCONTINUITY),
     ("torque", fci.TORQUE_RANGE),
@@ -80,7 +79,7 @@ class Control:
         self._mode = fci.IDLE
         for frame in ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE"):
             self.state[frame] = np.eye(4).ravel()
-        self.state["O_ddP_O"] = GRAVITY
+        self.state["O_ddP_O"] = arm.robot.gravity  # which the client's model wants to know
         self._hold(arm.robot.q_home)
 
     @property

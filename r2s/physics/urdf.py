@@ -1,0 +1,290 @@
+"""Read an arm from URDF: links, joints, limits, and the shapes that the file holds itself.
+
+Meshes, materials, transmissions and simulators' own elements are left out. The base and what is fixed to it do not
+move, so their inertia does not count; a link fixed to a moving one is part of it, and its name a frame there.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError, choices, nearest
+
+MOVING, FIXED = ("revolute", "continuous"), "fixed"
+ROUNDED = 1e-9  # of a tensor's largest moment
+DRAKE = "http://drake.mit.edu"  # whose elements of an actuator say what URDF has no word for
+ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
+ET.register_namespace("drake", DRAKE)
+COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers of an attribute; others are one
+
+
+def is_urdf(path: Path) -> bool:
+    """Return whether a file is named as URDF, or begins as one."""
+    if path.suffix.lower() == ".urdf":
+        return True
+    try:
+        with path.open("rb") as file:
+            return next(ET.iterparse(file, ["start"]))[1].tag == "robot"
+    except ET.ParseError:
+        return False
+
+
+def read_urdf(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:
+    """Return what a URDF describes, and the joints' speed limits (n,) rad/s, nan where it has none.
+
+    A body has the name of its link, a joint that of its own; damping and friction of `dynamics` stay with it.
+
+    Raises:
+        UserError: no XML, no URDF, or not an arm of revolute joints; with the name of the link or joint.
+    """
+    return _Reader(path).spec()
+
+
+@dataclass(frozen=True)
+class _Lump:
+    """A mass (kg), its centre (3,) m and its tensor (3, 3) kg m^2 about that, in axes of some link."""
+
+    mass: float
+    com: np.ndarray
+    inertia: np.ndarray
+
+
+class _Reader:
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            root = ET.parse(path).getroot()
+        except ET.ParseError as error:
+            raise self._error(f"it is not XML: {error}") from None
+        if root.tag != "robot":
+            raise self._error(f"its outermost element is <{root.tag}>, of a URDF it is <robot>")
+        if any("xacro" in element.tag for element in root.iter()):
+            raise self._error("it holds xacro, which is no URDF yet: `xacro FILE > arm.urdf` makes one of it")
+        self.name = root.get("name") or path.stem
+        self.links = self._named(root, "link")
+        self.joints = self._named(root, "joint")
+        self.rotors = dict(self._rotor(element) for element in root.findall("transmission"))
+        self.children: dict[str, list[ET.Element]] = {name: [] for name in self.links}
+        self.above: dict[str, ET.Element] = {}
+        for joint in self.joints.values():
+            self._attach(joint)
+        roots = [name for name in self.links if name not in self.above]
+        if len(roots) != 1:
+            raise self._error(f"one link must carry all others; {choices(roots) or 'none'} hang on no joint")
+        self.root = roots[0]
+        if loose := sorted(set(self.links) - {self.root, *(c for _, c in self._tree(self.root))}):
+            raise self._error(f"link '{loose[0]}' does not hang on '{self.root}': its joints are a ring")
+
+    def spec(self) -> tuple[mujoco.MjSpec, np.ndarray]:
+        spec = mujoco.MjSpec()
+        spec.modelname = self.name
+        spec.compiler.degree = False
+        world = spec.worldbody
+        bodies = {self.root: world if self.root == world.name else world.add_body(name=self.root)}
+        self._shapes(bodies[self.root], self.root)
+        speeds = []
+        for joint, child in self._tree(self.root):
+            position, rotation = self._origin(joint, _what(joint))
+            body = bodies[child] = bodies[self._end(joint, "parent")].add_body(name=child, pos=position)
+            body.quat = _quaternion(rotation)
+            if joint.get("type") != FIXED:
+                lump = self._moved(child)
+                body.mass, body.ipos, body.explicitinertial = lump.mass, lump.com, True
+                x = lump.inertia
+                body.fullinertia = [x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]]
+                speeds.append(self._move(body, joint))
+            self._shapes(body, child)
+        return spec, np.array(speeds)
+
+    def _error(self, message: str) -> UserError:
+        return UserError(f"robot.mjcf: {self.path.name}: {message}")
+
+    def _named(self, root: ET.Element, tag: str) -> dict[str, ET.Element]:
+        """Return the elements of a kind by their names."""
+        out: dict[str, ET.Element] = {}
+        for element in root.findall(tag):
+            name = element.get("name")
+            if not name or name in out:
+                raise self._error(f"two elements are {tag} '{name}'" if name else f"a {tag} has no name")
+            out[name] = element
+        return out
+
+    def _attach(self, joint: ET.Element) -> None:
+        """Note what a joint joins, if an arm may have such a joint."""
+        kind, child = joint.get("type"), self._end(joint, "child")
+        if kind not in (*MOVING, FIXED):
+            raise self._error(f"{_what(joint)} is {kind}; allowed are {choices((*MOVING, FIXED))}")
+        if joint.find("mimic") is not None:
+            raise self._error(f"{_what(joint)} mimics another one, and no joint of an arm may")
+        if child in self.above:
+            raise self._error(f"link '{child}' hangs on two joints, {_what(self.above[child])} and {_what(joint)}")
+        self.above[child] = joint
+        self.children[self._end(joint, "parent")].append(joint)
+
+    def _rotor(self, transmission: ET.Element) -> tuple[str, float]:
+        """Return the joint of a transmission, and the inertia of its rotors at the joint, kg m^2."""
+        what, joint = f"transmission '{transmission.get('name')}'", transmission.find("joint")
+        inertia = 0.0
+        for actuator in transmission.findall("actuator"):
+            rotor, gear = actuator.find(ROTOR), actuator.find(GEAR)
+            ratio = 1.0 if gear is None else self._number(gear, "value", what)
+            inertia += 0.0 if rotor is None else ratio**2 * self._number(rotor, "value", what)
+        return "" if joint is None else joint.get("name", ""), inertia
+
+    def _end(self, joint: ET.Element, which: str) -> str:
+        """Return the name of a joint's parent or child link."""
+        element = joint.find(which)
+        name = element.get("link", "") if element is not None else ""
+        if name not in self.links:
+            raise self._error(f"{_what(joint)}: its {which} is no link: '{name}'{nearest(name, self.links)}")
+        return name
+
+    def _tree(self, link: str, *, fixed: bool = False) -> Iterator[tuple[ET.Element, str]]:
+        """Yield the joints beyond a link with their child links, each after what carries it; `fixed`: only those."""
+        for joint in self.children[link]:
+            if not fixed or joint.get("type") == FIXED:
+                child = self._end(joint, "child")
+                yield joint, child
+                yield from self._tree(child, fixed=fixed)
+
+    def _numbers(self, element: ET.Element, key: str, default: str, owner: str) -> np.ndarray:
+        """Return the numbers of an attribute, (k,)."""
+        text = element.get(key, default)
+        try:
+            out = np.array([float(word) for word in text.split()])
+        except ValueError:
+            out = np.array([np.nan])
+        count = COUNT.get(key, 1)
+        if len(out) != count or not np.isfinite(out).all():
+            what = f"{count} numbers" if count > 1 else "a number"
+            raise self._error(f"{owner}: {key} of <{element.tag}> must be {what}; it is '{text}'")
+        return out
+
+    def _number(self, element: ET.Element | None, key: str, owner: str, default: str = "") -> float:
+        return float(self._numbers(element if element is not None else ET.Element(key), key, default, owner)[0])
+
+    def _origin(self, element: ET.Element, owner: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return where an element's <origin> is: (3,) m, and the rotation (3, 3) of its axes."""
+        origin = element.find("origin")
+        origin = ET.Element("origin") if origin is None else origin
+        angles = self._numbers(origin, "rpy", "0 0 0", owner)
+        return self._numbers(origin, "xyz", "0 0 0", owner), _rotation(angles)
+
+    def _move(self, body: mujoco.MjsBody, joint: ET.Element) -> float:
+        """Add the joint that moves a body; return its speed limit, rad/s, or nan."""
+        what = _what(joint)
+        axis, limit, dynamics = (joint.find(tag) for tag in ("axis", "limit", "dynamics"))
+        along = np.array([1.0, 0.0, 0.0]) if axis is None else self._numbers(axis, "xyz", "1 0 0", what)
+        if np.linalg.norm(along) < 1e-6:
+            raise self._error(f"{what}: its axis is 0 0 0")
+        hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=along)
+        hinge.armature = self.rotors.get(joint.get("name", ""), 0.0)
+        hinge.damping[0] = self._number(dynamics, "damping", what, "0")
+        hinge.frictionloss = self._number(dynamics, "friction", what, "0")
+        low, high, effort, speed = (
+            self._number(limit, key, what, "0") for key in ("lower", "upper", "effort", "velocity")
+        )
+        if low > high:
+            raise self._error(f"{what}: its lower limit {low:g} is above the upper one, {high:g} rad")
+        # a revolute joint without a range is one that somebody made of a continuous one
+        hinge.limited = int(joint.get("type") == "revolute" and low < high)
+        if hinge.limited:
+            hinge.range = low, high
+        hinge.actfrclimited = int(effort > 0)
+        if effort > 0:
+            hinge.actfrcrange = -effort, effort
+        return speed if speed > 0 else np.nan
+
+    def _moved(self, link: str) -> _Lump:
+        """Return what a joint moves: a link and all that is fixed to it, in the link's frame."""
+        poses = {link: (np.zeros(3), np.eye(3))}
+        for joint, child in self._tree(link, fixed=True):
+            at, turn = poses[self._end(joint, "parent")]
+            position, rotation = self._origin(joint, _what(joint))
+            poses[child] = at + turn @ position, turn @ rotation
+        parts = []
+        for name, (at, turn) in poses.items():
+            if (own := self._inertial(name)) is not None:
+                parts.append(_Lump(own.mass, at + turn @ own.com, turn @ own.inertia @ turn.T))
+        mass = sum(part.mass for part in parts)
+        if mass <= 0:
+            raise self._error(f"link '{link}' moves, and has no <inertial> with a mass")
+        if len(parts) == 1:
+            return parts[0]
+        com = sum((part.mass * part.com for part in parts), np.zeros(3)) / mass
+        arms = [(part.mass, part.com - com) for part in parts]
+        steiner = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
+        return _Lump(mass, com, sum((part.inertia for part in parts), np.zeros((3, 3))) + steiner)
+
+    def _inertial(self, name: str) -> _Lump | None:
+        """Return a link's own inertia in its frame; None where it has none."""
+        what, element = f"link '{name}'", self.links[name].find("inertial")
+        if element is None:
+            return None
+        mass = self._number(element.find("mass"), "value", what)
+        if mass < 0:
+            raise self._error(f"{what}: its mass is {mass:g} kg")
+        if mass == 0:
+            return None
+        tensor = element.find("inertia")
+        xx, yy, zz = (self._number(tensor, key, what) for key in ("ixx", "iyy", "izz"))
+        xy, xz, yz = (self._number(tensor, key, what, "0") for key in ("ixy", "ixz", "iyz"))
+        x = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = np.linalg.eigvalsh(x)
+        if min(moments[0], moments[0] + moments[1] - moments[2]) < -ROUNDED * moments[2]:
+            raise self._error(
+                f"{what}: no body has the moments of inertia {', '.join(f'{m:.4g}' for m in moments)} kg m^2: none "
+                "may be negative, or more than the other two together"
+            )
+        com, turn = self._origin(element, what)
+        return _Lump(mass, com, turn @ x @ turn.T)
+
+    def _shapes(self, body: mujoco.MjsBody, link: str) -> None:
+        """Give a body the boxes, cylinders and spheres of its link; those that collide are marked so."""
+        kinds = mujoco.mjtGeom
+        for tag in ("visual", "collision"):
+            for element in self.links[link].findall(tag):
+                what = f"link '{link}'"
+                at, turn = self._origin(element, what)
+                for shape in element.findall("geometry/*"):
+                    if shape.tag == "box":
+                        kind, size = kinds.mjGEOM_BOX, 0.5 * self._numbers(shape, "size", "", what)
+                    elif shape.tag == "sphere":
+                        kind, size = kinds.mjGEOM_SPHERE, np.array([self._number(shape, "radius", what), 0, 0])
+                    elif shape.tag == "cylinder":
+                        radius, length = (self._number(shape, key, what) for key in ("radius", "length"))
+                        kind, size = kinds.mjGEOM_CYLINDER, np.array([radius, 0.5 * length, 0])
+                    else:
+                        continue
+                    contact = int(tag == "collision")
+                    body.add_geom(
+                        type=kind, size=size, pos=at, quat=_quaternion(turn), contype=contact, conaffinity=contact,
+                        mass=0.0,
+                    )  # fmt: skip
+
+
+def _what(joint: ET.Element) -> str:
+    return f"joint '{joint.get('name')}'"
+
+
+def _rotation(rpy: np.ndarray) -> np.ndarray:
+    """Return (3, 3) of Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    (a, b, c), (i, j, k) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [c * b, c * j * i - k * a, c * j * a + k * i],
+            [k * b, k * j * i + c * a, k * j * a - c * i],
+            [-j, b * i, b * a],
+        ]
+    )
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Return (4,) w x y z of a rotation (3, 3)."""
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, rotation.flatten())
+    return quat
