@@ -16,7 +16,6 @@ from r2s.physics.dynamics import HOLDS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-
 CREEP = 2e-3  # rad/s, below which stiction may hold: above what a step of 1 ms leaves of a stop, below any motion
 HORIZON = 0.5  # s, of the replays that a rule is chosen by: long enough for stops
 
