@@ -207,12 +207,14 @@ COULOMB = Family(
 
 
 def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    level = p[0] * (1 + np.sign(sign) * p[1]) * (1 + p[3] * np.exp(-((dq / p[4]) ** 2)))
+    rise = p[3] * (1 + np.sign(sign) * p[5])
+    level = p[0] * (1 + np.sign(sign) * p[1]) * (1 + rise * np.exp(-((dq / p[4]) ** 2)))
     return level * sign + p[2] * dq
 
 
 def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    level, bump = p[0] * (1 + np.sign(dq) * p[1]), p[3] * np.exp(-((dq / p[4]) ** 2))
+    level = p[0] * (1 + np.sign(dq) * p[1])
+    bump = p[3] * (1 + np.sign(dq) * p[5]) * np.exp(-((dq / p[4]) ** 2))
     fall = level * bump * -2 * dq / p[4] ** 2
     return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2]
 
@@ -221,7 +223,7 @@ def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np
 def _stribeck_native(p, v, h, memory):
     sign = np.tanh(v / WIDTH_DQ)
     level = p[0] * (1.0 + np.sign(v) * p[1])
-    bump = p[3] * np.exp(-((v / p[4]) ** 2))
+    bump = p[3] * (1.0 + np.sign(v) * p[5]) * np.exp(-((v / p[4]) ** 2))
     fall = level * bump * -2.0 * v / p[4] ** 2
     level *= 1.0 + bump
     return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + p[2]
@@ -230,7 +232,7 @@ def _stribeck_native(p, v, h, memory):
 @njit(cache=True)
 def _stribeck_sharp(p, v, h, memory):
     sign = np.sign(v)
-    level, bump = p[0] * (1.0 + sign * p[1]), p[3] * np.exp(-((v / p[4]) ** 2))
+    level, bump = p[0] * (1.0 + sign * p[1]), p[3] * (1.0 + sign * p[5]) * np.exp(-((v / p[4]) ** 2))
     return level * (1.0 + bump) * sign + p[2] * v, p[2] - level * bump * 2.0 * abs(v) / p[4] ** 2
 
 
@@ -240,10 +242,13 @@ def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
 
 STRIBECK = Family(
     name="stribeck",
-    names=(*COULOMB.names, "rise", "stribeck_velocity"),
-    units=(*COULOMB.units, "1", "rad/s"),
+    names=(*COULOMB.names, "rise", "stribeck_velocity", "rise_asymmetry"),
+    units=(*COULOMB.units, "1", "rad/s", "1"),
     logarithmic=("coulomb", "stribeck_velocity"),
-    formula="coulomb (1 ± asymmetry) (1 + rise exp(-(v / stribeck_velocity)²)) sign(v) + viscous v",
+    optional=("rise_asymmetry",),
+    formula=(
+        "coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v / stribeck_velocity)²)) sign(v) + viscous v"
+    ),
     law=_stribeck_law,
     law_slope=_stribeck_slope,
     native=_stribeck_native,
@@ -265,6 +270,14 @@ def _bristle_native(p, v, h, memory):
     return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
 
 
+def _bristle_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    return _stribeck_law(dq, [*p[:5], np.zeros(())], sign)
+
+
+def _bristle_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
+    return _stribeck_slope(dq, [*p[:5], np.zeros(())], sign)
+
+
 def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
     return [*_stribeck_start(level), np.full_like(level, PRESLIDING)]
 
@@ -276,12 +289,12 @@ def _bristle_held(phi: np.ndarray) -> np.ndarray:
 
 BRISTLE = Family(
     name="bristle",
-    names=(*STRIBECK.names, "presliding"),
-    units=(*STRIBECK.units, "rad"),
+    names=(*STRIBECK.names[:5], "presliding"),
+    units=(*STRIBECK.units[:5], "rad"),
     logarithmic=(*STRIBECK.logarithmic, "presliding"),
     formula="Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
-    law=_stribeck_law,
-    law_slope=_stribeck_slope,
+    law=_bristle_law,
+    law_slope=_bristle_slope,
     native=_bristle_native,
     start=_bristle_start,
     held=_bristle_held,
