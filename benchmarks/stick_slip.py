@@ -32,8 +32,8 @@ START = 2e-3  # rad/s: what a window's measured start velocity may be of a joint
 def true_dynamics(truth: dict, recording: Recording) -> Dynamics:
     """Return an arm's truth.json as far as the families express it.
 
-    Theirs have one viscous term and one Stribeck rise for both directions, where the arms have two: the law is the
-    one that is closest to the arm's over the velocities of `recording`, by least squares.
+    Theirs have one viscous term for both directions, where the arms have two: the law is the one that is closest to
+    the arm's over the velocities of `recording`, by least squares.
     """
     f = {name: np.array(values) for name, values in truth["friction"].items()}
     command, lag = truth["breakaway_on"] == "command", truth["lag_s"]
@@ -70,7 +70,7 @@ def _closest(family, f: dict, dq: np.ndarray) -> np.ndarray:
         level = level + (np.where(up, f["fs_pos"], f["fs_neg"]) - level) * np.exp(-((v / f["vs"]) ** 2))
     true = level * np.sign(v) + np.where(up, f["fv_pos"], f["fv_neg"]) * v
     mean = 0.5 * (f["fc_pos"] + f["fc_neg"])
-    start = [mean, 0.0, f["fv_pos"], 0.2, f.get("vs", 0.0)][: len(family.names)]
+    start = [mean, 0.0, f["fv_pos"], 0.2, f.get("vs", 0.0), 0.0][: len(family.names)]
     return least_squares(lambda p: family.law(v, list(p), np.sign(v)) - true, start, x_scale=0.1).x
 
 

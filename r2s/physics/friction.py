@@ -246,7 +246,9 @@ STRIBECK = Family(
     units=(*COULOMB.units, "1", "rad/s", "1"),
     logarithmic=("coulomb", "stribeck_velocity"),
     optional=("rise_asymmetry",),
-    formula="coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v/stribeck_velocity)²)) sign v + viscous v",
+    formula=(
+        "coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v / stribeck_velocity)²)) sign(v) + viscous v"
+    ),
     law=_stribeck_law,
     law_slope=_stribeck_slope,
     native=_stribeck_native,

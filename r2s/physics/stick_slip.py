@@ -170,10 +170,12 @@ def _farthest_beyond(mass, acceleration, drive, edges, side):
     worst, at, way = 0.0, -1, 1.0
     for j in range(len(side)):
         if side[j] == HELD:
-            net = drive[j]
-            for k in range(len(side)):
-                if side[k] != HELD:
-                    net -= element(mass, j, k) * acceleration[k]
+            net, row = drive[j], j * (j + 1) // 2
+            for k in range(j):
+                net -= mass[row + k] * acceleration[k]  # 0 where held
+            for k in range(j + 1, len(side)):
+                row += k
+                net -= mass[row + j] * acceleration[k]
             beyond = max(net - edges[1, j], edges[0, j] - net)
             if beyond > worst:
                 worst, at, way = beyond, j, np.sign(net)
