@@ -193,7 +193,7 @@ def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motio
     rows = np.isin(stuck.recording.trajectory, np.flatnonzero(keep))
     ramps = Ramps(stuck.recording.select(rows), stuck.joint[keep], stuck.sign[keep])
     nominal = replace(wrong, breakaway=np.array([[-0.2, 0.25]] * 3))
-    result = run(arm, nominal, motion, [TORQUE], ramps=ramps)
+    result = run(arm, nominal, motion.select(motion.t < 2.5), [TORQUE], ramps=ramps)
     assert list(result.edges.open) == ["joint 1, positive", "joint 2, negative", "joint 2, positive"]
     assert result.edges.open["joint 1, positive"] == "not ramped"
     assert re.fullmatch(r"not reached: held against 1\.(49|5) Nm", result.edges.open["joint 2, negative"])
