@@ -126,9 +126,11 @@ def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndar
     need = left.needed(gravity)
     held = np.sqrt((need**2).mean(0)) > HELD * robot.tau_max
     seen = left.seen = np.flatnonzero(moved | held)
+    if not len(seen):
+        return
     own = left.each(need, m.tau)
     said = f"the recording: tau, said to be {recording.torque},"
-    mended = []  # (what is left unexplained, what mends it), of the whole recording
+    mended = []  # (what is left unexplained of all, what mends it)
     if own.mean() > WRONG or most.max() > OVER_LIMIT:
         for factor, unit in UNITS["tau"].items():
             words = f"is {factor:g} times what {robot.name} needs for this motion: {unit}, not Nm?"
@@ -137,6 +139,7 @@ def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndar
         words = f"has the other sign in all joints: negated, it fits what {robot.name} needs"
         mended.append((left.each(need, -m.tau).mean(), words))
         mended += _other_orders(robot, m, gravity)
+    mended = [x for x in mended if x[0] < MENDED * own.mean()]
     if own.max() > WRONG:
         pairs = left.pairs(need, m.tau)
         order = linear_sum_assignment(pairs)[1]
@@ -152,7 +155,7 @@ def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndar
         words = f"has the other sign in joint{_listed(seen[flipped])}: negated, it fits what {robot.name} needs"
         if flipped.any() and not flipped.all():
             mended.append((np.where(flipped, signs, own).mean(), words))
-    if mended and min(mended)[0] < max(MENDED * own.mean(), 0.1):
+    if mended:
         raise UserError(f"{said} {min(mended)[1]}")
     if most.max() > OVER_LIMIT:
         j = int(most.argmax())

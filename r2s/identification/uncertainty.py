@@ -71,9 +71,12 @@ class Identified:
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
         edges = self.space.dynamics(f.samples).breakaway
         moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # with the offset
-        edges = np.where(got, edges + scale * np.random.default_rng(0).standard_t(freedom, edges.shape), x)
+        most = student.ppf(0.975, freedom)
+        # the far tails of few degrees of freedom are no belief in an arm: nobody should train on them
+        drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
+        edges = np.where(got, edges + scale * drawn, x)
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
-        half = np.hypot(student.ppf(0.975, freedom) * scale, moves)
+        half = np.hypot(most * scale, moves)
         held = self.edges.tried + self.dynamics.offset[:, None]
         low, high = np.where(got, x - half, held), np.where(got, x + half, held)
         low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -MOST_EDGE), np.minimum(high[:, 0], 0.0)
