@@ -78,7 +78,8 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
         data.qpos[:], data.qvel[:] = qs[i], dqs[i]
         mujoco.mj_forward(model, data)  # the bias, and M
         bias, mass = data.qfrc_bias.copy(), mass_matrix(model, data)
-        nominal, actual = weight(model, data, robot.mass, robot.com), weight(model, data, d.mass, d.com)
+        links = (robot.mass, robot.com), (d.mass, d.com)
+        nominal, actual = (weight(model, data, *one, robot.gravity) for one in links)
         loaded = d.load * np.abs(nominal)
         friction = d.friction(v, np.sign(v)) + loaded * np.sign(v)
         slope = d.family.law_slope(v, list(d.phi.T), np.where(v > 0, 1.0, -1.0))  # of either branch: without the jump
