@@ -321,7 +321,7 @@ def _urdf_joint(root: ET.Element, name: str, kind: str, parent: str, child: str,
 
 
 def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
-    """Return (3,) rad of Rz(yaw) Ry(pitch) Rx(roll) = r, as URDF and SDF have it; any yaw where the pitch is upright."""
+    """Return (3,) rad of Rz(yaw) Ry(pitch) Rx(roll) = r, as URDF and SDF have it; any yaw at upright pitch."""
     yaw = np.arctan2(r[1, 0], r[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     # what Rz(-yaw) r leaves, from elements that are well-conditioned whatever that yaw is
