@@ -184,7 +184,7 @@ def test_ramps_give_the_edges_of_the_dead_zone(found, truth):
 def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motion):
     """Its nominal edge is no command: not reached, an interval up to the bound, and an edge that it was held against.
 
-    Joint 2 is held against more than is tried, joint 1 is not ramped upwards.
+    Joint 2 holds against all that is tried (less what delay and lag keep back of a ramp), joint 1 is not ramped up.
     """
     breaks = truth.breakaway.copy()
     breaks[1] = -6.0, 6.0
@@ -193,10 +193,10 @@ def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motio
     rows = np.isin(stuck.recording.trajectory, np.flatnonzero(keep))
     ramps = Ramps(stuck.recording.select(rows), stuck.joint[keep], stuck.sign[keep])
     nominal = replace(wrong, breakaway=np.array([[-0.2, 0.25]] * 3))
-    result = run(arm, nominal, motion, [TORQUE], ramps=ramps)
+    result = run(arm, nominal, motion.select(motion.t < 2.5), [TORQUE], ramps=ramps)
     assert list(result.edges.open) == ["joint 1, positive", "joint 2, negative", "joint 2, positive"]
     assert result.edges.open["joint 1, positive"] == "not ramped"
-    assert re.fullmatch(r"not reached: held against 1\.(49|5) Nm", result.edges.open["joint 2, negative"])
+    assert re.fullmatch(r"not reached: held against 1\.(4[6-9]|5) Nm", result.edges.open["joint 2, negative"])
     edges, offset = result.dynamics.breakaway, result.dynamics.offset
     assert edges[0, 1] == 0.25  # nominal, whatever the offset
     held = result.edges.tried[1] + offset[1]
