@@ -20,7 +20,7 @@ from r2s.engines.dart import DartEngine
 from r2s.excitation.fourier import fourier
 from r2s.excitation.safety import check_limits, gravity_torque
 from r2s.files import located
-from r2s.identification.checks import check_recording
+from r2s.identification.checks import check_motion, check_recording
 from r2s.identification.parameters import parameter_space
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.learning.env import TaskEnv
@@ -199,7 +199,7 @@ def test_a_joint_without_end_has_no_limit_anywhere(write):
     twin.command(np.zeros(3))
     away = np.array([40.0, 0.0, -40.0])
     turns = Recording(t=motion.t, q=motion.q + away, dq=motion.dq, tau=motion.q, torque="measured")
-    check_recording(robot, turns)
+    check_motion(robot, turns)
 
 
 def test_goals_lie_where_the_arm_reaches(write):

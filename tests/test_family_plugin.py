@@ -107,7 +107,7 @@ def result(path, arm):
     """What a short recording of an arm with that friction says of it, the paper's law as a start."""
     truth = replace(Dynamics.of(arm, PHI, family(path)), delay=2e-3)
     noise = {k: conf("data/simulated")[k] for k in ("position_noise", "velocity_noise")}
-    motion = record(SimulatedArm(arm, truth, **noise, seed=0), fourier(arm, duration=4.0, seed=0, effort=0))
+    motion = record(SimulatedArm(arm, truth, **noise, seed=0), fourier(arm, duration=8.0, seed=0, effort=0))
     return identify(
         arm,
         nominal_dynamics(arm, **conf("friction/uniform") | {"family": path}),
