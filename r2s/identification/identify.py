@@ -19,7 +19,7 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_recording
 from r2s.identification.dead_zone import scan_breakaway
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import NONE, Problem, Report, Search, searched
+from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.torque_residual import TorqueResidual
@@ -67,7 +67,8 @@ def identify(
     """
     check_recording(robot, recording)
     names = [f.name for f in FAMILIES]
-    bounds, prior, terms, family = settings.bounds, settings.prior, settings.terms, settings.family
+    bounds, terms, family = settings.bounds, settings.terms, settings.family
+    prior = believed(settings.prior, recording)
     folds = settings.folds
     began, history = time.perf_counter(), []
 

@@ -68,7 +68,8 @@ def save_parameters(
 
 
 FIXED = ("phi", "offset", "inertia")
-LATER = ("mass", "com", "load", "drag", "gain")  # files of before may lack them: then they are the robot's, or 0
+# files of before may lack them: then they are the robot's, or 0
+LATER = ("mass", "com", "armature", "load", "drag", "gain")
 
 
 def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:

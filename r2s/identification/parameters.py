@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.link_inertia import LINK, inertia_scale, links, log_cholesky
@@ -21,8 +22,8 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 
-OTHER_UNITS = {"offset": "Nm", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1", "inertia_scale": "1"}
-OTHER_UNITS |= {name: "1" for name in LINK}
+OTHER_UNITS = {"offset": "Nm", "armature": "kg m^2", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1"}
+OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
 WHOLE_ARM = ("delay", "lag")
 OF_LINKS = ("inertia_scale", *LINK)
@@ -37,6 +38,11 @@ def units() -> dict[str, str]:
 def logarithmic() -> set[str]:
     """Return the parameters that are searched by their logarithm: they are positive."""
     return {"inertia_scale"}.union(*(f.logarithmic for f in known_families()))
+
+
+def of_torque() -> set[str]:
+    """Return the parameters that grow with an arm's torque: those in Nm, Nm s/rad, and kg m^2 of rotors."""
+    return {name for name, unit in units().items() if unit.startswith("Nm")} | {"armature"}
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ class ParameterSpace:
         """(P,) the nominal dynamics as a vector, clipped into the bounds."""
         d = self.nominal
         values = dict(zip(d.family.names, d.phi.T, strict=False))
-        values |= {"offset": d.offset, "load": d.load, "gain": d.gain}
+        values |= {"offset": d.offset, "armature": d.armature, "load": d.load, "gain": d.gain}
         values |= {"drag_sin": d.drag[:, 0], "drag_cos": d.drag[:, 1]}
         values |= {"breakaway_negative": d.breakaway[:, 0], "breakaway_positive": d.breakaway[:, 1]}
         values |= {"delay": np.array([d.delay]), "lag": np.array([d.lag])}
@@ -95,11 +101,11 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def spread_out(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return (P,): one value per block, repeated over it; `default` for blocks without one."""
-        return np.concatenate([np.full(self.size(b), values.get(b, default)) for b in self.blocks])
+        """Return (P,): of each block its value, or its values per joint (n,); `default` for blocks without one."""
+        return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     def of_joints(self, joints: np.ndarray) -> np.ndarray:
-        """Return (P,) bool: friction and offset of the joints (n,) bool; inertia and delay belong to no joint."""
+        """Return (P,) bool: friction, offset and rotor of the joints (n,) bool; links and delay are of no joint."""
         none = np.zeros(1, dtype=bool)
         return np.concatenate([none if b in WHOLE_ARM else joints & (b not in OF_LINKS) for b in self.blocks])
 
@@ -141,7 +147,8 @@ class ParameterSpace:
         phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
         drag = [value(name, d.drag[:, i]) for i, name in enumerate(("drag_sin", "drag_cos"))]
         out = replace(d, phi=np.stack(phi, -1), drag=np.stack(drag, -1))
-        out = replace(out, offset=value("offset", d.offset), load=value("load", d.load), gain=value("gain", d.gain))
+        own = {name: value(name, getattr(d, name)) for name in ("offset", "armature", "load", "gain")}
+        out = replace(out, **own)
         edges = d.breakaway
         if self.break_command is not None:
             edges = self.break_command + out.offset[..., None]
@@ -170,21 +177,24 @@ def check_parameters(where: str, names: Iterable[str]) -> None:
             raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(known)}{nearest(name, known)}")
 
 
-def check_bounds(where: str, bounds: Mapping[str, Sequence[float]]) -> None:
+def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
     """Raise UserError where bounds are not two rising numbers (positive where the scale is logarithmic)."""
     for name, pair in bounds.items():
         words = isinstance(pair, str) or any(isinstance(end, str) for end in pair)
-        if words or len(pair) != 2 or not pair[0] < pair[1] or (name in logarithmic() and pair[0] <= 0):
+        wrong = words or len(pair) != 2 or not np.all(np.less(*pair))
+        if wrong or (name in logarithmic() and np.any(np.less_equal(pair[0], 0))):
             raise UserError(f"{where}.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
 
 
 def parameter_space(
     robot: Robot,
     nominal: Dynamics,
-    bounds: Mapping[str, Sequence[float]],
+    bounds: Mapping[str, Sequence[ArrayLike]],
     break_command: np.ndarray | None = None,
 ) -> ParameterSpace:
     """Make the space from {"phi1": [low, high], ...}; a block that is not named is not searched.
+
+    An end is one number, or one per joint (n,).
 
     Raises:
         UserError: no block at all, an unknown one, one of another friction family or both kinds of inertia, or bounds
@@ -207,7 +217,9 @@ def parameter_space(
     if "inertia_scale" in bounds and set(bounds) & set(LINK):
         raise UserError("bounds: inertia_scale and link_... describe the same tensors: name one of the two")
     space = ParameterSpace(tuple(bounds), robot.n, np.zeros(0), np.zeros(0), nominal, robot, break_command)
-    sides = [space.spread_out({k: float(pair[i]) for k, pair in bounds.items()}, 0.0) for i in (0, 1)]
+    sides = [
+        space.spread_out({k: np.asarray(pair[i], dtype=float) for k, pair in bounds.items()}, 0.0) for i in (0, 1)
+    ]
     return replace(space, lower=sides[0], upper=sides[1])
 
 

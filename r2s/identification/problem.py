@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.link_inertia import LINK
-from r2s.identification.parameters import ParameterSpace, check_parameters, parameter_space
+from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, of_torque, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.physics.dynamics import Dynamics
@@ -20,9 +21,10 @@ from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
+WIDE = 4.0  # of the recorded RMS torque, bounds for motor torque
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
-TERMS = ("offset", "inertia_scale", "link", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
+TERMS = ("offset", "inertia_scale", "link", "armature", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
 Report = Callable[[dict], None]
 
 
@@ -43,18 +45,18 @@ def optional_friction() -> list[str]:
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
-def check_prior(prior: Mapping[str, float]) -> None:
+def check_prior(prior: Mapping[str, ArrayLike]) -> None:
     """Raise UserError if the prior names what does not exist (it may name what is not searched), or no deviation."""
     check_parameters("prior", prior)
     for name, sigma in prior.items():
-        if isinstance(sigma, str) or not sigma > 0:
+        if isinstance(sigma, str) or not np.all(np.greater(sigma, 0)):
             raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
 
 
 def searched(
     robot: Robot,
     nominal: Dynamics,
-    bounds: Mapping[str, Sequence[float]],
+    bounds: Mapping[str, Sequence[ArrayLike]],
     terms: Sequence[str],
     recording: Recording,
 ) -> ParameterSpace:
@@ -62,8 +64,8 @@ def searched(
 
     What `bounds` do not name has those of the family's record.
 
-    Delay and lag lie between a command and the motion, a gain error in the torque sensor: each is searched where
-    it is.
+    Delay and lag lie between a command and the motion, a gain error in what recorded the torque, and a link-side
+    sensor does not feel rotors: each is searched where it is.
 
     Raises:
         UserError: a term without bounds.
@@ -73,15 +75,45 @@ def searched(
     bounds = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | dict(bounds)
     if not set(own) & set(bounds):
         raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
+    bounds = fitting(bounds, recording)
     names = [name for name in own if name in bounds]
-    elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
+    elsewhere = {"commanded": ("gain",), "measured": ("delay", "lag", "armature"), "motor": ("delay", "lag")}
     for term in terms:
-        if term in elsewhere or term in optional_friction():
+        if term in elsewhere[recording.torque] or term in optional_friction():
             continue
         names += LINK if term == "link" else [term]
     if missing := [name for name in names if name not in bounds]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
     return parameter_space(robot, nominal, {name: bounds[name] for name in names})
+
+
+def fitting(bounds: Mapping[str, Sequence[ArrayLike]], recording: Recording) -> dict[str, Sequence[ArrayLike]]:
+    """Return bounds that fit an arm of any size: for motor torque what is in Nm reaches WIDE times the recorded RMS.
+
+    A motor's torque holds all friction of its gear: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm.
+    """
+    if recording.torque != "motor":
+        return dict(bounds)
+    reach = WIDE * _rms(recording)
+    out = dict(bounds)
+    for name in out.keys() & of_torque():
+        low, high = (np.asarray(end, dtype=float) for end in out[name])
+        out[name] = [np.where(low < 0.0, np.minimum(low, -reach), low), np.maximum(high, reach)]
+    return out
+
+
+def believed(prior: Mapping[str, ArrayLike], recording: Recording) -> dict[str, ArrayLike]:
+    """Return deviations in SI units: of what is in Nm, prior.motor names shares of each joint's RMS torque."""
+    if recording.torque != "motor":
+        return dict(prior)
+    own = of_torque() - logarithmic()
+    return {name: sigma * _rms(recording) if name in own else sigma for name, sigma in prior.items()}
+
+
+def _rms(recording: Recording) -> np.ndarray:
+    """Return (n,) Nm; of a joint that carries nothing 1 % of the largest, so that nothing has a width of 0."""
+    rms = np.sqrt((recording.tau**2).mean(0))
+    return np.maximum(rms, 0.01 * rms.max())
 
 
 class Problem:
@@ -90,7 +122,7 @@ class Problem:
     Args:
         data: the residual that decides. quick: one on the level of torque, for a fast start; may be the same.
         prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
-            the scale is logarithmic). Blocks that are not named are uniform in their bounds.
+            the scale is logarithmic), one or (n,). Blocks that are not named are uniform in their bounds.
         kept: (n,) bool, joints whose friction and offset stay nominal.
     """
 
@@ -98,7 +130,7 @@ class Problem:
         self,
         data: ReplayResidual | TorqueResidual,
         quick: TorqueResidual,
-        prior: Mapping[str, float],
+        prior: Mapping[str, ArrayLike],
         kept: np.ndarray | None = None,
     ):
         self.data, self.quick_data, self.space = data, quick, data.space

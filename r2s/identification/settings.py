@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from numpy.typing import ArrayLike
+
 from r2s.errors import UserError, check_number, choices
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import check_bounds, check_parameters
@@ -14,10 +16,10 @@ class Settings:
     """The settings of `identify`: `identify.*` of the config, with the terms and the prior of one kind of torque.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...}, of whatever may be searched.
+        bounds: {"phi1": [low, high], ...}, of whatever may be searched; an end is a number, or one per joint.
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
-        terms: what is searched beside friction: viscous, offset, inertia_scale or link, delay, lag, load, drag_sin,
-            drag_cos, gain.
+        terms: what is searched beside friction: viscous, offset, inertia_scale or link, armature, delay, lag, load,
+            drag_sin, drag_cos, gain.
         family: of the friction; auto keeps the one with the smallest error on motion left out.
         window_s: length of a replayed window, s (commanded torque).
         stride: ms that compared angles are means of (commanded torque).
@@ -31,8 +33,8 @@ class Settings:
         UserError: a family, term or parameter that does not exist, or a number outside its range.
     """
 
-    bounds: Mapping[str, Sequence[float]]
-    prior: Mapping[str, float]
+    bounds: Mapping[str, Sequence[ArrayLike]]
+    prior: Mapping[str, ArrayLike]
     terms: Sequence[str]
     family: str = "sigmoid"
     window_s: float = 0.2

@@ -1,8 +1,8 @@
 """The arm in one description and three formats: MJCF, URDF and SDF of the same links, limits and friction.
 
-The MJCF that came with the robot is the source; identified masses, centres and tensors go over it. Each link's frame
-in URDF and SDF is that of its joint at angle zero, so every tensor is written in link axes without a rotation (a
-rotated inertial frame is read wrongly by ignition-physics 5.1, the physics of Gazebo Fortress).
+The MJCF that came with the robot is the source; identified masses, centres, tensors and rotors go over it. Each
+link's frame in URDF and SDF is that of its joint at angle zero, so every tensor is written in link axes without a
+rotation (a rotated inertial frame is read wrongly by ignition-physics 5.1, the physics of Gazebo Fortress).
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
     """Return the arm's links from base to hand, and the pose (4, 4) of the end effector in the last one.
 
     Args:
-        robot: the arm. dynamics: masses, centres, tensors, friction.
+        robot: the arm. dynamics: masses, centres, tensors, rotors, friction.
         friction: add it as Coulomb and viscous terms that match it at 30 % and 100 % of the largest velocities.
     """
     model = robot.model(gravity=True)
@@ -69,7 +69,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
                 inertia=inertia,
                 damping=float(model.dof_damping[i] + viscous[i]),
                 friction=float(model.dof_frictionloss[i] + coulomb[i]),
-                armature=float(model.dof_armature[i]),
+                armature=float(dynamics.armature[i]),
             )
         )
         before = joint
@@ -90,7 +90,7 @@ def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get the first alone."""
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
-    if not robot.model(gravity=True).dof_armature.any():
+    if not dynamics.armature.any():
         write_urdf(folder / "arm.urdf", robot, dynamics)
         write_sdf(folder / "arm.sdf", robot, dynamics)
 
@@ -292,7 +292,9 @@ def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.nd
 
 def _without_armature(links: list[Link], what: str) -> None:
     if any(link.armature for link in links):
-        raise UserError(f"robot.mjcf: its joints have armature, which {what} cannot say; write it into the links")
+        raise UserError(
+            f"the joints have armature (rotor inertia, of robot.mjcf or identified), which {what} cannot say"
+        )
 
 
 def _place(pose: np.ndarray) -> dict[str, str]:

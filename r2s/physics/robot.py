@@ -30,6 +30,7 @@ class Robot:
         ee_site: the site that reaches for goals.
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
+        armature: (n,) kg m^2, nominal inertia of each joint's rotor, as the joint feels it through the gear.
         slowing: where an arm allows less speed the closer a joint is to a position limit: deceleration (n,) rad/s^2
             and offset (n,) rad/s, of sqrt(2 deceleration way + offset^2) - offset. None: it does not.
     """
@@ -47,6 +48,7 @@ class Robot:
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
+    armature: np.ndarray
     slowing: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -166,6 +168,7 @@ def load_robot(
         mass=model.body_mass[model.jnt_bodyid].copy(),
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1),
+        armature=model.dof_armature.copy(),
     )
 
 

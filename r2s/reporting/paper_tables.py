@@ -40,7 +40,7 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: Identified, commande
     if d.family.held is not None:
         return _held_by_bristles(robot, found, d.family.held)
     if not commanded:
-        return ["Nominal: a link-side sensor does not feel at which torque of the motor a joint lets go."]
+        return ["Nominal: what is fitted on the level of torque does not say at which command a joint lets go."]
     old = nominal.breakaway
     columns: dict[str, list[str]] = {}
     measured = found.break_spread is not None
@@ -153,7 +153,7 @@ def friction_table(robot: Robot, nominal: Dynamics, found: Identified, fastest: 
 
 
 def other_terms(robot: Robot, found: Identified) -> list[Item]:
-    """Return delay and lag, and what else was searched: load, drag, sensor gain."""
+    """Return delay and lag, and what else was searched: rotors, load, drag, sensor gain."""
     space = found.space
     items: list[Item] = []
     arm = [b for b in space.blocks if b in WHOLE_ARM]
@@ -164,11 +164,12 @@ def other_terms(robot: Robot, found: Identified) -> list[Item]:
             pd.DataFrame(_listed(rows), index=pd.Index([f"{b}, ms" for b in arm], name="whole arm")),
         ]
     meaning = {
+        "armature": "armature: inertia of the joint's rotor, as the joint feels it through the gear",
         "load": "load: friction per torque that gravity loads the joint with",
         "drag_sin": "drag: offset that goes with the joint's own sin q and cos q, as a cable's",
-        "gain": "gain: relative error of the torque sensor",
+        "gain": "gain: relative error of the torque sensor, or of the motor's torque constant",
     }
-    rest = [b for b in ("load", "drag_sin", "drag_cos", "gain") if b in space.blocks]
+    rest = [b for b in ("armature", "load", "drag_sin", "drag_cos", "gain") if b in space.blocks]
     if rest:
         columns = {named(b): [v.cell for v in values(space, found.found, b, found.unseen)] for b in rest}
         items += ["; ".join(meaning[b] for b in rest if b in meaning) + ".", per_joint(robot, columns)]
