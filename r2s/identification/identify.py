@@ -22,6 +22,7 @@ from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
+from r2s.identification.term_selection import needed
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
 from r2s.physics.dynamics import Dynamics, of_family
@@ -68,7 +69,7 @@ def identify(
     check_recording(robot, recording)
     names = [f.name for f in FAMILIES]
     bounds, terms, family = settings.bounds, settings.terms, settings.family
-    prior = believed(settings.prior, recording)
+    prior = believed(settings.prior, robot, recording)
     folds = settings.folds
     began, history = time.perf_counter(), []
 
@@ -94,6 +95,14 @@ def identify(
         families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
         family = names[int(chosen["best"])]
     nominal = of_family(nominal, family)
+    if spare := [name for name in settings.spare if name in terms]:
+
+        def chosen_terms() -> dict[str, Any]:
+            left = needed(robot, nominal, recording, bounds, prior, terms, spare, folds, how, told)
+            return {"needed": [name in left for name in terms]}
+
+        is_needed = np.asarray(step("terms", chosen_terms)["needed"], dtype=bool)
+        terms = [name for name, keep in zip(terms, is_needed, strict=True) if keep]
     space = searched(robot, nominal, bounds, terms, recording)
     quick = TorqueResidual(robot, space, recording, **how)
     data: ReplayResidual | TorqueResidual = quick

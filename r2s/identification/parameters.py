@@ -1,7 +1,8 @@
 """The parameters that identification searches, as one vector, and the file that carries them to the other stages.
 
 A vector is made of blocks: one value per joint or link (friction of one family, offsets, inertia), or one for the
-whole arm (delay, lag). A search sees only the unit cube; where a value spans decades its coordinate is logarithmic.
+whole arm (delay, lag, payload). A search sees only the unit cube; where a value spans decades its coordinate is
+logarithmic.
 
 Inertia has two parametrisations. `inertia_scale`, one per link, is the paper's (Table III NEW is an exact multiple of
 OLD). The full one is ten numbers per link, the log-Cholesky parameters of Rucker and Wensing (IEEE RA-L 7(2), 2022)
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
-from r2s.identification.link_inertia import LINK, inertia_scale, links, log_cholesky
+from r2s.identification.link_inertia import LINK, PAYLOAD, carrying, inertia_scale, links, log_cholesky
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
@@ -25,7 +26,9 @@ from r2s.physics.robot import Robot
 OTHER_UNITS = {"offset": "Nm", "armature": "kg m^2", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1"}
 OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
-WHOLE_ARM = ("delay", "lag")
+OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
+TIMING = ("delay", "lag")
+WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
 
 
@@ -88,8 +91,8 @@ class ParameterSpace:
         values |= {"inertia_scale": inertia_scale(d.inertia, self.robot.inertia)}
         if any(b in LINK for b in self.blocks):
             values |= dict(zip(LINK, log_cholesky(self.robot, d).T, strict=True))
-        zero = np.zeros(self.n)
-        return np.clip(np.concatenate([values.get(b, zero) for b in self.blocks]), self.lower, self.upper)
+        parts = [values.get(b, np.zeros(self.size(b))) for b in self.blocks]
+        return np.clip(np.concatenate(parts), self.lower, self.upper)
 
     def block(self, x: np.ndarray, name: str) -> np.ndarray:
         """Return the (..., n) values of one block of x (..., P); (..., 1) where it is of the whole arm."""
@@ -147,8 +150,8 @@ class ParameterSpace:
         phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
         drag = [value(name, d.drag[:, i]) for i, name in enumerate(("drag_sin", "drag_cos"))]
         out = replace(d, phi=np.stack(phi, -1), drag=np.stack(drag, -1))
-        own = {name: value(name, getattr(d, name)) for name in ("offset", "armature", "load", "gain")}
-        out = replace(out, **own)
+        out = replace(out, offset=value("offset", d.offset), armature=value("armature", d.armature))
+        out = replace(out, load=value("load", d.load), gain=value("gain", d.gain))
         edges = d.breakaway
         if self.break_command is not None:
             edges = self.break_command + out.offset[..., None]
@@ -160,12 +163,17 @@ class ParameterSpace:
         if "lag" in blocks:
             out = replace(out, lag=self.block(x, "lag")[..., 0])
         if "inertia_scale" in blocks:
-            return replace(out, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
+            out = replace(out, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
         if blocks & set(LINK):
             start = log_cholesky(self.robot, d).T if set(LINK) - blocks else np.zeros((len(LINK), self.n))
             theta = np.stack([value(name, own) for name, own in zip(LINK, start, strict=True)], -1)
             mass, com, inertia = links(self.robot, theta)
-            return replace(out, mass=mass, com=com, inertia=inertia)
+            out = replace(out, mass=mass, com=com, inertia=inertia)
+        if "payload_mass" in blocks:
+            place = [self.block(x, b)[..., 0] if b in blocks else np.zeros(lead) for b in PAYLOAD[1:]]
+            payload = self.block(x, "payload_mass")[..., 0]
+            mass, com, inertia = carrying(out.mass, out.com, out.inertia, payload, np.stack(place, -1))
+            out = replace(out, mass=mass, com=com, inertia=inertia)
         return out
 
 
@@ -181,7 +189,7 @@ def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
     """Raise UserError where bounds are not two rising numbers (positive where the scale is logarithmic)."""
     for name, pair in bounds.items():
         words = isinstance(pair, str) or any(isinstance(end, str) for end in pair)
-        wrong = words or len(pair) != 2 or not np.all(np.less(*pair))
+        wrong = words or len(pair) != 2 or not np.all(np.less(pair[0], pair[1]))
         if wrong or (name in logarithmic() and np.any(np.less_equal(pair[0], 0))):
             raise UserError(f"{where}.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.levenberg_marquardt import minimise
-from r2s.identification.link_inertia import LINK
+from r2s.identification.link_inertia import LINK, PAYLOAD
 from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, of_torque, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.torque_residual import TorqueResidual
@@ -21,10 +21,21 @@ from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-WIDE = 4.0  # of the recorded RMS torque, bounds for motor torque
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
 STEP = 1e-4  # of the unit cube: far above the round-off of a replay, far below its curvature
-TERMS = ("offset", "inertia_scale", "link", "armature", "delay", "lag", "load", "drag_sin", "drag_cos", "gain")
+TERMS = (
+    "offset",
+    "inertia_scale",
+    "link",
+    "payload",
+    "armature",
+    "delay",
+    "lag",
+    "load",
+    "drag_sin",
+    "drag_cos",
+    "gain",
+)
 Report = Callable[[dict], None]
 
 
@@ -45,12 +56,17 @@ def optional_friction() -> list[str]:
     return list(dict.fromkeys(name for f in known_families() for name in f.optional))
 
 
+def parts(term: str) -> tuple[str, ...]:
+    """Return the blocks that a term stands for."""
+    return {"link": LINK, "payload": PAYLOAD}.get(term, (term,))
+
+
 def check_prior(prior: Mapping[str, ArrayLike]) -> None:
     """Raise UserError if the prior names what does not exist (it may name what is not searched), or no deviation."""
     check_parameters("prior", prior)
     for name, sigma in prior.items():
         if isinstance(sigma, str) or not np.all(np.greater(sigma, 0)):
-            raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
+            raise UserError(f"prior.{name}: {sigma!s} is not a positive standard deviation")
 
 
 def searched(
@@ -60,7 +76,7 @@ def searched(
     terms: Sequence[str],
     recording: Recording,
 ) -> ParameterSpace:
-    """Return the space of the family's parameters and `terms`; `link` stands for its ten blocks.
+    """Return the space of the family's parameters and `terms`; `link` and `payload` stand for several.
 
     What `bounds` do not name has those of the family's record.
 
@@ -75,45 +91,45 @@ def searched(
     bounds = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | dict(bounds)
     if not set(own) & set(bounds):
         raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
-    bounds = fitting(bounds, recording)
+    bounds = fitting(bounds, robot, recording)
     names = [name for name in own if name in bounds]
     elsewhere = {"commanded": ("gain",), "measured": ("delay", "lag", "armature"), "motor": ("delay", "lag")}
     for term in terms:
         if term in elsewhere[recording.torque] or term in optional_friction():
             continue
-        names += LINK if term == "link" else [term]
+        names += parts(term)
     if missing := [name for name in names if name not in bounds]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
     return parameter_space(robot, nominal, {name: bounds[name] for name in names})
 
 
-def fitting(bounds: Mapping[str, Sequence[ArrayLike]], recording: Recording) -> dict[str, Sequence[ArrayLike]]:
-    """Return bounds that fit an arm of any size: for motor torque what is in Nm reaches WIDE times the recorded RMS.
+def fitting(
+    bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
+) -> dict[str, Sequence[ArrayLike]]:
+    """Return bounds that fit an arm of any size: for motor torque what is in Nm reaches as far as the joint's torque.
 
     A motor's torque holds all friction of its gear: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm.
     """
-    if recording.torque != "motor":
-        return dict(bounds)
-    reach = WIDE * _rms(recording)
     out = dict(bounds)
-    for name in out.keys() & of_torque():
-        low, high = (np.asarray(end, dtype=float) for end in out[name])
-        out[name] = [np.where(low < 0.0, np.minimum(low, -reach), low), np.maximum(high, reach)]
+    if recording.torque == "motor":
+        reach = _largest_torque(robot, recording)
+        for name in out.keys() & of_torque():
+            low, high = (np.asarray(end, dtype=float) for end in out[name])
+            out[name] = [np.where(low < 0.0, np.minimum(low, -reach), low), np.maximum(high, reach)]
     return out
 
 
-def believed(prior: Mapping[str, ArrayLike], recording: Recording) -> dict[str, ArrayLike]:
-    """Return deviations in SI units: of what is in Nm, prior.motor names shares of each joint's RMS torque."""
+def believed(prior: Mapping[str, ArrayLike], robot: Robot, recording: Recording) -> dict[str, ArrayLike]:
+    """Return deviations in SI units: what is in Nm, prior.motor names as shares of each joint's largest torque."""
     if recording.torque != "motor":
         return dict(prior)
-    own = of_torque() - logarithmic()
-    return {name: sigma * _rms(recording) if name in own else sigma for name, sigma in prior.items()}
+    own, reach = of_torque() - logarithmic(), _largest_torque(robot, recording)
+    return {name: sigma * reach if name in own else sigma for name, sigma in prior.items()}
 
 
-def _rms(recording: Recording) -> np.ndarray:
-    """Return (n,) Nm; of a joint that carries nothing 1 % of the largest, so that nothing has a width of 0."""
-    rms = np.sqrt((recording.tau**2).mean(0))
-    return np.maximum(rms, 0.01 * rms.max())
+def _largest_torque(robot: Robot, recording: Recording) -> np.ndarray:
+    """Return (n,) Nm: the arm's limits, or what was recorded where that is more."""
+    return np.maximum(robot.tau_max, np.abs(recording.tau).max(0))
 
 
 class Problem:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, check_number, choices
-from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import check_bounds, check_parameters
-from r2s.identification.problem import check_choices, check_prior, optional_friction
+from r2s.identification.problem import check_choices, check_prior, optional_friction, parts
 
 
 @dataclass(frozen=True)
@@ -18,8 +17,8 @@ class Settings:
     Attributes:
         bounds: {"phi1": [low, high], ...}, of whatever may be searched; an end is a number, or one per joint.
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
-        terms: what is searched beside friction: viscous, offset, inertia_scale or link, armature, delay, lag, load,
-            drag_sin, drag_cos, gain.
+        terms: what is searched beside friction: viscous, offset, inertia_scale or link, payload, armature, delay,
+            lag, load, drag_sin, drag_cos, gain.
         family: of the friction; auto keeps the one with the smallest error on motion left out.
         window_s: length of a replayed window, s (commanded torque).
         stride: ms that compared angles are means of (commanded torque).
@@ -27,6 +26,7 @@ class Settings:
         breakaway: scan the dead zone's edges up to this, Nm, where there are no ramps (commanded torque; a link-side
             sensor does not feel the motor's breakaway). None keeps the nominal edges.
         folds: of the cross-validation within the recording.
+        spare: those of the terms that are left out where motion left out is predicted as well without them.
         keep_nominal: a joint whose refit predicts motion left out not clearly better than the nominal one keeps that.
 
     Raises:
@@ -43,13 +43,14 @@ class Settings:
     breakaway: float | None = 1.5
     folds: int = 4
     keep_nominal: bool = False
+    spare: Sequence[str] = ()
 
     def __post_init__(self):
         check_choices(self.family, self.terms)
         check_parameters("bounds", self.bounds)
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
-        terms = [name for term in self.terms for name in (LINK if term == "link" else [term])]
+        terms = [name for term in self.terms for name in parts(term)]
         if missing := [name for name in terms if name not in {*self.bounds, *optional_friction()}]:
             raise UserError(f"identify.bounds: none for {choices(missing)}")
         check_number("identify.window_s", self.window_s, "(0, inf)")
@@ -58,5 +59,5 @@ class Settings:
         if self.breakaway is not None:
             check_number("identify.breakaway", self.breakaway, "[0, inf)")
         check_number("identify.folds", self.folds, "[1, inf)", whole=True)
-        if self.folds < 2 and (self.family == "auto" or self.keep_nominal):
+        if self.folds < 2 and (self.family == "auto" or self.keep_nominal or self.spare):
             raise UserError(f"identify.folds: {self.folds} is too few to leave motion out; at least 2 are needed")

@@ -6,12 +6,11 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.link_inertia import LINK
-from r2s.identification.parameters import WHOLE_ARM
 from r2s.identification.uncertainty import Identified
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
-from r2s.reporting.identified_values import Value, named, per_joint, values
+from r2s.reporting.identified_values import Value, named, of_whole_arm, per_joint, values
 from r2s.reporting.tables import number
 
 TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2), "Iyz": (1, 2)}
@@ -153,15 +152,14 @@ def friction_table(robot: Robot, nominal: Dynamics, found: Identified, fastest: 
 
 
 def other_terms(robot: Robot, found: Identified) -> list[Item]:
-    """Return delay and lag, and what else was searched: rotors, load, drag, sensor gain."""
+    """Return delay and lag, payload, and what else was searched: rotors, load, drag, sensor gain."""
     space = found.space
     items: list[Item] = []
-    arm = [b for b in space.blocks if b in WHOLE_ARM]
-    if arm:
-        rows = [values(space, found.found, b, found.unseen)[0].times(1e3) for b in arm]
+    if arm := of_whole_arm(space, found.found, found.unseen):
         items += [
-            "Between a command and the torque at the joint.",
-            pd.DataFrame(_listed(rows), index=pd.Index([f"{b}, ms" for b in arm], name="whole arm")),
+            "Delay and lag are between a command and the torque at the joint; a payload is what the last link carries, "
+            "its centre in that link's frame.",
+            pd.DataFrame(_listed([*arm.values()]), index=pd.Index(list(arm), name="whole arm")),
         ]
     meaning = {
         "armature": "armature: inertia of the joint's rotor, as the joint feels it through the gear",

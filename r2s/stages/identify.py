@@ -215,7 +215,7 @@ def make_settings(cfg, torque):
 
     words: dict[str, Any] = plain(cfg.identify)
     del words["validation_fraction"]
-    for key in ("terms", "prior"):
+    for key in ("terms", "spare", "prior"):
         words[key] = words[key][torque]
     return called(Settings, "identify", words | {"family": cfg.friction.family})
 
