@@ -216,9 +216,12 @@ class Search(Protocol):
         ...
 
 
-def fit_torque(problem: Problem, rounds: int = 2) -> np.ndarray:
-    """Return u (P,) by least squares on the level of torque, weighed again after every round."""
-    u = problem.start
+def fit_torque(problem: Problem) -> np.ndarray:
+    """Return u (P,) by least squares on the level of torque, weighed again after every round.
+
+    Of motor torque the nominal friction may be off by tens of Nm, so the first weights say little.
+    """
+    u, rounds = problem.start, 4 if problem.quick_data.at_motor else 2
     for k in range(rounds):
         u = minimise(problem.quick, problem.quick_jacobian, u, 12, 1e-3)
         if k < rounds - 1:

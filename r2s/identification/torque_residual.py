@@ -44,7 +44,7 @@ class TorqueResidual:
         self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
         self.commanded = recording.torque == "commanded"
         self._rotors = 0.0 if recording.torque == "measured" else m.ddq  # a link-side sensor does not feel them
-        self._at_motor = recording.torque == "motor"
+        self.at_motor = recording.torque == "motor"
         gravity = None if self.commanded else GRAVITY
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
         self._rest = rest - robot.armature * m.ddq  # rotors are the candidate's
@@ -74,14 +74,14 @@ class TorqueResidual:
         d, m = dynamics, self.motion
         standard = self._standard(d).ravel()
         out = self._rest + self._y @ standard + d.armature * self._rotors
-        if not self.commanded and not self._at_motor:  # the sensor sits before what is added below
+        if not self.commanded and not self.at_motor:  # the sensor sits before what is added below
             out = out * (1.0 + d.gain)
         out += m.filtered(d.friction(m.fast, m.bristle if d.family.has_memory else None)) - d.offset
         if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
         out += d.load * self._load * self._sign[d.family.has_memory]
-        return out * (1.0 + d.gain) if self._at_motor else out
+        return out * (1.0 + d.gain) if self.at_motor else out
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
