@@ -288,7 +288,7 @@ WRONG = [
     (
         {},
         {"torque_constant": 1.0, "torque": "measured"},
-        "data.torque_constant is for data.torque=motor, not measured",
+        "torque_constant is for data.torque=motor, not measured",
     ),
     ({"tau_motor": 1.0}, {"torque_constant": 1.0}, "no column 'current' for tau (motor torque)"),
     ({"tau_motor": 1.0}, {"torque_constant": 1.0}, "tau_motor is torque already"),

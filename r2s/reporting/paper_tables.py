@@ -157,8 +157,8 @@ def other_terms(robot: Robot, found: Identified) -> list[Item]:
     items: list[Item] = []
     if arm := of_whole_arm(space, found.found, found.unseen):
         items += [
-            "Delay and lag are between a command and the torque at the joint; a payload is what the last link carries, "
-            "its centre in that link's frame.",
+            "Delay and lag are between a command and the torque at the joint; a payload is what the last link "
+            "carries, its centre in that link's frame.",
             pd.DataFrame(_listed([*arm.values()]), index=pd.Index(list(arm), name="whole arm")),
         ]
     meaning = {
