@@ -51,9 +51,10 @@ def needed(
             x = space.from_unit(fit_torque(Problem(own, own, prior)))
             error, window = test.on(space).error(x[None])[0] ** 2, test.clusters[:: robot.n]
             out.append(np.stack([error[window == w].mean(0) for w in np.unique(window)]))
-        done += 1
-        report({"search": "terms", "evaluations": 0, "done": done, "total": 1 + len(spare)})
-        return np.concatenate(out)
+        done, squares = done + 1, np.concatenate(out)
+        row = {"search": "terms", "evaluations": 0, "cost": float(squares.mean())}
+        report(row | {"done": done, "total": 1 + len(spare)})
+        return squares
 
     kept, whole = list(terms), errors(terms)
     best = whole / whole.mean(0)  # joints count alike
