@@ -248,6 +248,15 @@ def test_rotors_go_where_the_arm_goes(arm, truth, tmp_path, start):
     np.testing.assert_allclose(again.nominal.armature, arm.armature)
 
 
+def test_spare_terms_are_terms():
+    """An unknown one gets one line; leaving motion out needs two folds, but only where a spare term is searched."""
+    with pytest.raises(UserError, match=r"^identify\.spare: unknown term 'lnk'; .*did you mean 'link'"):
+        settings(spare=["lnk"])
+    with pytest.raises(UserError, match=r"^identify\.folds: 1 is too few"):
+        settings(spare=["link"], folds=1)
+    settings(terms=["offset"], spare=["link"], folds=1)
+
+
 def log(path, **change):
     """Write a log of a motor torque of three joints."""
     t = 1e-3 * np.arange(50)

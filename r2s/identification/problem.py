@@ -43,12 +43,15 @@ def check_choices(family: str, terms: Sequence[str]) -> None:
     """Raise UserError if there is no such friction family, or no such term to search."""
     if family != "auto":
         friction_family(family)
+    check_terms("identify.terms", terms)
+
+
+def check_terms(where: str, terms: Sequence[str]) -> None:
+    """Raise UserError if there is no such term to search."""
     known = (*optional_friction(), *TERMS)
     for name in terms:
         if name not in known:
-            raise UserError(
-                f"identify.terms: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}"
-            )
+            raise UserError(f"{where}: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
 
 
 def optional_friction() -> list[str]:

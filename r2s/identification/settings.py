@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, check_number, choices
 from r2s.identification.parameters import check_bounds, check_parameters
-from r2s.identification.problem import check_choices, check_prior, optional_friction, parts
+from r2s.identification.problem import check_choices, check_prior, check_terms, optional_friction, parts
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Settings:
 
     def __post_init__(self):
         check_choices(self.family, self.terms)
+        check_terms("identify.spare", self.spare)
         check_parameters("bounds", self.bounds)
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
@@ -59,5 +60,5 @@ class Settings:
         if self.breakaway is not None:
             check_number("identify.breakaway", self.breakaway, "[0, inf)")
         check_number("identify.folds", self.folds, "[1, inf)", whole=True)
-        if self.folds < 2 and (self.family == "auto" or self.keep_nominal or self.spare):
+        if self.folds < 2 and (self.family == "auto" or self.keep_nominal or {*self.spare} & {*self.terms}):
             raise UserError(f"identify.folds: {self.folds} is too few to leave motion out; at least 2 are needed")

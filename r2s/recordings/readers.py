@@ -214,13 +214,13 @@ def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError
     inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
     nested = [key for key, last in inside.items() if last == name]
     hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
-    in_nm = [column for column in (TAU["motor"], "tau") if _match(table, field, column)]
-    if torque == "motor" and name in CURRENT and in_nm:
-        hint = f"; {in_nm[0]} is torque already if it is in Nm: then leave data.torque_constant null"
     for other, column in TAU.items():
         known = column in inside.values() or _match(table, field, column)
         if field == "tau" and torque and other != torque and known and not nested:
             hint = f"; {column} is {other} torque"
+    in_nm = [column for column in (TAU["motor"], "tau") if _match(table, field, column)]
+    if torque == "motor" and name in CURRENT and in_nm:
+        hint = f"; {in_nm[0]} is torque already if it is in Nm: then leave data.torque_constant null"
     of = f" ({torque} torque)" if torque and field == "tau" else ""
     return UserError(
         f"no column '{name}' for {field}{of}; columns: {_listed(table)}{hint} (set data.columns.{field})"
