@@ -22,7 +22,7 @@ from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
-from r2s.identification.term_selection import needed
+from r2s.identification.spare_terms import needed
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
 from r2s.physics.dynamics import Dynamics, of_family
