@@ -184,7 +184,7 @@ def test_ramps_give_the_edges_of_the_dead_zone(found, truth):
 def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motion):
     """Its nominal edge is no command: not reached, an interval up to the bound, and an edge that it was held against.
 
-    Joint 2 is held against more than is tried (less what delay and lag keep back of a ramp), joint 1 is not ramped up.
+    Joint 2 holds against all that is tried (less what delay and lag keep back of a ramp), joint 1 is not ramped up.
     """
     breaks = truth.breakaway.copy()
     breaks[1] = -6.0, 6.0

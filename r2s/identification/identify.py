@@ -21,7 +21,6 @@ from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
 from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
 from r2s.identification.replay_residual import ReplayResidual
-from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
 from r2s.identification.static_friction import StaticFriction
@@ -162,19 +161,17 @@ def identify(
         # what a first search leaves is not noise: weights come from what the last one could not explain
         problem.adapt(u, fitted=k == len(searches) - 1 or on_level)
     last = searches[-1]
-    if last.local and data is not quick:  # it goes on from where it was, weighed by what is left unexplained
+    if last.local:  # a local search goes on from where it was, weighed by what is left unexplained
 
         def again(row: dict) -> None:
             told(row | {"search": f"{row['search']}, reweighed"})
 
-        local = last if lag is None else partial(without_lag, last)
-        u = ended("reweighed", local, u, again)  # type: ignore[arg-type]
-        problem.adapt(u, fitted=True)
-        if lag is not None and np.array_equal(u[lag], problem.start[lag]):
+        for k in range(2 if data is quick else 1):
+            local = last if data is quick or lag is None else partial(without_lag, last)
+            u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
+            problem.adapt(u, fitted=True)
+        if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):
             problem.believe(lag, NONE)
-    elif data is quick:
-        problem.adapt(u, fitted=True)
-        u = ended("level", LeastSquares(max_evaluations=12, ftol=1e-5, level="torque"), u)
     dynamics, edges = space.dynamics(space.from_unit(u)), None
     if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))

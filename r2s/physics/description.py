@@ -321,10 +321,12 @@ def _urdf_joint(root: ET.Element, name: str, kind: str, parent: str, child: str,
 
 
 def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
-    """Return (3,) rad of Rz(yaw) Ry(pitch) Rx(roll) = r, as URDF and SDF have it."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(r).as_euler("xyz")
+    """Return (3,) rad of Rz(yaw) Ry(pitch) Rx(roll) = r, as URDF and SDF have it; any yaw at upright pitch."""
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    # what Rz(-yaw) r leaves, from elements that are well-conditioned whatever that yaw is
+    roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
+    return np.array([roll, np.arctan2(-r[2, 0], c * r[0, 0] + s * r[1, 0]), yaw])
 
 
 def _pose_words(pose: np.ndarray) -> str:

@@ -367,6 +367,8 @@ def passive_torque(
 ) -> np.ndarray:
     """Return what the joints feel beside the command `tau`, Nm: offset - friction, or the dead zone's hold.
 
+    The rule "command" of `Dynamics.hold`; of "net" r2s/physics/stick_slip.py is the law.
+
     Dead zone (eq. 6 and Table II): while abs(dq) < dq_min and command plus offset lie within the breakaway band,
     the action is nullified (the joint feels neither command nor offset).
 

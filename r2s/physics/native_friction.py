@@ -28,14 +28,13 @@ MARK, FAMILY, P1 = range(3)
 OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
 DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: the next twelve are in use
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
-NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds; REST: friction as sliding begins
+NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
 Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(GRAVITY + 3, GRAVITY + 8)  # of soft limits; 0: there are none
 WIDTH = DQ_DAMPING + 1
 MARKER = 7_202_020.0
-# Rows of what a step knows of its joints, two each of the last two: of the negative and the positive direction.
-SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES = 0, 1, 2, 3, 4, 5, 7
-ROWS = 9
+# Rows of what a step knows of its joints. REST and EDGES: two each, of the negative and the positive direction.
+SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
 
 
 # the place of a law is its number in `jnt_user`
