@@ -52,7 +52,7 @@ def searches(name: str, **change) -> list:
 def how(torque: str = "commanded", **change) -> Settings:
     """Return the settings of `identify` as stage=identify gives them, but for the family."""
     own = {k: v for k, v in SETTINGS.items() if k != "validation_fraction"}
-    return Settings(**own | {k: own[k][torque] for k in ("terms", "prior", "extra")} | change)
+    return Settings(**own | {k: own[k][torque] for k in ("terms", "prior", "extra", "spare")} | change)
 
 
 def side_by_side(jobs: Sequence[Sequence[str]]) -> None:

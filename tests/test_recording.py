@@ -105,7 +105,7 @@ def test_duration_and_rate_leave_out_the_time_between_trajectories():
         (lambda x: x.update(torque=""), "torque is not declared"),
         (
             lambda x: x.update(torque="mesured"),
-            "unknown torque 'mesured'; allowed: measured, commanded; did you mean",
+            "unknown torque 'mesured'; allowed: measured, commanded, motor; did you mean",
         ),
         (lambda x: x.update(q="abc"), "q is not a rectangular array of numbers"),
         (lambda x: x.update(period=-1), "period=-1"),
@@ -397,7 +397,7 @@ def drop(table, *names):
         (
             lambda x: x,
             {"torque": "comanded"},
-            "unknown torque 'comanded'; allowed: measured, commanded; did you mean",
+            "unknown torque 'comanded'; allowed: measured, commanded, motor; did you mean",
         ),
         (lambda x: x, {"columns": {"ta": "tau"}}, "unknown key 'ta' in data.columns; allowed: t, q, dq, tau"),
         (lambda x: x, {"columns": {"t": "tt"}}, "no column 'tt' for t; columns: t, segment, q1"),

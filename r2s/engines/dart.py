@@ -25,6 +25,7 @@ class DartEngine:
         gravity: False is libfranka's convention (the arm compensates it).
         masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in
             link axes; each replaces the file's values for the n moving links.
+        armature: (n,) kg m^2 of the joints, in place of the file's.
         dt: time step, s.
         stop_margin: rad, how far outside the position limits the hard stops are.
 
@@ -41,6 +42,7 @@ class DartEngine:
         masses: np.ndarray | None = None,
         coms: np.ndarray | None = None,
         inertias: np.ndarray | None = None,
+        armature: np.ndarray | None = None,
         dt: float = SIM_DT,
         stop_margin: float = 0.0,
     ):
@@ -53,7 +55,7 @@ class DartEngine:
         self.robot = robot
         # DART has no armature. Damping A/h with the torque (A/h) v put back is the same thing exactly: the
         # implicit step solves (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
-        self._armature = model.dof_armature.copy()
+        self._armature = np.array(robot.armature if armature is None else armature, dtype=float)
         self._damping = model.dof_damping + self._armature / dt
         self._counter = self._armature / dt if self._armature.any() else None
         self._low, self._high = -robot.tau_max, robot.tau_max
@@ -156,7 +158,9 @@ class DartEngine:
 def dart(robot: Robot) -> Callable[[Dynamics], DartEngine]:
     """Return what makes the engine of simulator=dart: of an arm with these links, without gravity."""
     _dartpy()
-    return lambda d: DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
+    return lambda d: DartEngine(
+        robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia, armature=d.armature
+    )
 
 
 def _dartpy() -> ModuleType:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.problem import Problem, Report, fit_torque, searched
@@ -45,8 +46,8 @@ def compare_families(
     robot: Robot,
     nominal: Dynamics,
     recording: Recording,
-    bounds: Mapping[str, Sequence[float]],
-    prior: Mapping[str, float],
+    bounds: Mapping[str, Sequence[ArrayLike]],
+    prior: Mapping[str, ArrayLike],
     terms: Sequence[str],
     folds: int,
     how: Mapping[str, Any],
@@ -86,7 +87,7 @@ def joints_kept(
     robot: Robot,
     space: ParameterSpace,
     recording: Recording,
-    prior: Mapping[str, float],
+    prior: Mapping[str, ArrayLike],
     folds: int,
     how: Mapping[str, Any],
 ) -> np.ndarray:

@@ -19,9 +19,10 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import NONE, Problem, Report, Search, searched
+from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
+from r2s.identification.spare_terms import needed
 from r2s.identification.static_friction import StaticFriction
 from r2s.identification.term_selection import demanded
 from r2s.identification.torque_residual import TorqueResidual
@@ -69,7 +70,8 @@ def identify(
     """
     check_motion(robot, recording)
     names = [f.name for f in FAMILIES]
-    bounds, prior, family = settings.bounds, settings.prior, settings.family
+    bounds, family = settings.bounds, settings.family
+    prior = believed(settings.prior, robot, recording)
     terms = list(settings.terms)
     folds = settings.folds
     began, history = time.perf_counter(), []
@@ -107,6 +109,14 @@ def identify(
 
         entered = np.asarray(step("terms", choose)["entered"], dtype=bool)
         terms = with_terms(terms, [name for name, enters in zip(settings.extra, entered, strict=True) if enters])
+    if spare := [name for name in settings.spare if name in terms]:
+
+        def chosen_terms() -> dict[str, Any]:
+            left = needed(robot, nominal, recording, bounds, prior, terms, spare, folds, how, told)
+            return {"needed": [name in left for name in terms]}
+
+        is_needed = np.asarray(step("terms", chosen_terms)["needed"], dtype=bool)
+        terms = [name for name, keep in zip(terms, is_needed, strict=True) if keep]
     space = searched(robot, nominal, bounds, terms, recording)
     quick = TorqueResidual(robot, space, recording, **level)
     data: ReplayResidual | TorqueResidual = quick

@@ -11,6 +11,7 @@ from r2s.physics.robot import Robot
 
 CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
 LINK = tuple(f"link_{name}" for name in CHOLESKY)
+PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 
 
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -59,6 +60,28 @@ def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
     diagonal = [np.log(v[..., i, i]) for i in range(3)]
     rest = [v[..., 0, 1], v[..., 0, 2], v[..., 1, 2], v[..., 0, 3], v[..., 1, 3], v[..., 2, 3]]
     return np.stack([np.log(scale), *diagonal, *rest], -1)
+
+
+def carrying(
+    mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, payload: np.ndarray, place: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mass (..., n) kg, com (..., n, 3) m and tensor (..., n, 3, 3) of links, the last with a payload.
+
+    Its centre counts more than its extent, so it is a point: a gripper's own tensor is small beside m r^2.
+
+    Args:
+        mass, com, inertia: of the links without it.
+        payload: (...) kg, at least 0. place: (..., 3) m, of its centre in the last link's frame.
+    """
+    lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
+    out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]
+    own, arm = out[0][..., -1].copy(), place - out[1][..., -1, :]
+    share = payload / (own + payload)
+    out[0][..., -1] += payload
+    out[1][..., -1, :] += share[..., None] * arm
+    square = (arm**2).sum(-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
+    out[2][..., -1, :, :] += (own * share)[..., None, None] * square
+    return out[0], out[1], out[2]
 
 
 def inertia_scale(inertia: np.ndarray, nominal: np.ndarray) -> np.ndarray:

@@ -10,7 +10,15 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, nearest
-from r2s.identification.parameters import WHOLE_ARM, Estimate, ParameterSpace, logarithmic, parameter_space, units
+from r2s.identification.parameters import (
+    TIMING,
+    WHOLE_ARM,
+    Estimate,
+    ParameterSpace,
+    logarithmic,
+    parameter_space,
+    units,
+)
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
 from r2s.physics.friction import spelled
@@ -59,7 +67,7 @@ def save_parameters(
         "inertia": fixed.inertia.tolist(),
     }
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in LATER}
-    document["fixed"] |= {k: float(getattr(fixed, k)) for k in WHOLE_ARM}
+    document["fixed"] |= {k: float(getattr(fixed, k)) for k in TIMING}
     d = space.dynamics(found.x)
     rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for the reader; parameters are loaded
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
@@ -69,7 +77,8 @@ def save_parameters(
 
 
 FIXED = ("phi", "offset", "inertia")
-LATER = ("mass", "com", "load", "drag", "gain")  # files of before may lack them: then they are the robot's, or 0
+# files of before may lack them: then they are the robot's, or 0
+LATER = ("mass", "com", "armature", "load", "drag", "gain")
 
 
 def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:

@@ -1,7 +1,8 @@
 """The parameters that identification searches, as one vector, and the file that carries them to the other stages.
 
 A vector is made of blocks: one value per joint or link (friction of one family, offsets, inertia), or one for the
-whole arm (delay, lag). A search sees only the unit cube; where a value spans decades its coordinate is logarithmic.
+whole arm (delay, lag, payload). A search sees only the unit cube; where a value spans decades its coordinate is
+logarithmic.
 
 Inertia has two parametrisations. `inertia_scale`, one per link, is the paper's (Table III NEW is an exact multiple of
 OLD). The full one is ten numbers per link, the log-Cholesky parameters of Rucker and Wensing (IEEE RA-L 7(2), 2022)
@@ -14,17 +15,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
-from r2s.identification.link_inertia import LINK, inertia_scale, links, log_cholesky
+from r2s.identification.link_inertia import LINK, PAYLOAD, carrying, inertia_scale, links, log_cholesky
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 
-OTHER_UNITS = {"offset": "Nm", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1", "inertia_scale": "1"}
-OTHER_UNITS |= {name: "1" for name in LINK}
+OTHER_UNITS = {"offset": "Nm", "armature": "kg m^2", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1"}
+OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
-WHOLE_ARM = ("delay", "lag")
+OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
+TIMING = ("delay", "lag")
+WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
 
 
@@ -37,6 +41,11 @@ def units() -> dict[str, str]:
 def logarithmic() -> set[str]:
     """Return the parameters that are searched by their logarithm: they are positive."""
     return {"inertia_scale"}.union(*(f.logarithmic for f in known_families()))
+
+
+def of_torque() -> set[str]:
+    """Return the parameters that grow with an arm's torque: those in Nm, Nm s/rad, and kg m^2 of rotors."""
+    return {name for name, unit in units().items() if unit.startswith("Nm")} | {"armature"}
 
 
 @dataclass(frozen=True)
@@ -76,15 +85,15 @@ class ParameterSpace:
         """(P,) the nominal dynamics as a vector, clipped into the bounds."""
         d = self.nominal
         values = dict(zip(d.family.names, d.phi.T, strict=False))
-        values |= {"offset": d.offset, "load": d.load, "gain": d.gain}
+        values |= {"offset": d.offset, "armature": d.armature, "load": d.load, "gain": d.gain}
         values |= {"drag_sin": d.drag[:, 0], "drag_cos": d.drag[:, 1]}
         values |= {"breakaway_negative": d.breakaway[:, 0], "breakaway_positive": d.breakaway[:, 1]}
         values |= {"delay": np.array([d.delay]), "lag": np.array([d.lag])}
         values |= {"inertia_scale": inertia_scale(d.inertia, self.robot.inertia)}
         if any(b in LINK for b in self.blocks):
             values |= dict(zip(LINK, log_cholesky(self.robot, d).T, strict=True))
-        zero = np.zeros(self.n)
-        return np.clip(np.concatenate([values.get(b, zero) for b in self.blocks]), self.lower, self.upper)
+        parts = [values.get(b, np.zeros(self.size(b))) for b in self.blocks]
+        return np.clip(np.concatenate(parts), self.lower, self.upper)
 
     def block(self, x: np.ndarray, name: str) -> np.ndarray:
         """Return the (..., n) values of one block of x (..., P); (..., 1) where it is of the whole arm."""
@@ -96,11 +105,11 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def spread_out(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return (P,): one value per block, repeated over it; `default` for blocks without one."""
-        return np.concatenate([np.full(self.size(b), values.get(b, default)) for b in self.blocks])
+        """Return (P,): of each block its value, or its values per joint (n,); `default` for blocks without one."""
+        return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     def of_joints(self, joints: np.ndarray) -> np.ndarray:
-        """Return (P,) bool: friction and offset of the joints (n,) bool; inertia and delay belong to no joint."""
+        """Return (P,) bool: friction, offset and rotor of the joints (n,) bool; links and delay are of no joint."""
         none = np.zeros(1, dtype=bool)
         return np.concatenate([none if b in WHOLE_ARM else joints & (b not in OF_LINKS) for b in self.blocks])
 
@@ -142,7 +151,8 @@ class ParameterSpace:
         phi = [value(name, column) for name, column in zip(d.family.names, columns, strict=False)]
         drag = [value(name, d.drag[:, i]) for i, name in enumerate(("drag_sin", "drag_cos"))]
         out = replace(d, phi=np.stack(phi, -1), drag=np.stack(drag, -1))
-        out = replace(out, offset=value("offset", d.offset), load=value("load", d.load), gain=value("gain", d.gain))
+        out = replace(out, offset=value("offset", d.offset), armature=value("armature", d.armature))
+        out = replace(out, load=value("load", d.load), gain=value("gain", d.gain))
         edges = d.breakaway
         if self.break_command is not None:
             edges = self.break_command + out.offset[..., None]
@@ -155,12 +165,17 @@ class ParameterSpace:
         if "lag" in blocks:
             out = replace(out, lag=self.block(x, "lag")[..., 0])
         if "inertia_scale" in blocks:
-            return replace(out, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
+            out = replace(out, inertia=self.robot.inertia * self.block(x, "inertia_scale")[..., None, None])
         if blocks & set(LINK):
             start = log_cholesky(self.robot, d).T if set(LINK) - blocks else np.zeros((len(LINK), self.n))
             theta = np.stack([value(name, own) for name, own in zip(LINK, start, strict=True)], -1)
             mass, com, inertia = links(self.robot, theta)
-            return replace(out, mass=mass, com=com, inertia=inertia)
+            out = replace(out, mass=mass, com=com, inertia=inertia)
+        if "payload_mass" in blocks:
+            place = [self.block(x, b)[..., 0] if b in blocks else np.zeros(lead) for b in PAYLOAD[1:]]
+            payload = self.block(x, "payload_mass")[..., 0]
+            mass, com, inertia = carrying(out.mass, out.com, out.inertia, payload, np.stack(place, -1))
+            out = replace(out, mass=mass, com=com, inertia=inertia)
         return out
 
 
@@ -172,21 +187,24 @@ def check_parameters(where: str, names: Iterable[str]) -> None:
             raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(known)}{nearest(name, known)}")
 
 
-def check_bounds(where: str, bounds: Mapping[str, Sequence[float]]) -> None:
+def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
     """Raise UserError where bounds are not two rising numbers (positive where the scale is logarithmic)."""
     for name, pair in bounds.items():
         words = isinstance(pair, str) or any(isinstance(end, str) for end in pair)
-        if words or len(pair) != 2 or not pair[0] < pair[1] or (name in logarithmic() and pair[0] <= 0):
+        wrong = words or len(pair) != 2 or not np.all(np.less(pair[0], pair[1]))
+        if wrong or (name in logarithmic() and np.any(np.less_equal(pair[0], 0))):
             raise UserError(f"{where}.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
 
 
 def parameter_space(
     robot: Robot,
     nominal: Dynamics,
-    bounds: Mapping[str, Sequence[float]],
+    bounds: Mapping[str, Sequence[ArrayLike]],
     break_command: np.ndarray | None = None,
 ) -> ParameterSpace:
     """Make the space from {"phi1": [low, high], ...}; a block that is not named is not searched.
+
+    An end is one number, or one per joint (n,).
 
     Raises:
         UserError: no block at all, an unknown one, one of another friction family or both kinds of inertia, or bounds
@@ -209,7 +227,9 @@ def parameter_space(
     if "inertia_scale" in bounds and set(bounds) & set(LINK):
         raise UserError("bounds: inertia_scale and link_... describe the same tensors: name one of the two")
     space = ParameterSpace(tuple(bounds), robot.n, np.zeros(0), np.zeros(0), nominal, robot, break_command)
-    sides = [space.spread_out({k: float(pair[i]) for k, pair in bounds.items()}, 0.0) for i in (0, 1)]
+    sides = [
+        space.spread_out({k: np.asarray(pair[i], dtype=float) for k, pair in bounds.items()}, 0.0) for i in (0, 1)
+    ]
     return replace(space, lower=sides[0], upper=sides[1])
 
 

@@ -35,7 +35,7 @@ def prediction_errors(
     for name, dynamics in (("", identified), ("nominal_", nominal)):
         error = torque.off(dynamics)
         out[f"{name}torque_rmse_Nm"] = np.sqrt((error**2).mean(0)).tolist()
-    if recording.torque == "measured":
+    if recording.torque != "commanded":
         return out
     windows = cut_windows(recording, window_s)
     for name, dynamics in (("", identified), ("nominal_", nominal)):

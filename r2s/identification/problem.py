@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.levenberg_marquardt import minimise
-from r2s.identification.link_inertia import LINK
-from r2s.identification.parameters import ParameterSpace, check_parameters, parameter_space
+from r2s.identification.link_inertia import LINK, PAYLOAD
+from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, of_torque, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.static_friction import StaticFriction
 from r2s.identification.torque_residual import STEP, TorqueResidual
@@ -22,7 +23,8 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 NONE = 1e-4  # standard deviation of the belief in a value that is not searched
-TERMS = ("offset", "inertia_scale", "link", "delay", "lag", "load", "drag", "drag_sin", "drag_cos", "gain")
+TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
+TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
 
 
@@ -30,12 +32,15 @@ def check_choices(family: str, terms: Sequence[str]) -> None:
     """Raise UserError if there is no such friction family, or no such term to search."""
     if family != "auto":
         friction_family(family)
+    check_terms("identify.terms", terms)
+
+
+def check_terms(where: str, terms: Sequence[str]) -> None:
+    """Raise UserError if there is no such term to search."""
     known = (*optional_friction(), *TERMS)
     for name in terms:
         if name not in known:
-            raise UserError(
-                f"identify.terms: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}"
-            )
+            raise UserError(f"{where}: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
 
 
 def optional_friction() -> list[str]:
@@ -45,30 +50,30 @@ def optional_friction() -> list[str]:
 
 def parts(term: str) -> tuple[str, ...]:
     """Return the blocks that a term stands for."""
-    return {"link": tuple(LINK), "drag": ("drag_sin", "drag_cos")}.get(term, (term,))
+    return {"link": tuple(LINK), "payload": PAYLOAD, "drag": ("drag_sin", "drag_cos")}.get(term, (term,))
 
 
-def check_prior(prior: Mapping[str, float]) -> None:
+def check_prior(prior: Mapping[str, ArrayLike]) -> None:
     """Raise UserError if the prior names what does not exist (it may name what is not searched), or no deviation."""
     check_parameters("prior", prior)
     for name, sigma in prior.items():
-        if isinstance(sigma, str) or not sigma > 0:
-            raise UserError(f"prior.{name}: {sigma} is not a positive standard deviation")
+        if isinstance(sigma, str) or not np.all(np.greater(sigma, 0)):
+            raise UserError(f"prior.{name}: {sigma!s} is not a positive standard deviation")
 
 
 def searched(
     robot: Robot,
     nominal: Dynamics,
-    bounds: Mapping[str, Sequence[float]],
+    bounds: Mapping[str, Sequence[ArrayLike]],
     terms: Sequence[str],
     recording: Recording,
 ) -> ParameterSpace:
-    """Return the space of the family's parameters and `terms`; `link` stands for its ten blocks.
+    """Return the space of the family's parameters and `terms`; `link` and `payload` stand for several.
 
     What `bounds` do not name has those of the family's record.
 
-    Delay and lag lie between a command and the motion, a gain error in the torque sensor: each is searched where
-    it is.
+    Delay and lag lie between a command and the motion, a gain error in what recorded the torque, and a link-side
+    sensor does not feel rotors: each is searched where it is.
 
     Raises:
         UserError: a term without bounds.
@@ -78,14 +83,44 @@ def searched(
     bounds = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | dict(bounds)
     if not set(own) & set(bounds):
         raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
+    bounds = fitting(bounds, robot, recording)
     names = [name for name in own if name in bounds]
-    elsewhere = ("gain",) if recording.torque == "commanded" else ("delay", "lag")
+    elsewhere = {"commanded": ("gain",), "measured": ("delay", "lag", "armature"), "motor": ("delay", "lag")}
     for term in terms:
-        if term not in elsewhere and term not in optional_friction():
+        if term not in elsewhere[recording.torque] and term not in optional_friction():
             names += parts(term)
     if missing := [name for name in names if name not in bounds]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
     return parameter_space(robot, nominal, {name: bounds[name] for name in names})
+
+
+def fitting(
+    bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
+) -> dict[str, Sequence[ArrayLike]]:
+    """Return bounds that fit an arm of any size: for motor torque what is in Nm reaches as far as the joint's torque.
+
+    A motor's torque holds all friction of its gear: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm.
+    """
+    out = dict(bounds)
+    if recording.torque == "motor":
+        reach = _largest_torque(robot, recording)
+        for name in out.keys() & of_torque():
+            low, high = (np.asarray(end, dtype=float) for end in out[name])
+            out[name] = [np.where(low < 0.0, np.minimum(low, -reach), low), np.maximum(high, reach)]
+    return out
+
+
+def believed(prior: Mapping[str, ArrayLike], robot: Robot, recording: Recording) -> dict[str, ArrayLike]:
+    """Return deviations in SI units: what is in Nm, prior.motor names as shares of each joint's largest torque."""
+    if recording.torque != "motor":
+        return dict(prior)
+    own, reach = of_torque() - logarithmic(), _largest_torque(robot, recording)
+    return {name: sigma * reach if name in own else sigma for name, sigma in prior.items()}
+
+
+def _largest_torque(robot: Robot, recording: Recording) -> np.ndarray:
+    """Return (n,) Nm: the arm's limits, or what was recorded where that is more."""
+    return np.maximum(robot.tau_max, np.abs(recording.tau).max(0))
 
 
 class Problem:
@@ -94,7 +129,7 @@ class Problem:
     Args:
         data: the residual that decides. quick: one on the level of torque, for a fast start; may be the same.
         prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
-            the scale is logarithmic). Blocks that are not named are uniform in their bounds.
+            the scale is logarithmic), one or (n,). Blocks that are not named are uniform in their bounds.
         kept: (n,) bool, joints whose friction and offset stay nominal.
         at_rest: what is known of friction at standstill.
     """
@@ -103,7 +138,7 @@ class Problem:
         self,
         data: ReplayResidual | TorqueResidual,
         quick: TorqueResidual,
-        prior: Mapping[str, float],
+        prior: Mapping[str, ArrayLike],
         kept: np.ndarray | None = None,
         at_rest: StaticFriction | None = None,
     ):
@@ -185,9 +220,12 @@ class Search(Protocol):
         ...
 
 
-def fit_torque(problem: Problem, rounds: int = 2) -> np.ndarray:
-    """Return u (P,) by least squares on the level of torque, weighed again after every round."""
-    u = problem.start
+def fit_torque(problem: Problem) -> np.ndarray:
+    """Return u (P,) by least squares on the level of torque, weighed again after every round.
+
+    Of motor torque the nominal friction may be off by tens of Nm, so the first weights say little.
+    """
+    u, rounds = problem.start, 4 if problem.quick_data.at_motor else 2
     for k in range(rounds):
         u = minimise(problem.quick, problem.quick_jacobian, u, 12, 1e-3)
         if k < rounds - 1:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.identification.family_selection import FAMILY_HZ, left_out
 from r2s.identification.parameters import ParameterSpace, parameter_space
@@ -22,8 +23,8 @@ CLEARLY = 2.0  # standard errors by which motion left out must be predicted bett
 def demanded(
     space: ParameterSpace,
     recording: Recording,
-    bounds: Mapping[str, Sequence[float]],
-    prior: Mapping[str, float],
+    bounds: Mapping[str, Sequence[ArrayLike]],
+    prior: Mapping[str, ArrayLike],
     extra: Sequence[str],
     folds: int,
     how: Mapping[str, Any],
@@ -67,8 +68,8 @@ class _Fold:
         space: ParameterSpace,
         rest: Recording,
         out: Recording,
-        bounds: Mapping[str, Sequence[float]],
-        prior: Mapping[str, float],
+        bounds: Mapping[str, Sequence[ArrayLike]],
+        prior: Mapping[str, ArrayLike],
         extra: Sequence[str],
         how: Mapping[str, Any],
     ):

@@ -1,8 +1,9 @@
 """What a candidate gets wrong of torque, at the measured motion.
 
-For measured link-side torque (with gravity) there is no command to replay, so the residual is the torque that rigid
-dynamics, friction and offset predict against the measured one. It exists for commanded torque, too, where it is a
-fast start. In units of its own standard deviation, as far as `adapt` could tell it.
+For measured link-side torque and for motor torque (both with gravity) there is no command to replay, so the residual
+is the torque that rigid dynamics, friction and offset predict against the recorded one. A link-side sensor does not
+feel rotors. The residual exists for commanded torque, too, where it is a fast start. In units of its own standard
+deviation, as far as `adapt` could tell it.
 """
 
 from copy import copy
@@ -46,10 +47,11 @@ class TorqueResidual:
         self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
         self.seen = m.unmixed(np.abs(m.fast) >= slowest) if slowest else np.ones_like(m.q, dtype=bool)
         self.commanded = recording.torque == "commanded"
+        self._rotors = 0.0 if recording.torque == "measured" else m.ddq  # a link-side sensor does not feel them
+        self.at_motor = recording.torque == "motor"
         gravity = None if self.commanded else robot.gravity
-        self._rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
-        if not self.commanded:  # a link-side sensor does not feel rotors
-            self._rest -= robot.armature * m.ddq
+        rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
+        self._rest = rest - robot.armature * m.ddq  # rotors are the candidate's
         self._y = y.reshape(*m.q.shape, -1)
         still = np.zeros_like(m.q)
         y = regressor(robot, m.q, still, still, robot.gravity)
@@ -72,17 +74,18 @@ class TorqueResidual:
         return other
 
     def predict(self, dynamics: Dynamics) -> np.ndarray:
-        """Return (T, n) Nm: rigid-body torque + friction - offset at the measured motion, of one arm."""
+        """Return (T, n) Nm: rigid bodies and rotors + friction - offset at the measured motion, of one arm."""
         d, m = dynamics, self.motion
         standard = self._standard(d).ravel()
-        out = self._rest + self._y @ standard
-        if not self.commanded:
+        out = self._rest + self._y @ standard + d.armature * self._rotors
+        if not self.commanded and not self.at_motor:  # the sensor sits before what is added below
             out = out * (1.0 + d.gain)
         out += m.filtered(d.friction(m.fast, m.bristle if d.family.has_memory else None)) - d.offset
         if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
-        return out + d.load * self._load * self._sign[d.family.has_memory]
+        out += d.load * self._load * self._sign[d.family.has_memory]
+        return out * (1.0 + d.gain) if self.at_motor else out
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""

@@ -34,7 +34,7 @@ class Oracle:
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
         self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
         self._model = robot.model(gravity=False)
-        put_links(self._model, dynamics.mass, dynamics.com, dynamics.inertia)
+        put_links(self._model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site(robot.ee_site).id
         self._torque = task.torque(robot)

@@ -1,8 +1,8 @@
 """The arm in one description and three formats: MJCF, URDF and SDF of the same links, limits and friction.
 
-The MJCF that came with the robot is the source; identified masses, centres and tensors go over it. Each link's frame
-in URDF and SDF is that of its joint at angle zero, so every tensor is written in link axes without a rotation (a
-rotated inertial frame is read wrongly by ignition-physics 5.1, the physics of Gazebo Fortress).
+The MJCF that came with the robot is the source; identified masses, centres, tensors and rotors go over it. Each
+link's frame in URDF and SDF is that of its joint at angle zero, so every tensor is written in link axes without a
+rotation (a rotated inertial frame is read wrongly by ignition-physics 5.1, the physics of Gazebo Fortress).
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
     """Return the arm's links from base to hand, and the pose (4, 4) of the end effector in the last one.
 
     Args:
-        robot: the arm. dynamics: masses, centres, tensors, friction.
+        robot: the arm. dynamics: masses, centres, tensors, rotors, friction.
         friction: add it as Coulomb and viscous terms that match it at 30 % and 100 % of the largest velocities.
     """
     model = robot.model(gravity=True)
@@ -73,7 +73,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
                 inertia=inertia,
                 damping=float(model.dof_damping[i] + viscous[i]),
                 friction=float(model.dof_frictionloss[i] + coulomb[i]),
-                armature=float(model.dof_armature[i]),
+                armature=float(dynamics.armature[i]),
             )
         )
         before = joint
@@ -95,7 +95,7 @@ def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
     write_urdf(folder / "arm.urdf", robot, dynamics)
-    if not robot.armature.any():
+    if not dynamics.armature.any():
         write_sdf(folder / "arm.sdf", robot, dynamics)
 
 

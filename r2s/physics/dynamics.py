@@ -1,4 +1,4 @@
-"""What an arm's dynamics are: friction, offsets, breakaway, links, delay and lag."""
+"""What an arm's dynamics are: friction, offsets, breakaway, links, rotors, delay and lag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,9 +24,12 @@ class Dynamics:
         dq_min: rad/s, speed below which it may be held.
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
+        armature: (..., n) kg m^2, inertia of each joint's rotor, as the joint feels it through the gear. A link-side
+            torque sensor does not.
         load: (..., n), friction per torque that gravity loads the joint with.
         drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's.
-        gain: (..., n), relative error of the link-side torque sensor. Only a measured torque knows it.
+        gain: (..., n), relative error of the link-side torque sensor, or of the motor's torque constant: of what is
+            recorded, not of the arm.
         family: of the friction.
         hold: which torque the edges are of. "command" is the paper's eq. (6): command and offset are nullified while
             they are within the edges. "net" is stiction: a joint stays where it is while all that acts on it, the
@@ -42,6 +45,7 @@ class Dynamics:
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
+    armature: np.ndarray
     load: np.ndarray
     drag: np.ndarray
     gain: np.ndarray
@@ -58,7 +62,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return the robot's own links with friction phi (..., n, K) of a family, and nothing else."""
+        """Return the robot's own links and rotors with friction phi (..., n, K) of a family, and nothing else."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -68,6 +72,7 @@ class Dynamics:
             mass=robot.mass,
             com=robot.com,
             inertia=robot.inertia,
+            armature=robot.armature,
             load=np.zeros(n),
             drag=np.zeros((n, 2)),
             gain=np.zeros(n),
@@ -85,8 +90,8 @@ class Dynamics:
 
 
 # of an array that one arm has
-AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "load": 1, "drag": 2, "gain": 1}
-AXES |= {"delay": 0, "lag": 0}
+AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "armature": 1}
+AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0}
 
 
 def nominal_dynamics(

@@ -135,9 +135,12 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return moments, quaternions.reshape(*axes.shape[:-2], 4)
 
 
-def put_links(model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> None:
-    """Give the moving links of a compiled arm mass (n,) kg, centre (n, 3) m and tensor about it (n, 3, 3)."""
+def put_links(
+    model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
+) -> None:
+    """Give a compiled arm's links mass (n,) kg, centre (n, 3) m, tensor about it (n, 3, 3), rotors (n,) kg m^2."""
     at = model.jnt_bodyid
+    model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
     model.body_inertia[at], model.body_iquat[at] = principal_axes(inertia)
     mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -35,6 +35,7 @@ class Simulator:
         self._site = self.model.site(robot.ee_site).id
         self._user = self.batch.expand("jnt_user")
         self._damping = self.batch.expand("dof_damping")  # the friction law writes it: must not be shared by threads
+        self._armature = self.batch.expand("dof_armature")
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
         self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
@@ -59,6 +60,7 @@ class Simulator:
         at = arms[:, None], self._bodies
         self._user[arms, :, : native.Q_LOW] = spread(_law_columns(self.robot, self.model, dynamics), 2)
         self._damping[arms] = self.model.dof_damping
+        self._armature[arms] = spread(dynamics.armature, 1)
         self._inertia[at] = spread(moments, 2)
         self._iquat[at] = spread(axes, 2)
         self._mass[at] = spread(dynamics.mass, 1)
@@ -90,7 +92,7 @@ class Simulator:
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Go back to what `state` returned; what the arms do next is the same, bit for bit."""
-        for name in ("_user", "_inertia", "_iquat", "_mass", "_com"):
+        for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -99,7 +101,7 @@ class Simulator:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        names = ("q", "dq", "_memory", "_damping", "_user", "_inertia", "_iquat", "_mass", "_com")
+        names = ("q", "dq", "_memory", "_damping", "_user", "_armature", "_inertia", "_iquat", "_mass", "_com")
         return {name: getattr(self, name) for name in names}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
@@ -134,13 +136,13 @@ def _jacobian(axis, anchor, ee):
 
 
 def single_arm(robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None) -> mujoco.MjModel:
-    """Return one arm's model with its links, its friction law and the driver's soft limits in it, without gravity."""
+    """Return one arm's model without gravity: its links and rotors, friction law and the driver's soft limits."""
     native.install()
     model = robot.model(gravity=False, user=native.WIDTH)
     model.jnt_user[:, : native.Q_LOW] = _law_columns(robot, model, dynamics)
     if soft is not None:
         model.jnt_user[:, native.Q_LOW :] = _soft_columns(soft)
-    put_links(model, dynamics.mass, dynamics.com, dynamics.inertia)
+    put_links(model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
     return model
 
 

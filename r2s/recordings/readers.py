@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.recordings.recording import MIN_ROWS, Recording, declared_torque
@@ -25,7 +26,8 @@ DEFAULT_COLUMNS = {  # the first name that the file has
     "tau": ("tau",),
     "trajectory": ("segment", "trajectory"),
 }
-FRANKA_TAU = {"measured": "tau_J", "commanded": "tau_J_d"}  # looked for before tau
+TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # looked for before tau
+CURRENT = ("current", "i")  # looked for with a torque constant
 OPTIONAL = ("dq", "trajectory")
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
 RESTART_S = 0.1  # s, from its first moment: where a clock goes back to that starts anew
@@ -45,31 +47,36 @@ def read(
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     model_joints: Sequence[str] | None = None,
+    torque_constant: ArrayLike | None = None,
 ) -> Recording:
     """Read the recording in `path`, or raise a UserError: one line, the file and what is wrong with it.
 
-    torque: 'measured' (contains gravity) or 'commanded' (does not); None only where the file itself says it.
-    columns: the name in the file for any of t (s), q (rad), dq (rad/s), tau (Nm), trajectory. None is
-        the default, t: t, q: q, dq: dq, tau: tau_J if measured or tau_J_d if commanded, where absent tau,
-        trajectory: segment, where absent trajectory. A name for q, dq or tau is a (T, n) array, or stands for
-        q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name spells
-        that out; a list names the joints one by one. In HDF5 a name is a path: robot/q.
+    torque: 'measured' (contains gravity), 'commanded' (does not) or 'motor' (gravity, all friction and rotors are in
+        it); None only where the file itself says it.
+    columns: the name in the file for any of t (s), q (rad), dq (rad/s), tau (Nm, or A), trajectory. None is
+        the default, t: t, q: q, dq: dq, tau: tau_J if measured, tau_J_d if commanded or tau_motor if motor, where
+        absent tau, trajectory: segment, where absent trajectory. A name for q, dq or tau is a (T, n) array, or
+        stands for q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name
+        spells that out; a list names the joints one by one. In HDF5 a name is a path: robot/q.
     n_joints: expected number of joints, if known.
     max_gap_s: longer gaps in time start a new trajectory; None leaves them. Units of time are never guessed.
     period: s, see `Recording`. name: of the recording; the default is the file's.
     topic, joints, model_joints: of a bag (.bag, .db3, .mcap or a ROS 2 bag's folder), see `bag_table`.
+    torque_constant: Nm/A at the joint (gear included), (n,) or one for all, of a motor's currents: tau is then the
+        column of the current, A (the default is current, where absent i).
 
     Without dq in the file it is the central difference of q on the logged time (zero phase), each trajectory
     by itself; without trajectory, gaps separate them, and (not in a bag) a clock that goes
     back to where it began. A file by `Recording.save` comes back as it was. The
     logs of `franka::logToCSV` and of Franka's ROS messages hold both torques: `torque` picks one.
     """
+    constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
     bag = {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints}
     table = load_table(path, bag)
     try:
         how = n_joints, max_gap_s, period, name or path.stem
-        return from_table(table, torque, columns or {}, *how, restarting=not is_bag(path))
+        return from_table(table, torque, columns or {}, *how, restarting=not is_bag(path), constant=constant)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 
@@ -83,16 +90,17 @@ def from_table(
     period: float | None = None,
     name: str = "",
     restarting: bool = False,
+    constant: np.ndarray | None = None,
 ) -> Recording:
     """Return the recording that a file's columns hold; arguments as in `read`, errors without the file's name.
 
     restarting: a clock that goes back to where it began starts a new trajectory. In a bag it does not: there
-        messages of two starts may be mixed.
+        messages of two starts may be mixed. constant: Nm/A, () or (n,), where tau is a current.
     """
     notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # what `Recording.save` says about the rows
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(torque, notes.get("torque"))
-    found = {field: find_columns(table, field, spec, torque) for field, spec in _specs(columns).items()}
+    found = {field: find_columns(table, field, spec, torque, constant) for field, spec in _specs(columns).items()}
     arrays = {
         field: _vector(table, names, n_joints, field) if field in ("q", "dq", "tau") else scalar(table, names)
         for field, names in found.items()
@@ -102,6 +110,8 @@ def from_table(
         arrays["trajectory"] = anew
     if not np.any(arrays["tau"]):  # a position-controlled or simulated arm fills the field, with nothing
         raise UserError(f"tau ({listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
+    if constant is not None:
+        arrays["tau"] = arrays["tau"] * _per_joint(constant, arrays["tau"])
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
@@ -146,10 +156,49 @@ def _specs(columns: Mapping[str, Spec]) -> dict[str, Spec]:
     return {field: columns.get(field) for field in DEFAULT_COLUMNS}
 
 
-def find_columns(table: Table, field: str, spec: Spec, torque: str = "") -> list[str]:
+def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
+    """Return torque constants as floats, () or (n,), or None where there are none."""
+    if value is None:
+        return None
+    where = "data.torque_constant"
+    if torque != "motor":
+        raise UserError(f"{where} is for data.torque=motor, not {torque}; leave it null")
+    try:
+        constant = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise UserError(f"{where}: {value} is not a number of Nm/A, nor a list of one per joint") from None
+    if constant.ndim > 1 or not np.all(np.isfinite(constant)) or np.any(constant == 0):
+        raise UserError(f"{where}: {constant.tolist()} must be finite Nm/A, not 0: one per joint, or one for all")
+    return constant
+
+
+def _per_joint(constant: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    joints = tau.shape[-1] if tau.ndim > 1 else 1
+    if constant.ndim and constant.shape != (joints,):
+        raise UserError(f"data.torque_constant has {constant.size} values for {joints} joints")
+    return constant
+
+
+def _is_current(name: str) -> bool:
+    """Whether a column's name says that it holds a current: it must not pass for a torque."""
+    base = name.rsplit("/", 1)[-1].lower()
+    return "current" in base or re.fullmatch(r"i(_?(\d+|\{[ij]\})|\[\d+\])?", base) is not None
+
+
+def find_columns(
+    table: Table, field: str, spec: Spec, torque: str = "", constant: np.ndarray | None = None
+) -> list[str]:
     """Return the columns of a field; [] where an optional one is absent."""
-    defaults = DEFAULT_COLUMNS[field]
-    candidates = (FRANKA_TAU[torque], *defaults) if field == "tau" else defaults
+    candidates = DEFAULT_COLUMNS[field]
+    if field == "tau":
+        candidates = (TAU[torque], *candidates) if constant is None else CURRENT
+        named = [name for name in ([spec] if isinstance(spec, str) else spec or []) if _is_current(name)]
+        if spec is None and not any(_match(table, field, name) for name in candidates):
+            named = [name for name in CURRENT if _match(table, field, name)]
+        if named and torque == "motor" and constant is None:
+            raise UserError(
+                f"column '{named[0]}' is a current: set data.torque_constant=[Nm/A of each joint, gear included]"
+            )
     if spec is not None and not isinstance(spec, str):
         missing = [name for name in spec if name not in table]
         if missing or not spec:
@@ -200,10 +249,13 @@ def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError
     inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
     nested = [key for key, last in inside.items() if last == name]
     hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
-    for other, column in FRANKA_TAU.items():
+    for other, column in TAU.items():
         known = column in inside.values() or _match(table, field, column)
         if field == "tau" and torque and other != torque and known and not nested:
             hint = f"; {column} is {other} torque"
+    in_nm = [column for column in (TAU["motor"], "tau") if _match(table, field, column)]
+    if torque == "motor" and name in CURRENT and in_nm:
+        hint = f"; {in_nm[0]} is torque already if it is in Nm: then leave data.torque_constant null"
     of = f" ({torque} torque)" if torque and field == "tau" else ""
     return UserError(f"no column '{name}' for {field}{of}; columns: {listed(table)}{hint} (set data.columns.{field})")
 

@@ -12,7 +12,7 @@ from r2s.errors import UserError, choices, nearest
 from r2s.files import whole
 from r2s.recordings.repeats import TOLERANCE, comes_again, share_known, tracks_of
 
-TORQUES = ("measured", "commanded")
+TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
 SPLIT_GUARD_S = 0.1  # rows this close to the held-out ones are nearly the same rows: neither side gets them
 
@@ -33,7 +33,8 @@ class Recording:
     tau: np.ndarray
     """(T, n) Nm; `torque` says which."""
     torque: str
-    """'measured': link-side sensor, contains gravity. 'commanded': the command, without gravity."""
+    """'measured': link-side sensor, contains gravity. 'commanded': the command, without gravity. 'motor': of the
+    motors, as their joints would feel it through an ideal gear; contains gravity, all friction and rotor inertia."""
     trajectory: np.ndarray = None  # type: ignore[assignment]
     """(T,) index of the continuous stretch a row belongs to; None means that all rows are one stretch."""
     period: float | None = None
@@ -314,12 +315,13 @@ class Recording:
 
 
 def declared_torque(torque: str | None) -> str:
-    """Return `torque` if it is one of `TORQUES`; to who left it open a UserError explains both."""
+    """Return `torque` if it is one of `TORQUES`; to who left it open a UserError explains them."""
     if torque in TORQUES:
         return str(torque)
     meaning = (
-        "say data.torque=measured (link-side sensor, contains gravity: tau_J of a Franka) or "
-        "data.torque=commanded (the command, without gravity: tau_J_d); the numbers alone do not tell"
+        "say data.torque=measured (link-side sensor, contains gravity: tau_J of a Franka), "
+        "data.torque=commanded (the command, without gravity: tau_J_d) or data.torque=motor (of the motors, contains "
+        "gravity and all friction; from currents with data.torque_constant); the numbers alone do not tell"
     )
     if torque in (None, "", "???"):
         raise UserError(f"torque is not declared; {meaning}")

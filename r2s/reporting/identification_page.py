@@ -28,7 +28,11 @@ from r2s.reporting.paper_tables import (
 )
 from r2s.reporting.tables import number
 
-LINK_SIDE = "link-side torque, with gravity"
+TORQUE = {  # what a recording's torque is, in words
+    "commanded": "commanded torque, without gravity",
+    "measured": "link-side torque, with gravity",
+    "motor": "motor torque, with gravity and all friction",
+}
 
 
 def identification_sections(
@@ -104,8 +108,7 @@ def identification_sections(
 def _headlines(robot: Robot, found: Identified, validation: Recording, summary: Mapping) -> list[str]:
     """Return the first lines of the report."""
     family = found.dynamics.family.name
-    with_gravity = "commanded torque, without gravity" if validation.torque == "commanded" else LINK_SIDE
-    parts = [f"Recording {validation.name or 'without a name'}: {with_gravity}"]
+    parts = [f"Recording {validation.name or 'without a name'}: {TORQUE[validation.torque]}"]
     for side, words in (
         ("train", "fitted to {:.1f} s of motion"),
         ("validation", "judged on {:.1f} s of other motion"),

@@ -11,7 +11,7 @@ from r2s.identification.link_inertia import LINK, inertia_scale
 from r2s.identification.parameters import WHOLE_ARM
 from r2s.identification.uncertainty import Identified
 from r2s.physics.robot import Robot
-from r2s.reporting.identified_values import LEGEND, named, per_joint, values
+from r2s.reporting.identified_values import LEGEND, named, of_whole_arm, per_joint, values
 from r2s.reporting.tables import number, print_table
 
 
@@ -23,10 +23,9 @@ def identification_tables(robot: Robot, identified: Identified, summary: Mapping
     blocks = per_joint(robot, cells)
     for i in range(0, blocks.shape[1], 5):
         tables[f"parameters, nominal → identified{' (continued)' * (i > 0)}"] = blocks.iloc[:, i : i + 5]
-    arm = {b: values(space, found, b, identified.unseen)[0].times(1e3).cell for b in space.blocks if b in WHOLE_ARM}
-    if arm:
-        index = pd.Index([f"{b}, ms" for b in arm], name="whole arm")
-        tables["actuation"] = pd.DataFrame({"nominal → identified": list(arm.values())}, index=index)
+    if arm := of_whole_arm(space, found, identified.unseen):
+        cells = {"nominal → identified": [v.cell for v in arm.values()]}
+        tables["whole arm"] = pd.DataFrame(cells, index=pd.Index(list(arm), name="whole arm"))
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, identified)
     edges = identified.dynamics.breakaway

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from r2s.identification.parameters import Estimate, ParameterSpace, units
+from r2s.identification.parameters import TIMING, WHOLE_ARM, Estimate, ParameterSpace, units
 from r2s.identification.uncertainty import SHARPER
 from r2s.physics.robot import Robot
 from r2s.reporting.document import UNSEEN
@@ -56,6 +56,17 @@ def values(space: ParameterSpace, found: Estimate, block: str, unseen: Sequence[
     silent = np.isin(space.names, list(unseen))
     parts = (space.start, found.x, found.low, found.high, found.identifiable, silent)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
+
+
+def of_whole_arm(space: ParameterSpace, found: Estimate, unseen: Sequence[str] = ()) -> dict[str, Value]:
+    """Return {"delay, ms": Value, "payload_mass, kg": Value, ...} of the searched values that are of no one joint."""
+    out = {}
+    for block in (b for b in space.blocks if b in WHOLE_ARM):
+        value = values(space, found, block, unseen)[0]
+        out[f"{block}, {'ms' if block in TIMING else units()[block]}"] = (
+            value.times(1e3) if block in TIMING else value
+        )
+    return out
 
 
 def named(block: str) -> str:

@@ -27,7 +27,7 @@ from r2s.reporting.identification_figures import (
     whiteness_figure,
     whiteness_table,
 )
-from r2s.reporting.identification_page import identification_sections
+from r2s.reporting.identification_page import TORQUE, identification_sections
 from r2s.reporting.learning_figures import bands_figure, learning_figure, scores_figure
 from r2s.reporting.reach_figures import latency_figure, reach_figure, traces_figure
 from r2s.reporting.tables import gap_rows, reach_rows, scores_rows
@@ -57,7 +57,7 @@ def identification(
     commanded = validation.torque == "commanded"
     error = {label: torque.off(d) for label, d in both.items()}
     predicted = {label: motion.tau + e for label, e in error.items()}  # beside the recorded torque, delay undone
-    kind = "commanded torque" if commanded else "link-side torque"
+    kind = TORQUE[validation.torque].split(",")[0]
     title = f"{kind} of validation motion, low-pass {cutoff_hz:g} Hz"
     pictures = {"torque": torque_figure(run.figure("torque"), motion.t, motion.tau, predicted, title)}
     if commanded:

@@ -6,12 +6,11 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.link_inertia import LINK
-from r2s.identification.parameters import WHOLE_ARM
 from r2s.identification.uncertainty import Identified
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
-from r2s.reporting.identified_values import Value, named, per_joint, values
+from r2s.reporting.identified_values import Value, named, of_whole_arm, per_joint, values
 from r2s.reporting.tables import number
 
 TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2), "Iyz": (1, 2)}
@@ -40,7 +39,7 @@ def breakaway_table(robot: Robot, nominal: Dynamics, found: Identified, commande
     if d.family.held is not None:
         return _held_by_bristles(robot, found, d.family.held)
     if not commanded:
-        return ["Nominal: a link-side sensor does not feel at which torque of the motor a joint lets go."]
+        return ["Nominal: what is fitted on the level of torque does not say at which command a joint lets go."]
     old = nominal.breakaway
     columns: dict[str, list[str]] = {}
     ramped = found.edges
@@ -155,22 +154,22 @@ def friction_table(robot: Robot, nominal: Dynamics, found: Identified, fastest: 
 
 
 def other_terms(robot: Robot, found: Identified) -> list[Item]:
-    """Return delay and lag, and what else was searched: load, drag, sensor gain."""
+    """Return delay and lag, payload, and what else was searched: rotors, load, drag, sensor gain."""
     space = found.space
     items: list[Item] = []
-    arm = [b for b in space.blocks if b in WHOLE_ARM]
-    if arm:
-        rows = [values(space, found.found, b, found.unseen)[0].times(1e3) for b in arm]
+    if arm := of_whole_arm(space, found.found, found.unseen):
         items += [
-            "Between a command and the torque at the joint.",
-            pd.DataFrame(_listed(rows), index=pd.Index([f"{b}, ms" for b in arm], name="whole arm")),
+            "Delay and lag are between a command and the torque at the joint; a payload is what the last link "
+            "carries, its centre in that link's frame.",
+            pd.DataFrame(_listed([*arm.values()]), index=pd.Index(list(arm), name="whole arm")),
         ]
     meaning = {
+        "armature": "armature: inertia of the joint's rotor, as the joint feels it through the gear",
         "load": "load: friction per torque that gravity loads the joint with",
         "drag_sin": "drag: offset that goes with the joint's own sin q and cos q, as a cable's",
-        "gain": "gain: relative error of the torque sensor",
+        "gain": "gain: relative error of the torque sensor, or of the motor's torque constant",
     }
-    rest = [b for b in ("load", "drag_sin", "drag_cos", "gain") if b in space.blocks]
+    rest = [b for b in ("armature", "load", "drag_sin", "drag_cos", "gain") if b in space.blocks]
     if rest:
         columns = {named(b): [v.cell for v in values(space, found.found, b, found.unseen)] for b in rest}
         items += ["; ".join(meaning[b] for b in rest if b in meaning) + ".", per_joint(robot, columns)]

@@ -95,6 +95,7 @@ class File:
     kind: str
     path: str
     torque: str | None
+    torque_constant: list[float] | float | None
     validation: str | None
     ramps: str | None
     period: float | None
@@ -152,7 +153,8 @@ def read_motion(robot, file, share):
     from r2s.identification.checks import check_recording
     from r2s.recordings.readers import read
 
-    how = {k: getattr(file, k) for k in ("torque", "columns", "period", "max_gap_s", "topic", "joints")}
+    told = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
+    how = {k: getattr(file, k) for k in told}
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
     recording = read(file.path, **how)
@@ -237,7 +239,7 @@ def make_settings(cfg, torque):
 
     words: dict[str, Any] = plain(cfg.identify)
     del words["validation_fraction"]
-    for key in ("terms", "prior", "extra"):
+    for key in ("terms", "prior", "extra", "spare"):
         words[key] = words[key][torque]
     return called(Settings, "identify", words | {"family": cfg.friction.family})
 
