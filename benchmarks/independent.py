@@ -20,34 +20,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROBOT, ROOT, markdown
+from common import MACHINE, ROOT, markdown
 from independent_arms import make
 from independent_judge import judge
 
 FIVE = ("sigmoid", "coulomb", "stribeck", "lugre", "paper")
 
 
-def ramps_of(path: Path) -> Path:
-    """Return the ramps of a file in the arms' format as a file of r2s's own format, beside the runs."""
-    from r2s.recordings.ramps import Ramps
-    from r2s.recordings.recording import Recording
-
-    out = ROOT / "runs" / "bench" / f"ramps_{path.parent.name}.npz"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with np.load(path) as z:
-        t, q, dq, tau, joint, sign = (z[k] for k in ("t", "q", "dq", "tau_J_d", "joint", "sign"))
-    starts = np.flatnonzero(np.diff(t, prepend=t[0] + 1) < 0)
-    trajectory = np.cumsum(np.isin(np.arange(len(t)), starts)) - 1
-    motion = Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=trajectory, name=ROBOT.name)
-    Ramps(motion, joint[starts] - 1, sign[starts]).save(out)
-    return out
-
-
 def identified(arm: Path, name: str, words: list[str]) -> Path | None:
     """Run stage=identify on an arm unless it is done; return its run folder, None where it failed."""
     folder = ROOT / "runs" / "identify" / name
     data = ["data=recording", "data.torque=commanded", f"data.path={arm / 'train.npz'}"]
-    data += [f"data.validation={arm / 'validation.npz'}", f"data.ramps={ramps_of(arm / 'ramps.npz')}"]
+    data += [f"data.validation={arm / 'validation.npz'}", f"data.ramps={arm / 'ramps.npz'}"]
     command = [sys.executable, "run.py", "stage=identify", *data, f"name={name}", "only_missing=true", *words]
     failed = subprocess.run(command, cwd=ROOT).returncode
     return None if failed else folder

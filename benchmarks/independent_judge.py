@@ -10,19 +10,19 @@ of the training motion, which is what it feels in a simulator.
 """
 
 import json
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from common import ROBOT, replace
+from common import ROBOT
 from independent_arms import friction
 from scipy.signal import butter, filtfilt, savgol_filter
+from stick_slip import true_dynamics
 
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.prediction import _open_loop_ee
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
-from r2s.physics.rigid_body import GRAVITY, LinkInertia, regressor
+from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.recordings.readers import read
 
 FAMILY = {"sigmoid": SIGMOID, "coulomb_viscous": COULOMB, "stribeck": STRIBECK, "lugre": BRISTLE}
@@ -31,7 +31,6 @@ FASTEST = 0.95  # quantile of the speeds visited in a direction
 SPEEDS, CHECKED = 40, 5  # of a direction: where friction is compared, and where its interval is
 POSTURES = 200
 WAYS = (1, -1)
-DQ_MIN = 0.01  # rad/s, of the truth in r2s's simulator: as identified arms have it
 REACHED = 5e-3  # rad in its own direction: the ramp got there
 
 
@@ -39,31 +38,6 @@ def load_truth(folder: Path) -> dict:
     """Return truth.json with arrays for lists."""
     truth = json.loads((folder / "truth.json").read_text())
     return {k: np.array(v) if isinstance(v, list) else v for k, v in truth.items()}
-
-
-def true_dynamics(truth: dict) -> Dynamics:
-    """Return the truth as r2s's simulator can express it: one viscous term, one rise of both directions."""
-    f, family = {k: np.array(v) for k, v in truth["friction"].items()}, FAMILY[truth["family"]]
-    if family is SIGMOID:
-        phi = [f["phi1"], f["phi2"], f["phi3"]]
-    else:
-        coulomb = 0.5 * (f["fc_pos"] + f["fc_neg"])
-        phi = [coulomb, (f["fc_pos"] - f["fc_neg"]) / (2 * coulomb), 0.5 * (f["fv_pos"] + f["fv_neg"])]
-        if family is not COULOMB:
-            phi += [(f["fs_pos"] + f["fs_neg"]) / (2 * coulomb) - 1, f["vs"]]
-        if family is BRISTLE:
-            phi += [coulomb / f["sigma0"]]
-    edges = np.stack([truth["breakaway_net_neg"], truth["breakaway_net_pos"]], -1)
-    known = {"hold": "net"} if "hold" in {x.name for x in fields(Dynamics)} else {}
-    return replace(
-        Dynamics.of(ROBOT, np.stack(phi, -1), family, dq_min=DQ_MIN),
-        offset=truth["offset"],
-        breakaway=edges,
-        inertia=truth["inertia"],
-        delay=truth["delay_s"],
-        lag=truth["lag_s"],
-        **known,
-    )
 
 
 def visited(q: np.ndarray) -> np.ndarray:
@@ -83,7 +57,7 @@ class Pull:
 
     def __init__(self, q: np.ndarray):
         still = np.zeros_like(q)
-        self._gravity = regressor(ROBOT, q, still, still, GRAVITY)
+        self._gravity = regressor(ROBOT, q, still, still, ROBOT.gravity)
         self._nominal = LinkInertia(ROBOT.mass, ROBOT.com, ROBOT.inertia).standard()
         self._load = np.abs(np.einsum("tjkc,kc->tj", self._gravity, self._nominal)).mean(0)
         self._mean = self._gravity.mean(0)
@@ -158,7 +132,8 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
     late, true_late = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
     between = np.quantile(np.atleast_1d(late), (0.025, 0.975))
     validation = read(arm / "validation.npz", torque="commanded")
-    ahead = [_open_loop_ee(ROBOT, d, validation, threads)["0.5"] for d in (found, true_dynamics(truth))]
+    true = true_dynamics(truth, read(arm / "train.npz", torque="commanded"))
+    ahead = [_open_loop_ee(ROBOT, d, validation, threads)["0.5"] for d in (found, true)]
     return against(None, None) | {
         "true family": truth["family"],
         "paper": truth["paper"],

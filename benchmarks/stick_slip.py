@@ -17,7 +17,7 @@ from scipy.signal import savgol_filter
 
 from r2s.identification.prediction import _open_loop_ee
 from r2s.physics.dynamics import HOLDS, Dynamics
-from r2s.physics.friction import COULOMB, SIGMOID, STRIBECK
+from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.readers import read
@@ -29,31 +29,32 @@ SLOWEST = 5e-3  # rad/s; slower, the direction of a measured velocity is not kno
 START = 2e-3  # rad/s: what a window's measured start velocity may be of a joint at rest
 
 
-def true_dynamics(truth: dict, recording: Recording) -> Dynamics:
+def true_dynamics(truth: dict, recording: Recording | None) -> Dynamics:
     """Return an arm's truth.json as far as the families express it.
 
     Theirs have one viscous term for both directions, where the arms have two: the law is the one that is closest to
-    the arm's over the velocities of `recording`, by least squares.
+    the arm's over the velocities of `recording`, by least squares; eq. (5) needs none.
     """
     f = {name: np.array(values) for name, values in truth["friction"].items()}
-    command, lag = truth["breakaway_on"] == "command", truth["lag_s"]
     if "phi1" in f:
         family, phi = SIGMOID, np.stack([f["phi1"], f["phi2"], f["phi3"]], -1)
     else:
         family = STRIBECK if "vs" in f else COULOMB
         joints = [{name: values[j] for name, values in f.items()} for j in range(ROBOT.n)]
         phi = np.stack([_closest(family, one, dq) for one, dq in zip(joints, _speeds(recording), strict=True)])
+    if "sigma0" in f:  # bristles: as far as they bend under the Coulomb level
+        family, bend = BRISTLE, 0.5 * (f["fc_pos"] + f["fc_neg"]) / f["sigma0"]
+        phi = np.concatenate([phi[:, :5], bend[:, None], phi[:, 5:]], 1)
     return replace(
-        Dynamics.of(ROBOT, phi, family, dq_min=0.01 if command else START),
+        Dynamics.of(ROBOT, phi, family, dq_min=START),
         offset=np.array(truth["offset"]),
         breakaway=np.stack([truth["breakaway_net_neg"], truth["breakaway_net_pos"]], -1),
         mass=np.array(truth["mass"]),
         com=np.array(truth["com"]),
         inertia=np.array(truth["inertia"]),
-        # r2s feels during a step what the lag comes to at its end, which is too early by up to half a step
-        delay=truth["delay_s"] + (lag - SIM_DT / np.expm1(SIM_DT / lag) if lag else 0.0),
-        lag=lag,
-        hold="command" if command else "net",
+        delay=truth["delay_s"],
+        lag=truth["lag_s"],
+        hold="net",  # also where the truth's edges are of the command: its joints rest by what acts on them
     )
 
 
@@ -89,17 +90,18 @@ def speed(dynamics: Dynamics, tau: np.ndarray) -> tuple[float, float]:
 def main() -> None:
     """Print one line per arm, then the speeds."""
     columns = [f"{name}, {hold}, mm" for name in NAMES for hold in HOLDS]
-    print(f"{'arm':12}{'its rule':>10}" + "".join(f"{column:>26}" for column in columns))
+    print(f"{'arm':12}" + "".join(f"{column:>26}" for column in columns))
     for folder in sorted(Path(sys.argv[1]).iterdir()):
         truth = json.loads((folder / "truth.json").read_text()) if (folder / "truth.json").is_file() else {}
         if truth.get("family", "lugre") == "lugre":
             continue  # no family here has the bristle damping of a LuGre arm
         seen = {n: read(folder / f"{n}.npz", torque="commanded") for n in NAMES}
         true = true_dynamics(truth, seen["train"])
-        line = f"{folder.name:12}{true.hold:>10}"
+        line = f"{folder.name:12}"
         for recording in seen.values():
             for hold in HOLDS:
-                line += f"{_open_loop_ee(ROBOT, replace(true, hold=hold), recording, 1)[HORIZON]:26.2f}"
+                one = replace(true, hold=hold, dq_min=NEW.dq_min if hold == "command" else START)
+                line += f"{_open_loop_ee(ROBOT, one, recording, 1)[HORIZON]:26.2f}"
         print(line, flush=True)
     rng = np.random.default_rng(0)
     held = np.repeat(rng.uniform(-1, 1, (128, 1, 7)) * [1, 1, 1, 1, 0.5, 0.3, 0.3], 200, axis=1)

@@ -202,7 +202,7 @@ def test_readme_command(command, root, recording, trained, identified):
     toy = [*TOY, "pipeline.train_minutes=null"] if "pipeline" in command else TOY
     if "search=ga" in command:
         toy = ["data.seconds=2", "data.ramp_poses=1", "search.0.population=4", "search.0.generations=2"]
-        toy += ["friction.family=sigmoid", "identify.terms.commanded=[offset]"]
+        toy += ["friction.family=sigmoid", "identify.terms.commanded=[offset]", "identify.extra.commanded=[]"]
     out = succeed(*shlex.split(command), f"root={root}", *toy)
     folders = [root / Path(f).relative_to(root) for f in re.findall(r"written: (\S+)", out)]
     assert folders

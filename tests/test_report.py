@@ -380,7 +380,7 @@ def test_breakaway_is_told_as_it_was_measured(panda, identified, recording):
     assert ramped.loc["7", "positive\nrepeatability"] == "not reached"
     assert ramped.loc["7", "positive\nnew"] == "0.4 ?"
     assert ramped.loc["7", "positive\n95 % interval"] == f"[{0.7 + identified.dynamics.offset[6]:.3g}, 10]"
-    terminal = identification_tables(panda, ramps, {})["breakaway, Nm"]
+    terminal = identification_tables(panda, ramps, {})["breakaway, Nm of command and offset"]
     assert terminal.loc["positive", "joint 7"] == "0.4\nnot reached\nheld against 0.7 Nm"
     measured = replace(recording, torque="measured")
     assert not tables_of(everything(panda, scanned, measured, nominal=old), "Table II:")

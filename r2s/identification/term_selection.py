@@ -40,7 +40,8 @@ def demanded(
     folds_of = []
     for k, (rest, out) in enumerate(left_out(recording, folds, BLOCKS)):
         folds_of.append(_Fold(space, rest, out, bounds, prior, extra, how))
-        report({"search": "terms", "evaluations": 0, "done": k + 1, "total": folds})
+        cost = float(np.mean(folds_of[-1].squares([])))
+        report({"search": "terms", "evaluations": 0, "cost": cost, "done": k + 1, "total": folds})
     usual = np.sqrt(np.mean(np.concatenate([f.squares([]) for f in folds_of]), axis=0))
     chosen: list[str] = []
     best = _per_block(folds_of, chosen, usual)

@@ -20,6 +20,11 @@ def doubts(found: Identified) -> list[Item]:
         f"{total} numbers were searched; the data can tell {known} of them one by one. A number is known (no ?) "
         f"where its 95 % interval is narrower than {2 / SHARPER:g} standard deviations of the belief before."
     )
+    if found.refused:
+        items.append(
+            "Replays of the motion disagreed with the torque of joints that move, by more than the errors of both "
+            "allow: they were refused, and the numbers are those of the torque."
+        )
     if found.unseen:
         items.append(
             "Kept at their nominal values, because the data say hardly more of them than was believed before (or "

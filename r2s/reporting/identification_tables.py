@@ -38,7 +38,8 @@ def identification_tables(robot: Robot, identified: Identified, summary: Mapping
             ]
             for j in range(robot.n)
         }
-        tables["breakaway, Nm"] = pd.DataFrame(shown, index=pd.Index(SIDES, name="edge"))
+        rule = "of all that acts on the joint" if identified.dynamics.hold == "net" else "of command and offset"
+        tables[f"breakaway, Nm {rule}"] = pd.DataFrame(shown, index=pd.Index(SIDES, name="edge"))
     return tables | error_tables(robot, summary)
 
 
@@ -114,3 +115,5 @@ def identification_table(console: Console, robot: Robot, identified: Identified,
     """Print what `identification_tables` returns."""
     for title, table in identification_tables(robot, identified, summary).items():
         print_table(console, table, title, LEGEND if title.startswith("parameters") else None)
+    if identified.refused:
+        console.print("replays disagreed with the torque of joints that move: refused, the numbers are torque's")
