@@ -34,6 +34,7 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 STANDSTILL = 0.02  # rad/s: what friction is of a joint that is slower, or stands, its velocity does not tell
+REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
 CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -166,8 +167,9 @@ def identify(
         def again(row: dict) -> None:
             told(row | {"search": f"{row['search']}, reweighed"})
 
-        for k in range(2 if data is quick else 1):
-            local = last if data is quick or lag is None else partial(without_lag, last)
+        for k in range(REWEIGH):
+            alone = data is quick or lag is None or k < REWEIGH - 1
+            local = last if alone else partial(without_lag, last)
             u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
             problem.adapt(u, fitted=True)
         if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):

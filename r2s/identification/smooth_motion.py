@@ -92,7 +92,7 @@ class SmoothMotion:
 
 def _impulse_response(cutoff_hz: float, rate_hz: float) -> np.ndarray:
     """Return the two-sided kernel of `Recording.smooth` at a rate, cut where it has faded; its sum is 1."""
-    reach = int(1.5 * rate_hz / cutoff_hz)
+    reach = int(3.0 * rate_hz / cutoff_hz)  # what a shorter one leaves out biases friction by 0.3 % of its level
     pulse = np.zeros(8 * reach + 1)
     pulse[4 * reach] = 1.0
     kernel = sosfiltfilt(butter(4, cutoff_hz, fs=rate_hz, output="sos"), pulse)[3 * reach : 5 * reach + 1]

@@ -1,0 +1,112 @@
+"""Terms earn their place, joints that stand do not spoil what moving ones say, and ramps tell friction at rest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import conf
+from test_identify import BOUNDS, NOISE, SETTINGS, TORQUE, arm, recorded, run  # noqa: F401
+
+from r2s.arm.ramp import ramp
+from r2s.arm.simulated import SimulatedArm
+from r2s.identification.family_selection import left_out
+from r2s.identification.identify import with_terms
+from r2s.physics.dynamics import Dynamics, nominal_dynamics
+from r2s.physics.friction import COULOMB, STRIBECK
+
+EXTRA = ["link", "load", "drag"]
+PHI = np.array([[1.2, 0.05, 0.3], [0.9, -0.05, 0.2], [0.5, 0.1, 0.1]])
+
+
+def coulomb_arm(robot) -> Dynamics:
+    """Return an arm of hard stiction: it breaks away well above its Coulomb level."""
+    edges = np.stack([-1.3 * PHI[:, 0], 1.25 * PHI[:, 0]], -1)
+    hard = replace(Dynamics.of(robot, PHI, COULOMB, 1e-3), breakaway=edges, hold="net")
+    return replace(hard, offset=np.array([0.2, -0.1, 0.05]), delay=2e-3)
+
+
+@pytest.fixture(scope="module")
+def hard(arm):  # noqa: F811
+    """Return what identification says of it, and the truth."""
+    truth = coulomb_arm(arm)
+    ramps = ramp(SimulatedArm(arm, truth, **NOISE, seed=5), [arm.q_home, arm.q_home + 0.3])
+    start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
+    motion = recorded(arm, truth, 12.0, seed=0)
+    how = {"family": "coulomb", "extra": EXTRA, "ramps": ramps}
+    return run(arm, start, motion, [TORQUE], **how), truth, motion
+
+
+def test_hard_stiction_does_not_spoil_friction_or_delay(hard):
+    """Friction minus offset, which is what motion tells, within 2 % of its level; the delay within 0.2 ms."""
+    found, truth, motion = hard
+    top = np.quantile(np.abs(motion.dq), 0.95, axis=0)
+    speeds = np.concatenate([np.linspace(0.05, 1, 20), -np.linspace(0.05, 1, 20)])[:, None] * np.maximum(top, 0.1)
+    off, right = ((d.friction(speeds) - d.offset) for d in (found.dynamics, truth))
+    assert np.abs(off - right).max() < 0.02 * np.abs(truth.friction(speeds)).mean(0).min()
+    assert abs(float(found.dynamics.delay) - 2e-3) < 2e-4
+
+
+def test_no_term_enters_that_is_not_there(hard):
+    assert not {"load", "drag_sin", "link_d1"} & set(hard[0].space.blocks)
+
+
+def test_stiction_is_found_to_be_of_the_net_torque(hard):
+    """The rule that replays its stops better, and edges as commands within 30 mNm."""
+    found, truth, _ = hard
+    assert found.dynamics.hold == "net"
+    edges = found.dynamics.breakaway - found.dynamics.offset[:, None]
+    np.testing.assert_allclose(edges, truth.breakaway - truth.offset[:, None], rtol=0, atol=0.03)
+
+
+def test_a_term_that_is_there_enters(arm):  # noqa: F811
+    """Cable drag of a fifth of the friction is asked for by motion left out."""
+    truth = replace(coulomb_arm(arm), drag=np.array([[0.25, 0.1], [0.2, -0.2], [0.1, 0.1]]))
+    start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
+    found = run(arm, start, recorded(arm, truth, 12.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
+    assert "drag_sin" in found.space.blocks
+
+
+def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811
+    """Friction as sliding begins is the breakaway's, in either direction, within what a ramp is believed (5 %)."""
+    phi = np.concatenate([PHI, np.tile([0.4, 0.03, 0.3], (3, 1))], 1)
+    truth = replace(Dynamics.of(arm, phi, STRIBECK, 1e-3), hold="net", delay=2e-3)
+    truth = replace(truth, breakaway=STRIBECK.at_rest(phi))
+    ramps = ramp(SimulatedArm(arm, truth, **NOISE, seed=5), [arm.q_home, arm.q_home + 0.3])
+    start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "stribeck"})
+    terms = ["offset", "inertia_scale", "delay", "rise_asymmetry"]
+    found = run(arm, start, recorded(arm, truth, 12.0, seed=1), [TORQUE], family="stribeck", terms=terms, ramps=ramps)
+    net = [d.family.at_rest(d.phi) - d.offset[:, None] for d in (found.dynamics, truth)]
+    np.testing.assert_allclose(*net, rtol=0.1)
+
+
+def test_replays_that_disagree_with_torque_are_refused(hard, arm):  # noqa: F811
+    """A search that ends elsewhere on replays does not change what the torque says."""
+    motion = hard[2]
+
+    class Elsewhere:
+        local = False
+
+        def __call__(self, problem, start, report):
+            return np.clip(start + 0.05, 0, 1)
+
+    start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
+    both = run(arm, start, motion, [TORQUE, Elsewhere()], family="coulomb")
+    alone = run(arm, start, motion, [TORQUE], family="coulomb")
+    assert both.refused
+    assert not alone.refused
+    np.testing.assert_allclose(both.x, alone.x, rtol=0.05, atol=0.02)
+
+
+def test_a_link_takes_the_place_of_its_tensor():
+    assert with_terms(["offset", "inertia_scale", "delay"], ["link", "drag"]) == ["offset", "delay", "link", "drag"]
+    assert with_terms(["offset", "inertia_scale"], ["load"]) == ["offset", "inertia_scale", "load"]
+
+
+def test_what_is_left_out_is_spread_over_the_recording(hard):
+    """With several blocks a fold, each holds motion of all parts, and every row is left out once."""
+    motion = hard[2]
+    pairs = left_out(motion, 4, 3)
+    assert sum(len(out.t) for _, out in pairs) >= len(motion.t)
+    for rest, out in pairs:
+        assert len(np.unique(out.trajectory)) == 3
+        assert np.abs(rest.t[:, None] - out.t[::50]).min() > 0.09
