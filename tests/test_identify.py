@@ -236,7 +236,7 @@ def test_the_history_tells_what_the_search_did(directly):
     assert history["seconds"].is_monotonic_increasing
     assert (history["done"] <= history["total"]).all()
     starts = np.flatnonzero(history["done"] == 1).tolist()
-    assert len(starts) == 4
+    assert len(starts) == 5  # a search, twice again, and a scan for each rule of rest
     for a, b in zip(starts, [*starts[1:], len(history)], strict=True):
         part = history.iloc[a:b]
         assert part["search"].nunique() == 1

@@ -116,7 +116,7 @@ def identify(
             left = needed(robot, nominal, recording, bounds, prior, terms, spare, folds, how, told)
             return {"needed": [name in left for name in terms]}
 
-        is_needed = np.asarray(step("terms", chosen_terms)["needed"], dtype=bool)
+        is_needed = np.asarray(step("spare", chosen_terms)["needed"], dtype=bool)
         terms = [name for name, keep in zip(terms, is_needed, strict=True) if keep]
     space = searched(robot, nominal, bounds, terms, recording)
     quick = TorqueResidual(robot, space, recording, **level)

@@ -19,7 +19,6 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's curvature
-EXACT = 0.01  # of its RMS torque, to which a joint's friction is taken to follow its law
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
 HELD = 0.5  # steps: a command that is held for a step is that late on average
 BLOCK_S = 0.5  # s, stretches that the bootstrap draws
@@ -149,10 +148,7 @@ class TorqueResidual:
         It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing.
         """
         r = self.error(x[None])[0] * self.seen
-        rows = np.maximum(self.seen.sum(0), 1)
-        square = (r**2).sum(0) / rows
-        if self.commanded:  # a law of friction is not right to the last mNm, however little noise there is
-            square = np.maximum(square, EXACT**2 * ((self.motion.tau * self.seen) ** 2).sum(0) / rows)
+        square = (r**2).sum(0) / np.maximum(self.seen.sum(0), 1)
         self._scale = (1.0 if fitted else 0.5) * np.sqrt(square * np.minimum(_correlation_length(r), LONGEST))
 
     def weigh_like(self, other: "TorqueResidual") -> None:

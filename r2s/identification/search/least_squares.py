@@ -7,6 +7,8 @@ import numpy as np
 from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.problem import Problem, Report
 
+ROUNDS = 4  # the first weights are those of a nominal arm, and say little
+
 
 @dataclass(frozen=True)
 class LeastSquares:
@@ -27,7 +29,7 @@ class LeastSquares:
         """Return u (P,) from `start` (P,)."""
         how = (self.max_evaluations, self.ftol, self.minutes, report)
         if self.level == "torque":
-            for _ in range(2):  # the second time with weights from what the first could not explain
+            for _ in range(ROUNDS):  # each with weights from what the one before could not explain
                 start = minimise(problem.quick, problem.quick_jacobian, start, *how, "torque")
                 problem.quick_data.adapt(problem.space.from_unit(start), fitted=True)
             return start
