@@ -2,7 +2,7 @@
 
 `python benchmarks/known_truth.py [SEEDS]` records 20 s at 1 kHz of a simulated Panda (encoder noise 2e-5 rad,
 velocity noise 3e-3 rad/s, delay 3 ms) and ramps every joint both ways at two postures, per seed; identifies with
-search=staged; and writes docs/known_truth.md. Motion that is predicted is another excitation.
+search=replays; and writes docs/known_truth.md. Motion that is predicted is another excitation.
 """
 
 import sys
@@ -48,7 +48,7 @@ def one(seed: int) -> list[float]:
     motions = [recorded(seed, s) for s in (2 * seed, 2 * seed + 1)]
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
-    found = identify(ROBOT, OLD, motions[0], searches("staged"), how(family="sigmoid", terms=TERMS), ramps=ramps)
+    found = identify(ROBOT, OLD, motions[0], searches("replays"), how(family="sigmoid", terms=TERMS, extra=[]), ramps=ramps)
     seconds = time.perf_counter() - began
     d, space = found.dynamics, found.space
     fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)
@@ -80,7 +80,7 @@ def main() -> None:
         "",
         f"`python benchmarks/known_truth.py` on {MACHINE}: 20 s at 1 kHz, encoder noise 2e-5 rad, velocity noise",
         "3e-3 rad/s, delay 3 ms; beside it about 11 s in which every joint is ramped both ways at two postures.",
-        f"{len(rows)} seeds, each with another motion; search=staged, friction.family=sigmoid,",
+        f"{len(rows)} seeds, each with another motion; search=replays, friction.family=sigmoid,",
         f"identify.terms.commanded=[{', '.join(TERMS)}]. End-effector errors on motion that was not fitted.",
         "",
         "| | asked | median | worst | " + " | ".join(f"seed {s}" for s in seeds) + " |",

@@ -1,7 +1,7 @@
 """Our least squares beside MuJoCo's, `mujoco.minimize.least_squares`, on the problems that an identification solves.
 
 `python benchmarks/least_squares.py [SEEDS] [SECONDS]` records SECONDS (10) of the simulated Panda of known_truth.py
-per seed (4) and identifies it with search=staged. Each least-squares problem on the way is solved by both, from the
+per seed (4) and identifies it with search=replays. Each least-squares problem on the way is solved by both, from the
 same start, with the same Jacobian, until a step gains less than the same share of the cost. Then each identifies the
 arm alone. Writes docs/least_squares.md.
 """
@@ -155,7 +155,7 @@ def identified(seed: int, seconds: float, solvers: list[str]) -> tuple[list[dict
     ]
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 1))
     rows: list[dict] = []
-    staged = [Side(solvers, seed % 2 == 0, s.level, s.max_evaluations, s.ftol, rows) for s in searches("staged")]
+    staged = [Side(solvers, seed % 2 == 0, s.level, s.max_evaluations, s.ftol, rows) for s in searches("replays")]
     d = identify(ROBOT, OLD, motions[0], staged, family="sigmoid", ramps=ramps, **how(terms=TERMS)).dynamics
     fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)
     speeds = np.linspace(-1, 1, 201)[:, None] * fastest
@@ -207,7 +207,7 @@ def main() -> None:
         "",
         "## The same problems",
         "",
-        "Identification (search=staged) solves five or six least-squares problems on its way. Every solver gets each",
+        "Identification (search=replays) solves five or six least-squares problems on its way. Every solver gets each",
         "of them: the same start, the same Jacobian, the same bound on Jacobians. It ends where a step gains less",
         "than the same share of the cost. The identification goes on from ours. Medians over the arms.",
         "",

@@ -782,7 +782,7 @@ def test_the_papers_new_column_is_found_from_its_old_one(panda):
     recording = recorded(panda, new, 20.0, seed=0)
     turn = np.where(np.arange(panda.n) % 2, -0.3, 0.3)
     ramps = ramp(SimulatedArm(panda, new, **NOISE, seed=1), [panda.q_home, panda.q_home + turn])
-    found = run(panda, old, recording, [instantiate(s) for s in conf("search/staged")], ramps=ramps).dynamics
+    found = run(panda, old, recording, [instantiate(s) for s in conf("search/replays")], ramps=ramps).dynamics
     assert curve_error(found, new, recording.dq).max() < 0.01
     np.testing.assert_allclose(found.offset, new.offset, atol=0.005)
     np.testing.assert_allclose(inertia_scale(found.inertia, new.inertia), 1.0, atol=0.03)
