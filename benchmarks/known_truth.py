@@ -48,7 +48,8 @@ def one(seed: int) -> list[float]:
     motions = [recorded(seed, s) for s in (2 * seed, 2 * seed + 1)]
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 2))
     began = time.perf_counter()
-    found = identify(ROBOT, OLD, motions[0], searches("replays"), how(family="sigmoid", terms=TERMS, extra=[]), ramps=ramps)
+    settings = how(family="sigmoid", terms=TERMS, extra=[])
+    found = identify(ROBOT, OLD, motions[0], searches("replays"), settings, ramps=ramps)
     seconds = time.perf_counter() - began
     d, space = found.dynamics, found.space
     fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)

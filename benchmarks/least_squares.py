@@ -207,7 +207,7 @@ def main() -> None:
         "",
         "## The same problems",
         "",
-        "Identification (search=replays) solves five or six least-squares problems on its way. Every solver gets each",
+        "Identification (search=replays) solves some least-squares problems on its way. Every solver gets each",
         "of them: the same start, the same Jacobian, the same bound on Jacobians. It ends where a step gains less",
         "than the same share of the cost. The identification goes on from ours. Medians over the arms.",
         "",
