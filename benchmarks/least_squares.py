@@ -156,7 +156,7 @@ def identified(seed: int, seconds: float, solvers: list[str]) -> tuple[list[dict
     ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 1))
     rows: list[dict] = []
     staged = [Side(solvers, seed % 2 == 0, s.level, s.max_evaluations, s.ftol, rows) for s in searches("replays")]
-    d = identify(ROBOT, OLD, motions[0], staged, family="sigmoid", ramps=ramps, **how(terms=TERMS)).dynamics
+    d = identify(ROBOT, OLD, motions[0], staged, how(family="sigmoid", terms=TERMS, extra=[]), ramps=ramps).dynamics
     fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)
     speeds = np.linspace(-1, 1, 201)[:, None] * fastest
     curve = np.abs(d.friction(speeds) - TRUTH.friction(speeds)).max(0) / TRUTH.family.level(TRUTH.phi, fastest)

@@ -121,6 +121,7 @@ def identify(
     space = searched(robot, nominal, bounds, terms, recording)
     quick = TorqueResidual(robot, space, recording, **level)
     data: ReplayResidual | TorqueResidual = quick
+    edges = breakaway(ramps) if commanded and ramps is not None else None  # a link-side sensor hides the motor's
     started_on_level = getattr(searches[0], "level", "") == "torque"
     # how far the bristles are bent where a window starts nobody measured: replays would put right what is right
     if commanded and not (nominal.family.has_memory and started_on_level):
@@ -129,16 +130,18 @@ def identify(
             window_s=settings.window_s,
             stride=settings.stride,
             slowest=0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min,  # bristles have no dead zone
-            edges=None if ramps is None else _not_held(breakaway(ramps).command),
+            edges=None if edges is None else _not_held(edges.command),
             batch=min(len(space.start) + 1, 64),
             nthread=nthread,
         )
-    at_rest = None if ramps is None else StaticFriction(robot, ramps, breakaway(ramps))
-    rising = at_rest if "rise" in space.blocks else None
+    at_rest = None
+    if ramps is not None and edges is not None and "rise" in space.blocks:
+        at_rest = StaticFriction(robot, ramps, edges)
     kept = np.zeros(robot.n, dtype=bool)
     if settings.keep_nominal:
         kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
-    problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool), rising)
+    problem_of = partial(Problem, quick=quick, prior=prior, kept=np.asarray(kept, dtype=bool), at_rest=at_rest)
+    problem = problem_of(data)
     u = problem.start
     lag = space.where("lag") if "lag" in space.blocks else None
     refused = False
@@ -151,10 +154,10 @@ def identify(
         if lag is not None and (on_level or data is quick):
             problem.believe(lag, NONE)  # filtered torque feels a lag as it feels a delay
         elif lag is not None:
-            problem = Problem(data, quick, prior, np.asarray(kept, dtype=bool), rising)
+            problem = problem_of(data)
         v = ended(f"search {k + 1}", search, u)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
-            refused, problem, data = True, Problem(quick, quick, prior, np.asarray(kept, dtype=bool), rising), quick
+            refused, problem, data = True, problem_of(quick), quick
             if lag is not None:
                 problem.believe(lag, NONE)
             break
@@ -174,7 +177,7 @@ def identify(
             problem.adapt(u, fitted=True)
         if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):
             problem.believe(lag, NONE)
-    dynamics, edges = space.dynamics(space.from_unit(u)), None
+    dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
         command = _commands(edges, dynamics)

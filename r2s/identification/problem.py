@@ -174,7 +174,7 @@ class Problem:
         return self._with_prior(self.quick_data, u)
 
     def quick_jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return (R + P, P), the Jacobian of `quick` at u (P,)."""
+        """Return (R + B, P), the Jacobian of `quick` at u (P,)."""
         return np.concatenate([self.quick_data.jacobian(u), self._belief_jacobian(u)])
 
     def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:

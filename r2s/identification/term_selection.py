@@ -96,17 +96,14 @@ class _Fold:
         self._hessian, self._gradient = j.T @ j + np.diag(belief), j.T @ r[:rows] + pull
         self._change = np.concatenate([at_test[0].jacobian(u), at_test[1].jacobian(wide.start)], 1)
         self._left = at_test[0](space.from_unit(u)[None])[0]
-        window, self._joints = test.clusters, space.n
-        self._count = np.unique(window, return_inverse=True)[1]
-        self._seen = np.zeros((self._count.max() + 1, space.n))
-        np.add.at(self._seen, (self._count, np.tile(np.arange(space.n), len(window) // space.n)), test.seen.ravel())
+        self._joints, self._count = space.n, np.unique(test.clusters, return_inverse=True)[1]
 
     def squares(self, chosen: Sequence[str]) -> np.ndarray:
-        """Return (blocks, n), the sum of squares of what is left out over a block, relative to its usual rows."""
+        """Return (blocks, n), the sum of squares of what is left out over a block."""
         at = [np.arange(self._own), *(self._own + w for name in chosen for w in self._where[name])]
         free = np.concatenate(at)
         step = -np.linalg.solve(self._hessian[np.ix_(free, free)], self._gradient[free])
         r = self._left + self._change[:, free] @ step
-        out = np.zeros_like(self._seen)
+        out = np.zeros((self._count.max() + 1, self._joints))
         np.add.at(out, (self._count, np.tile(np.arange(self._joints), len(r) // self._joints)), r**2)
         return out
