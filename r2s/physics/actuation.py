@@ -66,8 +66,8 @@ class Actuation:
 MAX_DELAY = 0.02  # s, the longest pure delay that is kept in mind
 
 
-# Steps by which a semi-implicit step answers its torque early: q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), where on an arm the
-# torques of steps k - 1 and k make it, half each.
+# Steps by which a semi-implicit step answers its torque early: q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), where on an arm
+# the torques of steps k - 1 and k make it, half each.
 EARLY = 0.5
 
 
