@@ -136,6 +136,7 @@ class DrivenArm:
         state = State(
             t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
             tau=s.tau_J_d[None], effort=self._driver.effort[None], stopped=np.array([self._stopped]),
+            limited=np.array([self._driver.limited]),
         )  # fmt: skip
         self._told = time.perf_counter()
         return state

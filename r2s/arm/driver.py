@@ -1,27 +1,60 @@
 """Between a policy and an arm, once a millisecond: whatever the policy says, what is sent is within the arm's rules.
 
-In this order: finite -> fresh (watchdog) -> soft start -> less where joints are or would get too fast -> low-pass ->
-push away from position and velocity limits -> clip -> rate limit, last, against what the arm applied last. No clock
-and no arm in here: `Driver` is a function of states and targets, and the tests give it a million hostile ones.
+In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> the law of r2s/physics/limits.py, the same as in
+training -> rate limit, last, against what the arm applied last. No clock and no arm in here: `Driver` is a function of
+states and targets, and the tests give it a million hostile ones.
 
-`Drivers` is that of many arms in lock-step, `Driver` that of one; the law is compiled, r2s/physics/limits.py.
+`Drivers` is that of many arms in lock-step, `Driver` that of one.
 """
 
+from typing import NamedTuple
+
+import mujoco
+import mujoco.batch
 import numpy as np
+from numba import njit
 
 from r2s.arm.interface import ArmState
-from r2s.physics import limits
-from r2s.physics.actuation import low_pass_factor
-from r2s.physics.limits import ALLOWED, HEAVY, WALL_DDQ, WALL_RATE, Driving, Memory, Rules, SoftLimits
-from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.actuation import condition, low_pass_factor
+from r2s.physics.limits import BRAKE_S, STEP, TAU_MAX, WORK, guard, limits
 from r2s.physics.robot import SIM_DT, Robot
 
-DEADLINE_S = 0.05  # without a fresh finite target, or PERIODS of a slow policy: then the arm is damped, and stopped
+DEADLINE_S = 0.05  # without a fresh finite target, or PERIODS of a slow policy: then the arm is braked, and stopped
 PERIODS = 2.5
 DAMP_S = 0.5  # at most
-POSTURE = 8  # cycles between two looks at what the posture weighs
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # of the velocity limits
+STILL = 0.02  # rad/s
+RUNS, SILENT, NOT_FINITE, OUTSIDE = range(4)  # `Memory.why`
+
+
+class Memory(NamedTuple):
+    """What the driver of m arms remembers from cycle to cycle; `drive` writes it.
+
+    Attributes:
+        target: (m, n) Nm, the last finite one. filtered, effort: (m, n) Nm, as of `Actuation`.
+        sent: (m, n) Nm, the last command.
+        cycle, silent, damped: (m,), cycles in all, since the last finite target, and of bringing to rest.
+        why: (m,), RUNS or why the arm is brought to rest. rests: (m,), whether it is at rest.
+        limited: (m,), cycles in which the law changed what was asked for.
+    """
+
+    target: np.ndarray
+    filtered: np.ndarray
+    effort: np.ndarray
+    sent: np.ndarray
+    cycle: np.ndarray
+    silent: np.ndarray
+    damped: np.ndarray
+    why: np.ndarray
+    limited: np.ndarray
+    rests: np.ndarray
+
+    @staticmethod
+    def fresh(m: int, n: int) -> "Memory":
+        """Return that of m arms of n joints before their first cycle, without torque."""
+        count = np.zeros((5, m), dtype=np.int64)
+        return Memory(*np.zeros((4, m, n)), *count, np.zeros(m, dtype=bool))  # type: ignore[call-arg]
 
 
 class Drivers:
@@ -31,8 +64,8 @@ class Drivers:
         stopping: m times why the arm is being brought to rest, or None.
 
     Args:
-        robot: its limits. torque: (n,) Nm, the most that a target may ask for. m: arms.
-        cutoff_hz: low-pass on the target. period_s: s between the targets of a policy.
+        robot: its limits, and what it is believed to weigh. torque: (n,) Nm, the most that a target may ask for.
+        m: arms. cutoff_hz: low-pass on the target. period_s: s between the targets of a policy.
         soft_start_s: s, over which the targets of a motion fade in; 0: not at all.
     """
 
@@ -46,27 +79,17 @@ class Drivers:
         period_s: float = 0.02,
         soft_start_s: float = 0.0,
     ):
-        self._shape = m, robot.n
-        self._inverse_inertia = InverseInertia(robot, m)
-        home = np.tile(robot.q_home, (m, 1))
-        self._home = 1 / np.diag(self._inverse_inertia(home)[0])
-        soft = SoftLimits.of(robot, torque)
-        self._soft_damping = soft.dq_damping
-        slowing, offset = robot.slowing or (np.full(robot.n, 1e9), np.zeros(robot.n))
-        heavy = HEAVY if robot.slowing is None else 0.0
-        self._rules = Rules(
-            robot.q_min, robot.q_max, ALLOWED * robot.dq_max, 2 * WALL_DDQ * robot.ddq_max,
-            self._home >= heavy * self._home.max(), 2 * slowing, offset,
-            soft.q_low, soft.q_high, soft.q_stiffness, soft.dq_soft,
-        )  # fmt: skip
-        self._driving = Driving(
-            torque, robot.tau_max, robot.dtau_max * SIM_DT,
-            robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE, DQ_INSIDE * robot.dq_max,
-            low_pass_factor(cutoff_hz), max(DEADLINE_S, PERIODS * period_s), round(soft_start_s / SIM_DT),
-        )  # fmt: skip
+        self._shape, self._torque, self._limits = (m, robot.n), torque, limits(robot, torque)
+        self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
+        self._fast = DQ_INSIDE * robot.dq_max
+        self._factor, self._fade = low_pass_factor(cutoff_hz), round(soft_start_s / SIM_DT)
+        self._deadline = max(DEADLINE_S, PERIODS * period_s)
+        self._arms = mujoco.batch.Batch(robot.model(gravity=False), m, 1)
+        self._q, self._dq = self._arms.bind("qpos"), self._arms.bind("qvel")
+        self._mass, self._bias = self._arms.bind("M"), self._arms.bind("qfrc_bias")
         self.reset()
         still = np.zeros(self._shape)
-        self(home, still, still, None)  # what is compiled at the first call must not be so while an arm waits
+        self(np.tile(robot.q_home, (m, 1)), still, still, None)  # to compile while no arm waits
         self.reset()
 
     def reset(self) -> None:
@@ -80,10 +103,15 @@ class Drivers:
         return self._memory.effort
 
     @property
+    def limited(self) -> np.ndarray:
+        """(m,), the share of the cycles in which the law changed what was asked for."""
+        return self._memory.limited / np.maximum(self._memory.cycle, 1)
+
+    @property
     def done(self) -> np.ndarray:
         """(m,), whether a motion that is being stopped is at rest, or has had its time."""
         m = self._memory
-        return (m.why != limits.RUNS) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
+        return (m.why != RUNS) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, target: np.ndarray | None) -> np.ndarray:
         """Return the commands (m, n) Nm of this cycle.
@@ -93,40 +121,74 @@ class Drivers:
             tau_J_d: (m, n) Nm, what the arms applied last.
             target: (m, n) Nm that the policies want; None where they have said nothing.
         """
-        memory = self._memory
-        due = limits.due(q, dq, POSTURE, memory)
-        if due.any():
-            self._weigh(q, np.flatnonzero(due))
-        said = target is not None
-        out = limits.drive(q, dq, tau_J_d, target if said else q, said, self._driving, self._rules, memory)
+        memory, said = self._memory, target is not None
+        seen = np.isfinite(q).all(1) & np.isfinite(dq).all(1)
+        self._q[seen], self._dq[seen] = q[seen], dq[seen]
+        self._arms.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        bounds = self._torque, self._low, self._high, self._fast
+        settings = self._deadline, self._factor, self._fade
+        arms = self._mass, self._bias, self._limits
+        out = drive(q, dq, seen, tau_J_d, target if said else q, said, *bounds, *settings, *arms, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
                 if self.stopping[i] is None:
                     self.stopping[i] = self._reason(int(memory.why[i]), q[i], dq[i])
         return out
 
-    def _weigh(self, q: np.ndarray, ids: np.ndarray) -> None:
-        """Let braking be as strong as the posture bears: what holds the arm at home shakes it where it is lighter."""
-        memory, mobility = self._memory, self._inverse_inertia(q[ids], ids)
-        felt = np.minimum(1 / np.diagonal(mobility, axis1=1, axis2=2), self._home)
-        damping = WALL_RATE * felt
-        memory.weighed[ids], memory.mobility[ids] = memory.cycle[ids], mobility
-        memory.weight[ids], memory.damping[ids] = felt / self._home, damping
-        memory.soft_damping[ids] = np.minimum(self._soft_damping, damping)
-
     def _reason(self, why: int, q: np.ndarray, dq: np.ndarray) -> str:
         """Return in words why the arm at q, dq (n,) is being brought to rest."""
-        driving = self._driving
-        if why == limits.SILENT:
-            return f"no finite action for {1e3 * driving.deadline:g} ms"
-        if why == limits.NOT_FINITE:
+        if why == SILENT:
+            return f"no finite action for {1e3 * self._deadline:g} ms"
+        if why == NOT_FINITE:
             return "the arm's state is not finite"
-        out = np.maximum(driving.low - q, q - driving.high)
+        out = np.maximum(self._low - q, q - self._high)
         if (out > 0).any():
             j = int(out.argmax())
             return f"joint {j + 1} is at {q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
-        j = int((np.abs(dq) / driving.fast).argmax())
+        j = int((np.abs(dq) / self._fast).argmax())
         return f"joint {j + 1} is at {dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"
+
+
+@njit(cache=True)
+def drive(
+    q, dq, seen, applied, target, said, torque, low, high, fast, deadline, factor, fade, mass, bias, limits, memory
+):
+    """Return the commands (m, n) Nm of this cycle; arguments as of `Drivers`, seen (m,): the state is finite."""
+    out, (m, n) = np.empty_like(memory.sent), q.shape
+    work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
+    for i in range(m):
+        if said and np.isfinite(target[i]).all():
+            memory.target[i] = np.minimum(np.maximum(target[i], -torque), torque)
+            memory.silent[i] = 0
+        else:
+            memory.silent[i] += 1
+        if memory.why[i] == RUNS:
+            if memory.silent[i] * SIM_DT > deadline:
+                memory.why[i] = SILENT
+            elif not seen[i]:
+                memory.why[i] = NOT_FINITE
+            elif not ((q[i] >= low).all() and (q[i] <= high).all() and (np.abs(dq[i]) <= fast).all()):
+                memory.why[i] = OUTSIDE
+        stopping = memory.why[i] != RUNS
+        memory.damped[i] += stopping
+        memory.rests[i] = seen[i] and (np.abs(dq[i]) < STILL).all()
+        if stopping:
+            memory.target[i] = 0.0
+        at = slice(i, i + 1)
+        condition(
+            memory.target[at], memory.filtered[at], memory.effort[at], memory.cycle[at], 1, factor, fade,
+            limits[:, TAU_MAX], limits[:, STEP], effort,
+        )  # fmt: skip
+        last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
+        if seen[i]:
+            share = max(0.0, 1.0 - memory.damped[i] * SIM_DT / BRAKE_S)
+            changed = guard(q[i], dq[i], effort[0, 0], last, share, mass[i], bias[i], limits, work, out[i])
+            memory.limited[i] += changed
+        else:
+            for j in range(n):
+                out[i, j] = last[j] + min(max(-last[j], -limits[j, STEP]), limits[j, STEP])
+        memory.sent[i] = out[i]
+    return out
 
 
 class Driver:
@@ -148,6 +210,11 @@ class Driver:
     def effort(self) -> np.ndarray:
         """(n,) Nm, the target as it has come through the low-pass: what a policy sees of its own commands."""
         return self._drivers.effort[0]
+
+    @property
+    def limited(self) -> float:
+        """The share of the cycles in which the law changed what was asked for."""
+        return float(self._drivers.limited[0])
 
     @property
     def done(self) -> bool:

@@ -8,9 +8,10 @@ from r2s.engines.interface import Engine, Law
 from r2s.learning.evaluate import GOAL_SEED
 from r2s.physics.actuation import Actuation, Motors
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import SoftLimits
+from r2s.physics.limits import Guard
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
+from r2s.physics.simulator import single_arm
 from r2s.tasks.task import State, Task
 
 NONE = np.zeros(1, dtype=bool)  # has stopped
@@ -40,23 +41,26 @@ class EngineArms:
         self.robot, self._make, self._torque = robot, make, task.torque(robot)
         self._substeps, self._period = task.substeps, 1 / task.ctrl_hz
         self._drawn = draw(np.random.default_rng(GOAL_SEED), count)
-        self._kinematics, self._soft = Kinematics(robot), SoftLimits.of(robot, self._torque)
+        self._kinematics, self._command = Kinematics(robot), np.zeros(robot.n)
         self._actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
 
     def place(self, starts: np.ndarray, first: int) -> State:
         """Make the arm of episode `first` and put it at rest at starts (1, n) rad."""
         dynamics = self._drawn.one(first)
-        self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics, self._soft)
+        self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics)
+        self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque)
         self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
         self._actuation.reset()
+        self._command = np.zeros(self.robot.n)
         self._now, self._steps = (starts[0], np.zeros(self.robot.n)), 0
         self._engine.reset(*self._now)
         return self._read()
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torque (1, n) Nm."""
-        command = self._actuation(np.clip(target, -self._torque, self._torque), self._substeps)
-        for applied in self._motors(command)[0]:
+        for effort in self._actuation(np.clip(target, -self._torque, self._torque), self._substeps)[0]:
+            self._command = self._guard(*self._now, effort, self._command)
+            applied = self._motors(self._command[None, None])[0, 0]
             self._now = self._engine.step(applied + self._law(*self._now, applied))
         self._steps += 1
         return self._read()
@@ -68,5 +72,6 @@ class EngineArms:
     def _read(self) -> State:
         q, dq = self._now
         ee, jacobian = self._kinematics(q)
-        last, t = self._actuation.last, np.array([self._steps * self._period])
-        return State(t, q[None], dq[None], ee[None], jacobian[None], tau=last, effort=last, stopped=NONE)
+        tau, effort, t = self._command[None], self._actuation.last, np.array([self._steps * self._period])
+        limited = np.array([self._guard.changed / max(self._guard.cycles, 1)])
+        return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited)

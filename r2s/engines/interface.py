@@ -1,7 +1,7 @@
 """What r2s needs of a physics engine: be put somewhere, take one torque per millisecond, say where the joints are.
 
-An engine knows rigid bodies. Friction, breakaway, offsets and the driver's soft limits are no engine's own law: `Law`
-works them out, and they enter as one more joint torque each step. So the same arm moves in every engine.
+An engine knows rigid bodies. Friction, breakaway and offsets are no engine's own law: `Law` works them out, and they
+enter as one more joint torque each step. So the same arm moves in every engine.
 """
 
 from typing import Protocol
@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import SoftLimits
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import single_arm
 
@@ -35,11 +34,11 @@ class Law:
     is what the implicit step will come to. Without that term real wrist joints chatter at 1 ms.
 
     Args:
-        robot, dynamics: the arm. soft: the driver's soft limits, or None.
+        robot, dynamics: the arm.
     """
 
-    def __init__(self, robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None):
-        self._model = single_arm(robot, dynamics, soft)
+    def __init__(self, robot: Robot, dynamics: Dynamics):
+        self._model = single_arm(robot, dynamics)
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # stops are the engine's
         self._file_damping = robot.model(gravity=False).dof_damping
         self._data = mujoco.MjData(self._model)

@@ -1,12 +1,12 @@
-"""Many simulated arms behind the torque path of training: what the environment steps, and what evaluations run on."""
+"""Many simulated arms behind the driver's law: what the environment steps, and what evaluations and predictions run on."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-from r2s.physics.actuation import Actuation, Motors
+from r2s.physics.actuation import Actuation
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import SoftLimits
+from r2s.physics.limits import limits
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import Simulator
 from r2s.tasks.task import State, Task
@@ -15,41 +15,45 @@ from r2s.tasks.task import State, Task
 class ArmBatch:
     """`width` arms, each with its own dynamics; the `Arms` of `r2s.tasks.episode.rollout`.
 
-    A step: target torque -> low-pass, clip, rate limit each ms -> delay and lag -> physics with soft limits at 1 kHz
-    for one control period -> kinematics.
+    A step, each ms of a control period: target torque -> low-pass, clip, rate limit -> the driver's law -> delay and
+    lag -> physics; then kinematics.
+
+    Attributes:
+        stops: why episodes ended early: nothing stops an arm here.
 
     Args:
         robot, task: the arm, and what rates and torques are asked of it.
         dynamics: of `width` arms, or of one for all.
         nthread: 0 is all.
+        soft_start_s: s, over which the torque of an episode fades in.
     """
 
-    def __init__(self, robot: Robot, task: Task, dynamics: Dynamics, width: int, nthread: int = 0):
+    def __init__(
+        self, robot: Robot, task: Task, dynamics: Dynamics, width: int, nthread: int = 0, soft_start_s: float = 0.0
+    ):
         self.robot, self.width = robot, width
         self._torque, self._substeps, self._period = task.torque(robot), task.substeps, 1 / task.ctrl_hz
         self.sim = Simulator(robot, dynamics, width, nthread)
-        self.sim.set_soft_limits(SoftLimits.of(robot, self._torque))
-        self.actuation = Actuation(robot, width, cutoff_hz=task.cutoff_hz)
-        self.motors = Motors(width, robot.n, dynamics.delay, dynamics.lag)
+        self.sim.drive(limits(robot, self._torque))
+        self.actuation = Actuation(robot, width, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
+        self.stops: list = []
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
         """Give the arms `ids` new dynamics, delay and lag."""
         self.sim.set_dynamics(dynamics, ids)
-        self.motors.set(dynamics.delay, dynamics.lag, ids)
 
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
         """Put the arms `ids` (all by default) at rest at starts (m, n) rad; return the state of all."""
         self.sim.reset(starts, np.zeros_like(starts), ids)
         self.actuation.reset(ids)
-        self.motors.reset(ids)
         self._steps[slice(None) if ids is None else ids] = 0
         return self.read()
 
     def read(self) -> State:
         """Return the present state of all arms; its arrays are views."""
-        sim, last = self.sim, self.actuation.last
-        return State(self._steps * self._period, sim.q, sim.dq, sim.ee, sim.jacobian, last, last, self._stopped)
+        sim, effort, t = self.sim, self.actuation.last, self._steps * self._period
+        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, effort, self._stopped, sim.limited)
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torques (width, n) Nm; return the state then.
@@ -59,8 +63,7 @@ class ArmBatch:
         """
         check_finite("action", target, self._steps)
         within = np.minimum(np.maximum(target, -self._torque), self._torque)  # np.clip takes its time
-        command = self.actuation(within, self._substeps)
-        self.sim.rollout(self.motors(command), record=())
+        self.sim.rollout(self.actuation(within, self._substeps), record=())
         self.sim.kinematics()
         self._steps += 1
         return self.read()
@@ -71,12 +74,12 @@ class ArmBatch:
 
     def state(self) -> dict:
         """Return copies of all that the next steps depend on, for `set_state`."""
-        parts = {name: getattr(self, name).state() for name in ("sim", "actuation", "motors")}
+        parts = {name: getattr(self, name).state() for name in ("sim", "actuation")}
         return parts | {"_steps": self._steps.copy()}
 
     def set_state(self, state: Mapping) -> None:
         """Go back to what `state` returned; the same targets then lead to the same states, bit for bit."""
-        for name in ("sim", "actuation", "motors"):
+        for name in ("sim", "actuation"):
             getattr(self, name).set_state(state[name])
         self._steps[:] = state["_steps"]
 

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import SoftLimits
 from r2s.physics.rigid_body import put_links
 from r2s.physics.robot import Robot
 from r2s.tasks.reach import ReachTask
@@ -38,7 +37,6 @@ class Oracle:
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site(robot.ee_site).id
         self._torque = task.torque(robot)
-        self._soft = SoftLimits.of(robot, self._torque)
         self._plans: dict[int, tuple[np.ndarray, np.ndarray, float, int]] = {}
 
     @torch.no_grad()
@@ -65,7 +63,7 @@ class Oracle:
         mujoco.mj_fwdPosition(self._model, data)
         mujoco.mj_fwdVelocity(self._model, data)
         mujoco.mj_rne(self._model, data, 1, rigid)
-        return rigid + self.dynamics.friction(dto) - self.dynamics.offset - self._soft(q, dq)
+        return rigid + self.dynamics.friction(dto) - self.dynamics.offset
 
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
         """Return q (n,) within the limits whose end effector is at `goal` (3,) m, near `start`; damped steps."""

@@ -1,314 +1,247 @@
-"""The driver's rules: soft limits, and how much a policy may do when joints are or would get too fast; compiled."""
+"""The driver's law: what reaches an arm, whatever a policy says; compiled, the same in training and on every arm.
 
-from dataclasses import dataclass
-from typing import NamedTuple
+Three rules, on a target that has come through the low-pass (r2s/physics/actuation.py), with M the arm's inertia:
 
+1. All torque fades where a joint gets too fast or too close to a position limit, whatever made it so.
+2. No joint accelerates beyond what can be taken back in time. With v the speed that is allowed at q,
+   -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque). Of all torques that keep to this the nearest
+   is sent, in the sense of Gauss' principle of least constraint: what stops at the joints would add.
+3. The sum is clipped to the torque range, and its rate is limited, last, against what the arm applied last.
+
+Rule 2 is a control barrier function in each joint (Ames et al., European Control Conference 2019). It is continuous in
+states and targets, and its gains are what a late arm bears: nothing switches, nothing shakes.
+"""
+
+import math
+
+import mujoco
 import numpy as np
 from numba import njit
 
-from r2s.physics.actuation import low_pass_factor
 from r2s.physics.robot import SIM_DT, Robot
 
-ALLOWED = 0.92  # of the velocity limits: how fast joints may go at all
-SLOWER = 0.8  # of what an arm allows near its position limits, where it allows less there
-FREE = 0.65  # of the speed that is allowed: above, joints are braked and the policy loses authority
-WALL_DDQ = 0.35  # of ddq_max, the deceleration that a way to a position limit is judged by
-WALL_Q = 0.05  # rad within the position limits, where the allowed speed has come down to nothing
-WALL_RATE = 40.0  # 1/s, of the braking: as fast as the delay of an arm bears, for what the posture weighs
-PUSH_S = 0.04  # for which a target must not make a heavy joint faster than is allowed: a stretched arm is light
-HEAVY = 0.1  # of the largest inertia at home: lighter joints are held by friction, which is not known here; but all
-# count on an arm that allows less speed near position limits, or heavy joints throw the wrist over what is allowed
-AHEAD_S = 0.035  # at home, that speeds are judged ahead, by accelerations below
-AHEAD_FACTOR = low_pass_factor(60.0)  # of the low-pass on those, per cycle
-STILL = 0.02  # rad/s
+# 1/s: a loop of this rate that is LATE seconds late answers without overshoot, rate x delay <= 1/e
+# (from s + rate exp(-s delay) = 0 having a double real root).
+LATE = 0.012  # s, of torque and measurement: delays of 8 ms and lags of 3 ms have been seen, and a cycle
+RATE = round(1 / (math.e * LATE))
+# of RATE, at which a joint may close in on a position limit: second-order, critically damped
+APPROACH = 0.25 * RATE
+ALLOWED = 0.7  # of the velocity limits: what friction that nobody knows adds beyond is measured in docs/safety.md
+NOTHING = 0.9  # of the velocity limits, where no torque of the policy is left; it fades from ALLOWED on
+# rad within the position limits, where the allowed speed towards them has come down to nothing; at most a tenth of
+# a joint's range. In Q_FADES of it, from there on, the torque of the policy fades.
+Q_ALLOWED, Q_FADES = 0.1, 0.6
+SLOWER = 0.6  # of the speed that an FR3 allows near its position limits
+BRAKE_S = 0.15  # in which the allowed speeds come down to nothing when an arm is brought to rest
+
+# Columns of a matrix of limits (n, COLUMNS), one row for each joint.
+Q_LOW, Q_HIGH, Q_FADE, MOST, SLOWING, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
+COLUMNS = STEP + 1
+WORK = 6  # rows that `guard` works in, beside 2 n
+EXACT = 1e-9  # rad/s^2, to which accelerations keep to their bounds
+PIVOTS = 5  # rounds in which all joints change sides at once; then one by one, which always ends (Murty 1974)
+ROUNDS = 100
 
 
-@dataclass(frozen=True)
-class SoftLimits:
-    """Torque that pushes a joint back before the arm would stop itself; n joints.
+def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
+    """Return what `guard` holds an arm to, (n, COLUMNS).
 
-    Attributes:
-        q_low, q_high: (n,) rad, where the push begins. q_stiffness: (n,) Nm/rad.
-        dq_soft: (n,) rad/s, where it begins. dq_damping: (n,) Nm s/rad.
-    """
-
-    q_low: np.ndarray
-    q_high: np.ndarray
-    q_stiffness: np.ndarray
-    dq_soft: np.ndarray
-    dq_damping: np.ndarray
-
-    @staticmethod
-    def of(robot: Robot, torque: np.ndarray, *, q_margin: float = 0.1, dq_margin: float = 0.45) -> "SoftLimits":
-        """Return limits that outweigh an action's full `torque` (n,) Nm at 2/3 of each margin.
-
-        Args:
-            robot: gives the hard limits.
-            torque: what the policy can ask for.
-            q_margin: rad before a position limit. dq_margin: share of dq_max before the velocity limit.
-        """
-        return SoftLimits(
-            q_low=robot.q_min + q_margin,
-            q_high=robot.q_max - q_margin,
-            q_stiffness=1.5 * torque / q_margin,
-            dq_soft=(1 - dq_margin) * robot.dq_max,
-            dq_damping=1.5 * torque / (dq_margin * robot.dq_max),
-        )
-
-    def __call__(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """Return the push (..., n) Nm at q, dq (..., n) rad, rad/s."""
-        return soft_push(q, dq, self.q_low, self.q_high, self.q_stiffness, self.dq_soft, self.dq_damping)
-
-
-@njit(cache=True)
-def soft_push(q, dq, q_low, q_high, q_stiffness, dq_soft, dq_damping):
-    """Return what SoftLimits does; compiled, for a loop at 1 kHz."""
-    beyond = np.maximum(0.0, q - q_high) + np.minimum(0.0, q - q_low)
-    fast = np.sign(dq) * np.maximum(0.0, np.abs(dq) - dq_soft)
-    return -q_stiffness * beyond - dq_damping * fast
-
-
-class Rules(NamedTuple):
-    """What holds for an arm wherever it is; arrays (n,).
-
-    Attributes:
-        q_min, q_max: rad. most: rad/s, how fast joints may go. brake: rad/s^2, twice the deceleration that a way to a
-            position limit is judged by. heavy: whose speed a target must not carry over what is allowed.
-        slowing, offset: those of Robot.slowing, the deceleration doubled; where there is none they bound nothing.
-        soft_low, soft_high, soft_stiffness, soft_dq: as of `SoftLimits`.
-    """
-
-    q_min: np.ndarray
-    q_max: np.ndarray
-    most: np.ndarray
-    brake: np.ndarray
-    heavy: np.ndarray
-    slowing: np.ndarray
-    offset: np.ndarray
-    soft_low: np.ndarray
-    soft_high: np.ndarray
-    soft_stiffness: np.ndarray
-    soft_dq: np.ndarray
-
-
-class Driving(NamedTuple):
-    """What the driver of an arm keeps to beside `Rules`; arrays (n,).
-
-    Attributes:
-        torque: Nm, the most that a target may ask for. tau_max: Nm. step: Nm, most change of a command in a cycle.
-        low, high: rad, and fast: rad/s, beyond which the arm is brought to rest.
-        factor: of the low-pass on the target, per cycle. deadline: s without a fresh finite target.
-        fade: cycles over which the targets of a motion fade in; 0: not at all.
-    """
-
-    torque: np.ndarray
-    tau_max: np.ndarray
-    step: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    fast: np.ndarray
-    factor: float
-    deadline: float
-    fade: int
-
-
-class Posture(NamedTuple):
-    """What the arm weighs where it is.
-
-    Attributes:
-        mobility: (n, n) 1/(kg m^2), M^-1. weight: (n,), the inertia that a joint feels over that at home, at most 1.
-        damping: (n,) Nm s/rad, of the braking. soft_damping: (n,) Nm s/rad, of the soft velocity limits.
-    """
-
-    mobility: np.ndarray
-    weight: np.ndarray
-    damping: np.ndarray
-    soft_damping: np.ndarray
-
-
-class Memory(NamedTuple):
-    """What the driver of m arms remembers from cycle to cycle; `drive` and `due` write it.
-
-    Attributes:
-        target: (m, n) Nm, the last finite one. filtered, effort: (m, n) Nm, of the low-pass, and what it let through.
-        sent: (m, n) Nm, the last command. before: (m, n) rad/s, of the cycle before; nan: there was none.
-        ddq: (m, n) rad/s^2, low-passed. mobility (m, n, n), weight, damping, soft_damping (m, n): `Posture`.
-        cycle, silent, damped: (m,), cycles in all, since the last finite target, and of bringing to rest.
-        weighed: (m,), the cycle of the last look at the posture; -1: there was none.
-        why: (m,), RUNS or why the arm is brought to rest. rests: (m,), whether it is at rest.
-    """
-
-    target: np.ndarray
-    filtered: np.ndarray
-    effort: np.ndarray
-    sent: np.ndarray
-    before: np.ndarray
-    ddq: np.ndarray
-    mobility: np.ndarray
-    weight: np.ndarray
-    damping: np.ndarray
-    soft_damping: np.ndarray
-    cycle: np.ndarray
-    silent: np.ndarray
-    damped: np.ndarray
-    weighed: np.ndarray
-    why: np.ndarray
-    rests: np.ndarray
-
-    @staticmethod
-    def fresh(m: int, n: int) -> "Memory":
-        """Return that of m arms of n joints before their first cycle, without torque."""
-        rows, square, count = np.zeros((9, m, n)), np.zeros((m, n, n)), np.zeros((5, m), dtype=np.int64)
-        rows[4], count[3] = np.nan, -1
-        return Memory(*rows[:6], square, *rows[6:], *count, np.zeros(m, dtype=bool))  # type: ignore[call-arg]
-
-
-RUNS, SILENT, NOT_FINITE, OUTSIDE = range(4)  # `Memory.why`
-
-
-@njit(cache=True)
-def due(q, dq, every, memory):
-    """Begin a cycle; return (m,), whose posture was looked at `every` cycles ago."""
-    out = np.empty(len(q), np.bool_)
-    for i in range(len(q)):
-        memory.cycle[i] += 1
-        long = memory.weighed[i] < 0 or memory.cycle[i] - memory.weighed[i] >= every
-        out[i] = long and _finite(q[i]) and _finite(dq[i])
-    return out
-
-
-@njit(cache=True)
-def drive(q, dq, applied, target, said, driving, rules, memory):
-    """Return the commands (m, n) Nm of this cycle; r2s/arm/driver.py says in which order what is done.
+    A joint is added inertia where a full action would throw it: light wrists are held by friction, which is not known
+    here. With it, an action of 1 from rest is just allowed.
 
     Args:
-        q, dq: (m, n) rad, rad/s, where they are not finite the torque fades out. applied: (m, n) Nm, tau_J_d.
-        target: (m, n) Nm. said: whether the policies said anything in this cycle.
-        driving, rules, memory: what the arms are held to, and what has been; `due` has begun the cycle.
+        robot: gives position, velocity, torque and rate limits, and what it weighs at home.
+        torque: (n,) Nm, the most that a target asks for.
     """
-    out = np.empty_like(memory.sent)
-    for i in range(len(q)):
-        seen = _finite(q[i]) and _finite(dq[i])
-        if said and _finite(target[i]):
-            memory.target[i] = np.minimum(np.maximum(target[i], -driving.torque), driving.torque)
-            memory.silent[i] = 0
-        else:
-            memory.silent[i] += 1
-        if memory.why[i] == RUNS:
-            if memory.silent[i] * SIM_DT > driving.deadline:
-                memory.why[i] = SILENT
-            elif not seen:
-                memory.why[i] = NOT_FINITE
-            elif not _inside(q[i], dq[i], driving.low, driving.high, driving.fast):
-                memory.why[i] = OUTSIDE
-        memory.rests[i] = seen and _rests(dq[i])
-        stopping = memory.why[i] != RUNS
-        memory.damped[i] += stopping
-        if seen:
-            before = dq[i] if np.isnan(memory.before[i, 0]) else memory.before[i]
-            soon = _ahead(dq[i], before, memory.ddq[i], memory.weight[i])
-            memory.before[i] = dq[i]
-            fade = memory.cycle[i] / driving.fade if memory.cycle[i] < driving.fade else 1.0
-            posture = Posture(memory.mobility[i], memory.weight[i], memory.damping[i], memory.soft_damping[i])
-            wanted, push = _shape(q[i], dq[i], soon, memory.target[i], fade, stopping, rules, posture)
-        else:
-            wanted, push = np.zeros(q.shape[1]), np.zeros(q.shape[1])
-        last = applied[i] if _finite(applied[i]) else memory.sent[i]
-        for j in range(q.shape[1]):  # as r2s.physics.actuation.Actuation
-            memory.filtered[i, j] += driving.factor * (wanted[j] - memory.filtered[i, j])
-            clipped = min(max(memory.filtered[i, j], -driving.tau_max[j]), driving.tau_max[j])
-            change = clipped - memory.effort[i, j]
-            memory.effort[i, j] += min(max(change, -driving.step[j]), driving.step[j])
-        memory.sent[i] = _within(memory.effort[i] + push, last, driving.tau_max, driving.step)
-        out[i] = memory.sent[i]
+    out = np.empty((robot.n, COLUMNS))
+    inside = np.minimum(Q_ALLOWED, 0.1 * (robot.q_max - robot.q_min))
+    out[:, Q_LOW], out[:, Q_HIGH], out[:, Q_FADE] = robot.q_min + inside, robot.q_max - inside, Q_FADES * inside
+    out[:, MOST], out[:, DQ_MAX] = ALLOWED * robot.dq_max, robot.dq_max
+    deceleration, offset = robot.slowing or (np.full(robot.n, np.inf), np.zeros(robot.n))
+    out[:, SLOWING], out[:, OFFSET] = 2 * SLOWER**2 * deceleration, SLOWER * offset
+    out[:, ADDED] = np.maximum(0.0, torque / (RATE * out[:, MOST]) - felt_inertia(robot))
+    out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
     return out
 
 
-@njit(cache=True)
-def _finite(x):
-    return np.isfinite(x).all()
+def felt_inertia(robot: Robot) -> np.ndarray:
+    """Return (n,) kg m^2 that each joint feels at home with the others free: 1 over the diagonal of M^-1."""
+    model = robot.model(gravity=False)
+    data, mass = mujoco.MjData(model), np.empty((robot.n, robot.n))
+    data.qpos[:] = robot.q_home
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_fullM(model, data, mass)
+    return 1 / np.diag(np.linalg.inv(mass))
 
 
-@njit(cache=True)
-def _rests(dq):
-    return (np.abs(dq) < STILL).all()
+class Guard:
+    """The law for one arm, with the inertia of its model; `guard` for arguments.
 
+    Attributes:
+        cycles: so far. changed: in how many of them the law changed what was asked for.
 
-@njit(cache=True)
-def _inside(q, dq, low, high, fast):
-    return (q >= low).all() and (q <= high).all() and (np.abs(dq) <= fast).all()
-
-
-@njit(cache=True)
-def _ahead(dq, before, ddq, weight):
-    """Return (n,) rad/s, how fast the joints will be by the time that the torque can be another: it takes ms.
-
-    Less far ahead where a joint is lighter than at home: fed back late, its acceleration would shake it. `ddq` (n,)
-    is kept from cycle to cycle.
+    Args:
+        model: one arm without gravity. robot, torque: as of `limits`.
     """
-    ddq += AHEAD_FACTOR * ((dq - before) / SIM_DT - ddq)
-    return dq + AHEAD_S * weight * ddq
+
+    def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray):
+        self._model, self._data, self._limits = model, mujoco.MjData(model), limits(robot, torque)
+        self._work = np.empty((2 * robot.n + WORK, robot.n))
+        self.cycles = self.changed = 0
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray, effort: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """Return the command (n,) Nm for the effort (n,) Nm at q, dq (n,), after the command `last` (n,) Nm."""
+        data, out = self._data, np.empty_like(effort)
+        data.qpos[:], data.qvel[:] = q, dq
+        mujoco.mj_fwdPosition(self._model, data)
+        mujoco.mj_fwdVelocity(self._model, data)
+        now = data.M, data.qfrc_bias, self._limits, self._work
+        self.changed += guard(q, dq, effort, last, 1.0, *now, out)
+        self.cycles += 1
+        return out
 
 
-@njit(cache=True)
-def _shape(q, dq, soon, target, fade, stopping, rules, posture):
-    """Return the part of `target` (n,) Nm that is let through, and the push (n,) Nm that limits add."""
-    up, down = _bounds(q, rules)
-    push = soft_push(
-        q, dq, rules.soft_low, rules.soft_high, rules.soft_stiffness, rules.soft_dq, posture.soft_damping
-    )
-    if stopping:
-        return np.zeros_like(q), push - posture.damping * soon
-    wanted = target * (fade * _authority(up, down, soon))
-    wanted = wanted * _room(up, down, dq, wanted, rules.heavy, posture.mobility)
-    return wanted, push + _wall(up, down, soon, posture.damping)
+@njit(cache=True, error_model="numpy")
+def guard(q, dq, effort, last, share, mass, bias, limits, work, out):
+    """Write the command (n,) Nm of a cycle into `out`; return whether the law changed anything but the rate.
 
-
-@njit(cache=True)
-def _bounds(q, rules):
-    """Return (n,) rad/s, how fast a joint may go up and down at q: less on the way to a position limit."""
-    return _bound(rules.q_max - WALL_Q - q, rules), _bound(q - rules.q_min - WALL_Q, rules)
-
-
-@njit(cache=True)
-def _bound(way, rules):
-    """Return (n,) rad/s for joints that have `way` (n,) rad left to WALL_Q from a position limit."""
-    ours = np.sqrt(rules.brake * np.maximum(way, 0.0))
-    arms = np.sqrt(rules.slowing * np.maximum(way + WALL_Q, 0.0) + rules.offset**2) - rules.offset
-    return np.minimum(np.minimum(rules.most, ours), SLOWER * arms)
-
-
-@njit(cache=True)
-def _authority(up, down, dq):
-    """Return the share of its torque that a policy has: less of all of it when any joint is nearly too fast.
-
-    A light joint between heavy ones is thrown about by torques that are not its own.
+    Args:
+        q, dq: (n,) rad, rad/s, finite. effort: (n,) Nm, what is asked for. last: (n,) Nm, what the arm applied last.
+        share: of the allowed speeds that is left, 1 unless the arm is being brought to rest.
+        mass: (n (n + 1) / 2,) kg m^2, the lower triangle, row by row. bias: (n,) Nm, Coriolis torque.
+        limits: (n, COLUMNS), of `limits`. work: (2 n + WORK, n), anything.
     """
-    near = np.maximum(dq / np.maximum(up, 1e-3), -dq / np.maximum(down, 1e-3)).max()
-    return min(max((1.0 - near) / (1.0 - FREE), 0.0), 1.0)
+    n = len(q)
+    ddq, low, high = work[2 * n], work[2 * n + 1], work[2 * n + 2]
+    left = _left(q, dq, limits)
+    for j in range(n):
+        out[j] = left * effort[j]
+        ddq[j] = out[j] - bias[j]
+    _factor(mass, limits, work)
+    _solve(work, ddq)
+    within = True
+    for j in range(n):
+        up = _allowed(limits[j, Q_HIGH] - q[j], share, limits[j])
+        down = _allowed(q[j] - limits[j, Q_LOW], share, limits[j])
+        high[j], low[j] = RATE * (up - dq[j]), -RATE * (down + dq[j])
+        within &= low[j] <= ddq[j] <= high[j]
+    if not within:
+        _push(ddq, low, high, work)
+        for j in range(n):
+            out[j] += work[2 * n + 3, j]
+    for j in range(n):
+        clipped = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX])
+        out[j] = last[j] + min(max(clipped - last[j], -limits[j, STEP]), limits[j, STEP])
+    return left < 1.0 or not within
 
 
-@njit(cache=True)
-def _room(up, down, dq, wanted, heavy, mobility):
-    """Return the share of `wanted` (n,) Nm that in PUSH_S makes no heavy joint faster than is allowed.
+@njit(cache=True, error_model="numpy")
+def _left(q, dq, limits):
+    """Return the share of its torque that a policy keeps: rule 1."""
+    near = 0.0
+    for j in range(len(q)):
+        near = max(near, (abs(dq[j]) / limits[j, DQ_MAX] - ALLOWED) / (NOTHING - ALLOWED))
+        near = max(near, max(q[j] - limits[j, Q_HIGH], limits[j, Q_LOW] - q[j]) / limits[j, Q_FADE])
+    return 1.0 - min(near, 1.0)
 
-    Speeds tell too late where the arm is light: with joints 1 and 3 in line, 10 Nm turn the elbow from rest to its
-    limit within 10 ms, twice the delay of an arm.
+
+@njit(cache=True, error_model="numpy")
+def _allowed(way, share, limits):
+    """Return rad/s, how fast a joint may go that has `way` rad left; back, where there is none left."""
+    speed = min(share * limits[MOST], APPROACH * way)
+    if way > 0.0 and limits[SLOWING] < np.inf:
+        speed = min(speed, np.sqrt(limits[SLOWING] * way + limits[OFFSET] ** 2) - limits[OFFSET])
+    return speed
+
+
+@njit(cache=True, error_model="numpy")
+def _factor(mass, limits, work):
+    """Write Cholesky's root of the inertia, its diagonal inverted, into the first n rows of `work`."""
+    for i in range(len(limits)):
+        row = i * (i + 1) // 2
+        d = mass[row + i] + limits[i, ADDED]
+        for k in range(i):
+            r = mass[row + k]
+            for c in range(k):
+                r -= work[i, c] * work[k, c]
+            r *= work[k, k]
+            work[i, k] = r
+            d -= r * r
+        work[i, i] = 1.0 / np.sqrt(d)
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(root, x):
+    """Divide x (n,) by the inertia that `root` is of, in place."""
+    n = len(x)
+    for i in range(n):
+        s = x[i]
+        for k in range(i):
+            s -= root[i, k] * x[k]
+        x[i] = s * root[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for c in range(i + 1, n):
+            s -= root[c, i] * x[c]
+        x[i] = s * root[i, i]
+
+
+@njit(cache=True, error_model="numpy")
+def _push(ddq, low, high, work):
+    """Write the torques (n,) Nm that stops at the joints would add into row 2 n + 3 of `work`.
+
+    They solve the linear complementarity problem of low <= ddq + M^-1 push <= high, a joint's push towards the inside
+    and only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).
     """
-    gain = PUSH_S * (mobility @ wanted)
-    left = np.where(gain > 0, up - dq, down + dq)
-    share = np.maximum(left, 0.0) / np.maximum(np.abs(gain), 1e-9)
-    return min(1.0, share[heavy].min())
-
-
-@njit(cache=True)
-def _wall(up, down, dq, damping):
-    """Return (n,) Nm that brakes what is too fast, for where it is."""
-    return -damping * (np.maximum(dq - FREE * up, 0.0) - np.maximum(-dq - FREE * down, 0.0))
-
-
-@njit(cache=True)
-def _within(wanted, last, tau_max, step):
-    """Return (n,) Nm: clipped, then no further than `step` (n,) from what the arm applied last."""
-    clipped = np.minimum(np.maximum(wanted, -tau_max), tau_max)
-    return last + np.minimum(np.maximum(clipped - last, -step), step)
+    n = len(ddq)
+    root, mobility, push, side, other = work[:n], work[n : 2 * n], work[2 * n + 3], work[2 * n + 4], work[2 * n + 5]
+    for k in range(n):
+        for j in range(n):
+            mobility[k, j] = 1.0 if j == k else 0.0
+        _solve(root, mobility[k])
+        side[k] = 1.0 if ddq[k] > high[k] else (-1.0 if ddq[k] < low[k] else 0.0)
+    for turn in range(ROUNDS):
+        for i in range(n):  # the pushes of the joints that are at a bound; Cholesky's root of their mobility
+            push[i] = 0.0
+            if side[i] == 0.0:
+                continue
+            s, d = (high[i] if side[i] > 0.0 else low[i]) - ddq[i], mobility[i, i]
+            for k in range(i):
+                if side[k] == 0.0:
+                    continue
+                r = mobility[i, k]
+                for c in range(k):
+                    if side[c] != 0.0:
+                        r -= root[i, c] * root[k, c]
+                r *= root[k, k]
+                root[i, k] = r
+                d -= r * r
+                s -= r * push[k]
+            root[i, i] = 1.0 / np.sqrt(d)
+            push[i] = s * root[i, i]
+        for i in range(n - 1, -1, -1):
+            if side[i] == 0.0:
+                continue
+            s = push[i]
+            for c in range(i + 1, n):
+                if side[c] != 0.0:
+                    s -= root[c, i] * push[c]
+            push[i] = s * root[i, i]
+        done = True
+        for j in range(n - 1, -1, -1):
+            reached = ddq[j]
+            for k in range(n):
+                reached += mobility[j, k] * push[k]
+            other[j] = side[j]
+            if side[j] * push[j] > 0.0:
+                other[j] = 0.0  # it would pull outwards
+            elif side[j] == 0.0:
+                other[j] = 1.0 if reached > high[j] + EXACT else (-1.0 if reached < low[j] - EXACT else 0.0)
+            done &= other[j] == side[j]
+        if done:
+            return
+        for j in range(n - 1, -1, -1):
+            if other[j] != side[j]:
+                side[j] = other[j]
+                if turn >= PIVOTS:
+                    break

@@ -1,8 +1,8 @@
 """Friction inside MuJoCo's physics step: a compiled force that reads `jnt_user`.
 
 `install()` puts the laws of friction.py into MuJoCo as a native callback: `mujoco.batch.Batch` then gives every
-simulation its own arm at full speed. The same callback holds the driver's soft limits (limits.py), which need
-feedback every millisecond. It is the control callback, the last before accelerations, because who is held by the net
+simulation its own arm at full speed. The same callback holds the driver's law (limits.py), which needs feedback every
+millisecond, and behind it the motors' delay (actuation.py). It is the control callback, the last before accelerations, because who is held by the net
 torque (stick_slip.py) depends on all other forces.
 
 The force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
@@ -20,7 +20,9 @@ import numpy as np
 from numba import njit
 from numba.extending import is_jitted
 
+from r2s.physics.actuation import SLOTS, turn
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
+from r2s.physics.limits import COLUMNS, TAU_MAX, WORK, guard
 from r2s.physics.stick_slip import TINY, coming_velocity, element, turns
 
 # Columns of jnt_user. The first marks a model as ours: the callback is process-global and must leave others alone.
@@ -30,12 +32,15 @@ DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # 
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
-Q_LOW, Q_HIGH, Q_STIFFNESS, DQ_SOFT, DQ_DAMPING = range(GRAVITY + 3, GRAVITY + 8)  # of soft limits; 0: there are none
-WIDTH = DQ_DAMPING + 1
+DELAY, LAG, LIMITS = GRAVITY + 3, GRAVITY + 4, GRAVITY + 5  # of the arm; of the driver, COLUMNS wide, 0: there is none
+WIDTH = LIMITS + COLUMNS
 MARKER = 7_202_020.0
 # Rows of what a step knows of its joints. REST and EDGES: two each, of the negative and the positive direction.
 SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
-
+# Rows of n that an arm remembers: bristles, the command before, what the motors do, cycles (a number), in how many of
+# them the law changed what was asked for (a number), and SLOTS of commands.
+BRISTLE, SENT, MOTOR, CYCLE, LIMITED, LINE = range(6)
+KEPT = LINE + SLOTS
 
 # the place of a law is its number in `jnt_user`
 _laws: list[Callable] = [*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None)]
@@ -131,15 +136,27 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         qvel = carray(as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
         applied = carray(as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
         qfrc_passive = carray(as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
-        memory = carray(as_doubles(data[memory_at]), (n,))  # type: ignore[call-arg]
+        kept = carray(as_doubles(data[memory_at]), (KEPT, n))  # type: ignore[call-arg]
+        memory = kept[BRISTLE]
         xpos = carray(as_doubles(data[xpos_at]), (nbody, 3))  # type: ignore[call-arg]
         xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
         anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
         axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
         net = user[0, NET] != 0.0  # of all joints of an arm, or of none
-        if net:
+        driven = user[0, LIMITS + TAU_MAX] > 0.0
+        if net or driven:
             bias = carray(as_doubles(data[bias_at]), (n,))  # type: ignore[call-arg]
             mass = carray(as_doubles(data[mass_at]), (n * (n + 1) // 2,))  # type: ignore[call-arg]
+        if driven and user[0, MARK] == MARKER:
+            desk = carray(stack((2 * n + WORK) * n), (2 * n + WORK, n))  # type: ignore[call-arg]
+            cycle = SLOTS + int(kept[CYCLE, 0])
+            sent = kept[LINE + cycle % SLOTS]
+            changed = guard(q, qvel, applied, kept[SENT], 1.0, mass, bias, user[:, LIMITS:], desk, sent)
+            kept[LIMITED, 0] += changed
+            kept[SENT, :] = sent
+            turn(kept[LINE:], kept[MOTOR], cycle, user[0, DELAY], user[0, LAG], applied)
+            kept[CYCLE, 0] += 1.0
+        if net:
             work = carray(stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
             joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
             slow = False
@@ -183,11 +200,6 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             damping[j] = user[j, DAMPING] + slope
             drive = applied[j] + pull
             held = not net and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
-            if user[j, DQ_DAMPING] > 0.0 and abs(v) > user[j, DQ_SOFT]:
-                damping[j] += user[j, DQ_DAMPING]
-                force -= user[j, DQ_DAMPING] * (v - (user[j, DQ_SOFT] if v > 0.0 else -user[j, DQ_SOFT]))
-            beyond = max(0.0, q[j] - user[j, Q_HIGH]) + min(0.0, q[j] - user[j, Q_LOW])
-            force -= user[j, Q_STIFFNESS] * beyond
             qfrc_passive[j] += force + (-applied[j] if held else pull)
             if net:
                 joint[SPEED, j], joint[FRICTION, j], joint[LOADED, j] = v, friction, loaded
@@ -240,7 +252,7 @@ def _struct_offsets() -> dict[str, int]:
     """
     joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
     spec = mujoco.MjSpec.from_string(
-        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='3'/><worldbody>{joints}</worldbody></mujoco>"
+        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='{3 * KEPT}'/><worldbody>{joints}</worldbody></mujoco>"
     )
     model = spec.compile()
     data = mujoco.MjData(model)

@@ -69,12 +69,13 @@ class Robot:
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
 
-    def model(self, *, gravity: bool, user: int = 0, dt: float = SIM_DT) -> mujoco.MjModel:
+    def model(self, *, gravity: bool, user: int = 0, memory: int = 0, dt: float = SIM_DT) -> mujoco.MjModel:
         """Compile the arm.
 
         Args:
             gravity: False is libfranka's convention (the arm compensates it); True is for link-side torque.
-            user: width of `jnt_user`, where the friction law keeps its parameters (r2s/physics/friction.py).
+            user: width of `jnt_user`, where the friction law keeps its parameters (r2s/physics/native_friction.py).
+            memory: doubles that it remembers from step to step.
             dt: time step, s.
         """
         spec, _ = read_spec(self.mjcf)
@@ -92,7 +93,7 @@ class Robot:
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
             joint.parent.simple = False  # its centre and tensor may become others
         spec.nuser_jnt = user
-        spec.nuserdata = self.n if user else 0  # what friction remembers
+        spec.nuserdata = memory
         spec.option.timestep = dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

@@ -14,7 +14,7 @@ from numba import njit
 
 from r2s.physics import native_friction as native
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import SoftLimits
+from r2s.physics.actuation import steps_late
 from r2s.physics.rigid_body import principal_axes, put_links
 from r2s.physics.robot import SIM_DT, Robot
 
@@ -28,7 +28,7 @@ class Simulator:
     def __init__(self, robot: Robot, dynamics: Dynamics, nsim: int, nthread: int = 0, dt: float = SIM_DT):
         native.install()
         self.robot = robot
-        self.model = robot.model(gravity=False, user=native.WIDTH, dt=dt)
+        self.model = robot.model(gravity=False, user=native.WIDTH, memory=native.KEPT * robot.n, dt=dt)
         self.batch = mujoco.batch.Batch(self.model, nsim, nthread)
         self.nsim = nsim
         self._bodies = self.model.jnt_bodyid
@@ -58,7 +58,7 @@ class Simulator:
             return np.repeat(a, repeat, axis=0) if a.ndim > without and repeat > 1 else a
 
         at = arms[:, None], self._bodies
-        self._user[arms, :, : native.Q_LOW] = spread(_law_columns(self.robot, self.model, dynamics), 2)
+        self._user[arms, :, : native.LIMITS] = spread(_law_columns(self.robot, self.model, dynamics), 2)
         self._damping[arms] = self.model.dof_damping
         self._armature[arms] = spread(dynamics.armature, 1)
         self._inertia[at] = spread(moments, 2)
@@ -67,9 +67,15 @@ class Simulator:
         self._com[at] = spread(dynamics.com, 2)
         self.batch.set_const(ids)
 
-    def set_soft_limits(self, limits: SoftLimits) -> None:
-        """Let the driver's soft limits act in all arms; without this call there are none."""
-        self._user[:, :, native.Q_LOW :] = _soft_columns(limits)
+    def drive(self, limits: np.ndarray) -> None:
+        """Put the driver's law, and behind it each arm's delay and lag, before the torques of `rollout`.
+
+        These are then efforts, what is asked for; without this call they are what the joints feel.
+
+        Args:
+            limits: (n, COLUMNS), of r2s.physics.limits.limits.
+        """
+        self._user[:, :, native.LIMITS :] = limits
 
     def reset(
         self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, bristle: np.ndarray | float = 0.0
@@ -82,7 +88,8 @@ class Simulator:
         at = slice(None) if ids is None else ids
         self.q[at] = q
         self.dq[at] = dq
-        self._memory[at] = bristle
+        self._memory[at] = 0.0
+        self._memory[at, : self.robot.n] = bristle
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 
@@ -114,6 +121,18 @@ class Simulator:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
 
     @property
+    def tau(self) -> np.ndarray:
+        """(nsim, n) Nm, what the driver's law sent last."""
+        n = self.robot.n
+        return self._memory[:, native.SENT * n : (native.SENT + 1) * n]
+
+    @property
+    def limited(self) -> np.ndarray:
+        """(nsim,), in which share of the cycles since `reset` the driver's law changed what was asked for."""
+        n = self.robot.n
+        return self._memory[:, native.LIMITED * n] / np.maximum(self._memory[:, native.CYCLE * n], 1.0)
+
+    @property
     def ee(self) -> np.ndarray:
         """(nsim, 3) m, the end effector in the base frame."""
         return self._site_xpos[:, self._site]
@@ -135,24 +154,23 @@ def _jacobian(axis, anchor, ee):
     return out
 
 
-def single_arm(robot: Robot, dynamics: Dynamics, soft: SoftLimits | None = None) -> mujoco.MjModel:
-    """Return one arm's model without gravity: its links and rotors, friction law and the driver's soft limits."""
+def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
+    """Return one arm's model without gravity: its links and rotors, and its friction law."""
     native.install()
-    model = robot.model(gravity=False, user=native.WIDTH)
-    model.jnt_user[:, : native.Q_LOW] = _law_columns(robot, model, dynamics)
-    if soft is not None:
-        model.jnt_user[:, native.Q_LOW :] = _soft_columns(soft)
+    model = robot.model(gravity=False, user=native.WIDTH, memory=native.KEPT * robot.n)
+    model.jnt_user[:, : native.LIMITS] = _law_columns(robot, model, dynamics)
     put_links(model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
     return model
 
 
 def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
-    """Return the columns of `jnt_user` that are not soft limits, (..., n, Q_LOW)."""
+    """Return the columns of `jnt_user` that say what the arm is, (..., n, LIMITS)."""
     f = native
     moment, nominal = d.mass[..., None] * d.com, robot.mass[:, None] * robot.com
     errors = d.mass - robot.mass, moment - nominal
     arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
-    rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in arrays)), f.Q_LOW))
+    delay, lag = (late[..., None] for late in steps_late(d.delay, d.lag))
+    rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in (*arrays, delay, lag))), f.LIMITS))
     rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family, d.hold)
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
@@ -168,12 +186,8 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = errors[1]
     rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
     rows[..., f.GRAVITY : f.GRAVITY + 3] = robot.gravity
+    rows[..., f.DELAY], rows[..., f.LAG] = delay, lag
     # an arm in which links differ from nominal, or load counts, sums them up at every step; others are spared that
     differs = (d.load != 0) | (errors[0] != 0) | (errors[1] != 0).any(-1)
     rows[..., f.LINK] = differs.any(-1, keepdims=True)
     return rows
-
-
-def _soft_columns(limits: SoftLimits) -> np.ndarray:
-    """Return the columns of `jnt_user` that are soft limits, (n, WIDTH - Q_LOW)."""
-    return np.stack([limits.q_low, limits.q_high, limits.q_stiffness, limits.dq_soft, limits.dq_damping], -1)

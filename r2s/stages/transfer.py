@@ -54,8 +54,8 @@ def trained_config(cfg):
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
     from r2s.arm.deploy import DrivenArm
-    from r2s.arm.driven_batch import DrivenBatch
     from r2s.engines.episodes import EngineArms
+    from r2s.learning.batch import ArmBatch
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
     from r2s.learning.policy import load_policy
     from r2s.progress import Progress
@@ -98,8 +98,8 @@ def transfer(cfg, overrides):
                 rows[cfg.simulator.name] = task.measures(done) | gap(done, episodes["mujoco"])
                 episodes[cfg.simulator.name] = done
         if arm is not None:
-            if dynamics is not None:  # what the model says of this arm, behind the same driver
-                model = DrivenBatch(arm.robot, dynamics, task, len(goals), soft_start_s=fade, nthread=cfg.threads)
+            if dynamics is not None:  # what the model says of this arm
+                model = ArmBatch(arm.robot, task, dynamics, len(goals), cfg.threads, fade)
                 done = rollout(policy, model, task, starts, goals)
                 rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(model.stops)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")

@@ -10,6 +10,7 @@ from r2s.physics.robot import Robot
 from r2s.tasks.task import Episodes, State, Task
 
 HOLD_S = 0.5  # s, at the end of an episode: reached means reached and held
+REST = 0.05  # rad/s, below which a joint rests
 
 
 class Acts(Protocol):
@@ -68,7 +69,7 @@ def rollout(
     torque, weights = task.torque(robot), task.paper_weights
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
-    ee, distance, reward = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    ee, distance, reward, limited = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), np.zeros(count)
 
     def ask(state: State, goals: np.ndarray) -> np.ndarray:
         observation = torch.from_numpy(task.observe(state, goals, torque))
@@ -90,10 +91,14 @@ def rollout(
             reward[now, k] = terms @ weights
             q[now, k], dq[now, k], ee[now, k], tau[now, k] = state.q, state.dq, state.ee, state.tau
             before = dq[now, k]
+        limited[now] = state.limited
         distance[now, -1][arms.end()] = np.inf  # reached means reached and held by an arm that still runs
         progress(min(first + width, count), count)
     t = (1 + np.arange(task.steps)) / task.ctrl_hz
-    return Episodes(t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward)
+    q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
+    return Episodes(
+        t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward, q_left=q_left, limited=limited
+    )
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
@@ -102,10 +107,13 @@ def measures(episodes: Episodes) -> dict[str, float]:
     success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
     of the mean distance in that time. return_paper: mean sum of eq. (2). time_to_reach_s: median time after which the
     hand stays within 2 cm, of the episodes that got there. overshoot_m: how far out of 2 cm it came again after it
-    had first been within, mean of those that had.
+    had first been within, mean of those that had. rest: share of episodes in which every joint is slower than REST
+    for the whole last 0.5 s: a hand can lie on a joint's axis. q_left_rad: how close joints come to position limits,
+    the 5 % quantile over episodes. limited: share of the cycles in which the driver's law changed what was asked for.
     """
     step = episodes.t[1] - episodes.t[0]
-    last = episodes.distance[:, -round(HOLD_S / step) :]
+    hold = round(HOLD_S / step)
+    last = episodes.distance[:, -hold:]
     away = episodes.distance > 0.02
     steps = episodes.distance.shape[1]
     since = np.where(away.any(1), steps - np.argmax(away[:, ::-1], axis=1), 0)
@@ -125,6 +133,9 @@ def measures(episodes: Episodes) -> dict[str, float]:
         "return_paper": float(episodes.reward.sum(1).mean()),
         "time_to_reach_s": float(np.median(since[there]) * step) if there.any() else float("nan"),
         "overshoot_m": float(np.mean(later)) if later else float("nan"),
+        "rest": float((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST).mean()),
+        "q_left_rad": float(np.quantile(episodes.q_left, 0.05)),
+        "limited": float(episodes.limited.mean()),
     }
 
 

@@ -21,6 +21,7 @@ class State:
         ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target as it has come through the low-pass.
         stopped: (m,), whether the arm has ended its motion.
+        limited: (m,), in which share of the cycles of their episodes the driver's law changed what was asked for.
     """
 
     t: np.ndarray
@@ -31,12 +32,14 @@ class State:
     tau: np.ndarray
     effort: np.ndarray
     stopped: np.ndarray
+    limited: np.ndarray
 
     @staticmethod
     def still(robot: Robot) -> "State":
         """Return one arm at rest at home, without kinematics: what functions are compiled on."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
-        return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, np.zeros(1, dtype=bool))
+        none = np.zeros(1, dtype=bool), np.zeros(1)
+        return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class Episodes:
     Attributes:
         t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m. tau: (E, T, n) Nm, the command at the end of
         the step. distance: (E, T) m. reward: (E, T), eq. (2).
+        q_left: (E,) rad, how close any joint came to a position limit.
+        limited: (E,), in which share of the cycles the driver's law changed what was asked for.
     """
 
     t: np.ndarray
@@ -56,6 +61,8 @@ class Episodes:
     tau: np.ndarray
     distance: np.ndarray
     reward: np.ndarray
+    q_left: np.ndarray
+    limited: np.ndarray
 
 
 class Task(Protocol):
