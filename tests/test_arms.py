@@ -26,7 +26,7 @@ from r2s.identification.torque_residual import TorqueResidual
 from r2s.learning.env import TaskEnv
 from r2s.physics.description import write_mjcf
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.limits import SoftLimits
+from r2s.physics.limits import limits
 from r2s.physics.robot import load_robot
 from r2s.physics.simulator import Simulator, single_arm
 from r2s.recordings.readers import read
@@ -190,7 +190,7 @@ def test_a_joint_without_end_has_no_limit_anywhere(write):
     state["action"] = env.action_spec.rand()
     assert np.isfinite(env.step(state)["next"]["observation"].numpy()).all()
     sim = Simulator(robot, nominal_dynamics(robot, **FRICTIONLESS), 1, 1)
-    sim.set_soft_limits(SoftLimits.of(robot, robot.tau_max))
+    sim.drive(limits(robot, robot.tau_max))
     sim.reset(np.array([[100.0, 0.0, -100.0]]), np.zeros((1, 3)))
     sim.rollout(np.zeros((1, 50, 3)))
     np.testing.assert_allclose(sim.q, [[100.0, 0.0, -100.0]], atol=1e-12)

@@ -11,7 +11,6 @@ import pytest
 from r2s.errors import UserError
 from r2s.physics.dynamics import AXES, Dynamics
 from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
-from r2s.physics.limits import SoftLimits
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
 
@@ -168,7 +167,7 @@ def mass_matrix(model, data):
     return full
 
 
-def agree_step_by_step(robot, dynamics, k, q, dq, tau, out, soft=None):
+def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
     """Assert that each step of simulation k is that of the NumPy law from the same state; count who was held.
 
     From the same state, because a step may amplify what the one before left by the dozen: Stribeck's falling branch
@@ -195,9 +194,6 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out, soft=None):
         slope = np.maximum(slope, 0.0)
         passive = passive_torque(v, torque, friction, pull, d.breakaway, d.dq_min)
         held += int(np.sum(np.isclose(passive + friction, -torque, atol=1e-12)))
-        if soft is not None:
-            passive = passive + soft(data.qpos, v)
-            slope = slope + soft.dq_damping * (np.abs(v) > soft.dq_soft)
         data.qfrc_applied[:] = torque + passive + slope * v
         model.dof_damping[:] = base + slope
         mujoco.mj_step(model, data)
@@ -284,26 +280,6 @@ def test_the_dead_zone_holds_what_gravity_compensation_misses(panda):
     sim.kinematics()
     assert np.array_equal(sim.q[0], panda.q_home)
     assert sim.ee[1, 2] < before[1, 2] - 1e-4
-
-
-def test_native_soft_limits_are_those_of_the_driver(panda):
-    """Beyond their edges of position and speed arms are pushed as SoftLimits says; inside not at all."""
-    nsim, steps = 6, 40
-    dynamics = some_dynamics(panda, nsim)
-    q, dq, tau = some_motion(panda, nsim, steps)
-    soft = SoftLimits.of(panda, 0.1 * panda.tau_max)
-    q[:2], dq[2:4] = panda.q_max - 0.05, 0.95 * panda.dq_max * np.array([1, -1, 1, -1, 1, -1, 1])
-    q[1, :3], dq[3] = panda.q_min[:3] + 0.05, -dq[3]
-    sim = Simulator(panda, dynamics, nsim, 1)
-    sim.reset(q, dq)
-    free = sim.rollout(tau)["qpos"]
-    sim.set_soft_limits(soft)
-    sim.reset(q, dq)
-    out = sim.rollout(tau, record=("qpos", "qvel"))
-    assert np.abs(out["qpos"] - free).max(axis=(1, 2))[:4].min() > 1e-6
-    assert np.array_equal(out["qpos"][4:, :5], free[4:, :5])
-    for k in range(nsim):
-        agree_step_by_step(panda, dynamics, k, q, dq, tau, out, soft)
 
 
 def test_threads_do_not_change_a_bit(panda):

@@ -8,7 +8,8 @@ import pytest
 import torch
 from conftest import conf
 
-from r2s.arm.driven_batch import DrivenBatch
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.simulated import SimulatedArm
 from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
@@ -78,16 +79,23 @@ def test_another_task_is_trained_and_evaluated_as_ours():
     np.testing.assert_allclose(done.distance.T, expected, atol=1e-15)
 
 
-@pytest.mark.parametrize("make", [ArmBatch, DrivenBatch])
+def quiet(dynamics):
+    """Return an arm of known truth without noise."""
+    return SimulatedArm(PANDA, dynamics, position_noise=0.0, velocity_noise=0.0)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda task: ArmBatch(PANDA, task, NEW, 1, 1), lambda task: DrivenArm(quiet(NEW), task)]
+)
 def test_time_begins_with_the_episode(make):
-    """A state says how long its episode has run, in the batch and behind the driver; a second episode starts at 0."""
+    """A state says how long its episode has run, in the batch and on an arm; a second episode starts at 0."""
     task = Line()
-    arms = ArmBatch(PANDA, task, NEW, 2, 1) if make is ArmBatch else DrivenBatch(PANDA, NEW, task, 2, nthread=1)
+    arms = make(task)
     for _ in range(2):
-        state = arms.place(np.tile(PANDA.q_home, (2, 1)), 0)
+        state = arms.place(PANDA.q_home[None], 0)
         assert not state.t.any()
         for k in range(3):
-            state = arms.step(np.zeros((2, PANDA.n)))
+            state = arms.step(np.zeros((1, PANDA.n)))
             np.testing.assert_allclose(state.t, (k + 1) / task.ctrl_hz, rtol=1e-12)
 
 
@@ -100,10 +108,10 @@ class Still:
 
 
 def test_an_episode_that_stops_keeps_its_last_state():
-    """Arms that stop at once: the state of the stop lasts, its distance is worth nothing at the end."""
+    """An arm that stops at once: the state of the stop lasts, its distance is worth nothing at the end."""
     task, starts = Line(), np.tile(PANDA.q_home, (2, 1))
     starts[1, 1] = PANDA.q_max[1] - 0.01  # within what a driver brings to rest
-    arms = DrivenBatch(PANDA, replace(NEW, offset=0 * NEW.offset), task, 2, nthread=1)
+    arms = DrivenArm(quiet(replace(NEW, offset=0 * NEW.offset)), task)
     done = rollout(Still(), arms, task, starts, task.goals(PANDA, np.random.default_rng(0), 2))
     assert [stop.episode for stop in arms.stops] == [1]
     assert np.array_equal(done.q[1], np.broadcast_to(done.q[1, 0], done.q[1].shape))

@@ -1,4 +1,4 @@
-"""Many simulated arms behind the driver's law: what the environment steps, and what evaluations and predictions run on."""
+"""Many simulated arms behind the driver's law: of the environment, of evaluations and predictions."""
 
 from collections.abc import Mapping
 

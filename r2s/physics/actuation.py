@@ -24,7 +24,7 @@ def condition(target, filtered, last, cycle, nstep, factor, fade, tau_max, step_
     """Write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`; `Actuation` says what they are.
 
     Args:
-        target: (m, n) Nm. filtered, last: (m, n) Nm, kept from call to call. cycle: (m,), of the motion, counted here.
+        target: (m, n) Nm. filtered, last: (m, n) Nm, kept from call to call. cycle: (m,), counted here.
         factor: of the low-pass. fade: cycles over which the torque of a motion fades in.
         tau_max: (n,) Nm. step_max: (n,) Nm per cycle.
     """

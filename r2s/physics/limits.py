@@ -4,12 +4,12 @@ Three rules, on a target that has come through the low-pass (r2s/physics/actuati
 
 1. All torque fades where a joint gets too fast or too close to a position limit, whatever made it so.
 2. No joint accelerates beyond what can be taken back in time. With v the speed that is allowed at q,
-   -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque). Of all torques that keep to this the nearest
-   is sent, in the sense of Gauss' principle of least constraint: what stops at the joints would add.
+   -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque). Of all torques that keep to this the
+   nearest is sent, in the sense of Gauss' principle of least constraint: what stops at the joints would add.
 3. The sum is clipped to the torque range, and its rate is limited, last, against what the arm applied last.
 
-Rule 2 is a control barrier function in each joint (Ames et al., European Control Conference 2019). It is continuous in
-states and targets, and its gains are what a late arm bears: nothing switches, nothing shakes.
+Rule 2 is a control barrier function in each joint (Ames et al., European Control Conference 2019). It is continuous
+in states and targets, and its gains are what a late arm bears: nothing switches, nothing shakes.
 """
 
 import math

@@ -2,8 +2,8 @@
 
 `install()` puts the laws of friction.py into MuJoCo as a native callback: `mujoco.batch.Batch` then gives every
 simulation its own arm at full speed. The same callback holds the driver's law (limits.py), which needs feedback every
-millisecond, and behind it the motors' delay (actuation.py). It is the control callback, the last before accelerations, because who is held by the net
-torque (stick_slip.py) depends on all other forces.
+millisecond, and behind it the motors' delay (actuation.py). It is the control callback, the last before
+accelerations, because who is held by the net torque (stick_slip.py) depends on all other forces.
 
 The force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
 qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D: exact to first order, and stable
@@ -32,7 +32,11 @@ DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # 
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
-DELAY, LAG, LIMITS = GRAVITY + 3, GRAVITY + 4, GRAVITY + 5  # of the arm; of the driver, COLUMNS wide, 0: there is none
+DELAY, LAG, LIMITS = (
+    GRAVITY + 3,
+    GRAVITY + 4,
+    GRAVITY + 5,
+)  # of the arm; of the driver, COLUMNS wide, 0: there is none
 WIDTH = LIMITS + COLUMNS
 MARKER = 7_202_020.0
 # Rows of what a step knows of its joints. REST and EDGES: two each, of the negative and the positive direction.

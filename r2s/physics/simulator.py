@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 
 from r2s.physics import native_friction as native
-from r2s.physics.dynamics import Dynamics
 from r2s.physics.actuation import steps_late
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import principal_axes, put_links
 from r2s.physics.robot import SIM_DT, Robot
 
