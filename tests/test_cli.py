@@ -366,48 +366,42 @@ def one_line(done, pattern):
     assert re.search(pattern, lines[0])
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistake_gets_one_line(mistake, recording, tmp_path):
-    """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
-    text = recording.read_text()
+@pytest.fixture(scope="module")
+def logs(recording, tmp_path_factory) -> dict[str, Path]:
+    """The recording, and what is wrong about a file: the words of MISTAKES, with the paths that they stand for."""
+    folder, text = tmp_path_factory.mktemp("logs"), recording.read_text()
     rows = text.splitlines()
-    (tmp_path / "nan.csv").write_text(
-        "\n".join([*rows[:500], rows[500].replace(rows[500].split(",")[1], "nan", 1), *rows[501:]])
-    )
-    (tmp_path / "back.csv").write_text("\n".join([*rows[:500], rows[400], *rows[500:]]))
     six = [
         ",".join(v for k, v in zip(rows[0].split(","), r.split(","), strict=True) if not k.endswith("7"))
         for r in rows
     ]
-    (tmp_path / "six.csv").write_text("\n".join(six))
-    (tmp_path / "copy.csv").write_text("\n".join(rows[:1500]))
-    values = np.loadtxt(recording, delimiter=",", skiprows=1)
-    for name, q in (
-        ("still", values[0, 1:8] + 1e-3 * (values[:, 1:8] - values[0, 1:8])),
-        ("degrees", np.degrees(values[:, 1:8])),
-    ):
-        table = np.column_stack([values[:, :1], q, values[:, 8:]])
-        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
-    noise = np.random.default_rng(0).standard_normal(values.shape)
-    for name, table in (
-        ("milli", np.column_stack([values[:, :15], 1e3 * values[:, 15:]])),
-        ("again", values + noise * ([0] + [1e-4] * 7 + [1e-3] * 7 + [0.05] * 14)),
-    ):
-        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
-    places = {
-        "COPY": tmp_path / "copy.csv",
-        "STILL": tmp_path / "still.csv",
-        "DEGREES": tmp_path / "degrees.csv",
-        "MILLI": tmp_path / "milli.csv",
-        "AGAIN": tmp_path / "again.csv",
-        "LOG": recording,
-        "NAN": tmp_path / "nan.csv",
-        "BACK": tmp_path / "back.csv",
-        "SIX": tmp_path / "six.csv",
+    broken = {
+        "NAN": [*rows[:500], rows[500].replace(rows[500].split(",")[1], "nan", 1), *rows[501:]],
+        "BACK": [*rows[:500], rows[400], *rows[500:]],
+        "SIX": six,
+        "COPY": rows[:1500],
     }
-    command = mistake
-    for word, path in places.items():
-        command = command.replace(word, str(path))
+    values = np.loadtxt(recording, delimiter=",", skiprows=1)
+    t, q, dq, torques = values[:, :1], values[:, 1:8], values[:, 8:15], values[:, 15:]
+    noise = np.random.default_rng(0).standard_normal(values.shape)
+    tables = {
+        "STILL": np.column_stack([t, q[0] + 1e-3 * (q - q[0]), dq, torques]),
+        "DEGREES": np.column_stack([t, np.degrees(q), dq, torques]),
+        "MILLI": np.column_stack([t, q, dq, 1e3 * torques]),
+        "AGAIN": values + noise * ([0] + [1e-4] * 7 + [1e-3] * 7 + [0.05] * 14),
+    }
+    paths = {name: folder / f"{name.lower()}.csv" for name in (*broken, *tables)}
+    for name, lines in broken.items():
+        paths[name].write_text("\n".join(lines))
+    for name, table in tables.items():
+        np.savetxt(paths[name], table, delimiter=",", header=rows[0], comments="")
+    return {"LOG": recording} | paths
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_gets_one_line(mistake, logs, tmp_path):
+    """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
+    command = re.sub("|".join(logs), lambda found: str(logs[found[0]]), mistake)
     done = r2s(*command.split(), f"root={tmp_path / 'runs'}")
     one_line(done, MISTAKES[mistake])
     assert not (tmp_path / "runs").exists()
