@@ -93,15 +93,16 @@ class Step:
     def __init__(self, command: list[str], **_: object):
         assert command[:2] == [sys.executable, str(ROOT / "run.py")]
         forkserver._forkserver.ensure_running = lambda: None  # it runs: this process is of it
-        with tempfile.TemporaryDirectory() as folder:
-            pipe = str(Path(folder) / "pipe")
-            os.mkfifo(pipe)
-            self.child = started(*command[2:], at=Path.cwd(), out=pipe, err=pipe)
-            self.stdout = open(pipe)  # noqa: SIM115
+        self.folder = tempfile.TemporaryDirectory()
+        pipe = str(Path(self.folder.name) / "pipe")
+        os.mkfifo(pipe)
+        self.child = started(*command[2:], at=Path.cwd(), out=pipe, err=pipe)
+        self.stdout = open(pipe)  # noqa: SIM115
         self.poll, self.terminate = (lambda: self.child.exitcode), self.child.terminate
 
     def wait(self) -> int | None:  # noqa: D102
         self.child.join()
+        self.folder.cleanup()
         self.returncode = self.child.exitcode
         return self.returncode
 
