@@ -16,6 +16,7 @@ import traceback
 from importlib.util import find_spec
 from multiprocessing import forkserver
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -27,8 +28,10 @@ from conftest import REAL, ROOT, conf
 from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
 from r2s.physics.robot import load_robot
+from r2s.stages import pipeline
 
 TOY = ["+experiment=toy"]
+SHORT = [*TOY, "budget.env_steps=1600", "evaluation.env_steps=1600"]  # where nobody looks at the policy
 
 
 # Commands are forked off a server that has imported what they import anyway: seconds less for each of a hundred.
@@ -63,6 +66,7 @@ def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
     os.environ["COLUMNS"] = "110"
     os.chdir(at)
     sys.argv = ["run.py", *words]
+    pipeline.subprocess = SimpleNamespace(Popen=Step, PIPE=None, STDOUT=None)  # type: ignore[assignment]
     try:
         runpy.run_path(str(ROOT / "run.py"), run_name="__main__")
         status = 0
@@ -81,6 +85,26 @@ def started(*words: str, at: Path, out: str = os.devnull, err: str = os.devnull)
     child = FORKS.Process(target=front_door, args=(words, at, out, err))
     child.start()
     return child
+
+
+class Step:
+    """A command that a chain starts, off the same server: as much of subprocess.Popen as the chain uses."""
+
+    def __init__(self, command: list[str], **_: object):
+        assert command[:2] == [sys.executable, str(ROOT / "run.py")]
+        forkserver._forkserver.ensure_running = lambda: None  # it runs: this process is of it
+        self.folder = tempfile.TemporaryDirectory()
+        pipe = str(Path(self.folder.name) / "pipe")
+        os.mkfifo(pipe)
+        self.child = started(*command[2:], at=Path.cwd(), out=pipe, err=pipe)
+        self.stdout = open(pipe)  # noqa: SIM115
+        self.poll, self.terminate = (lambda: self.child.exitcode), self.child.terminate
+
+    def wait(self) -> int | None:  # noqa: D102
+        self.child.join()
+        self.folder.cleanup()
+        self.returncode = self.child.exitcode
+        return self.returncode
 
 
 def r2s(*words: str, at: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -173,7 +197,7 @@ def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, 
 
 def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     """One bad value: a line of its own, exit status 2, the other job done; repeated, that one is left alone."""
-    sweep = ["-m", *TOY, f"root={tmp_path}", "only_missing=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
+    sweep = ["-m", *SHORT, f"root={tmp_path}", "only_missing=true", "name=lr${algo.lr}", "algo.lr=2.0,1e-3"]
     done = r2s(*sweep)
     assert done.returncode == 2
     assert "error: algo.lr: 2.0 is not allowed; a number in (0, 1] is\n" in done.stderr
@@ -186,11 +210,12 @@ def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
 def test_the_grid_is_what_its_file_says(tmp_path):
     """paper_grid, cut down to two jobs, runs them side by side in folders named by their settings."""
     grid = ["-m", "+experiment=[paper_grid,toy]", f"root={tmp_path}", 'grid.algo="td3,tqc"', 'grid.lr="1e-3"']
-    succeed(*grid, 'grid.batch_size="16"', 'grid.gamma="0.9"', 'grid.seed="3"')
+    succeed(*grid, *SHORT[1:], 'grid.batch_size="16"', 'grid.gamma="0.9"', 'grid.seed="3"')
     names = sorted(p.name for p in (tmp_path / "train").iterdir())
     assert names == [f"grid_{a}_lr0.001_batch16_gamma0.9_seed3" for a in ("td3", "tqc")]
     config = yaml.safe_load((tmp_path / "train" / names[0] / "config.yaml").read_text())
     assert (config["seed"], config["threads"], config["algo"]["policy_delay"]) == (3, 1, 2)
+    assert all((tmp_path / "train" / name / "policy.onnx").is_file() for name in names)
 
 
 @pytest.mark.parametrize("command", [c for c in readme_commands() if not c.startswith("resume=")])
@@ -199,7 +224,9 @@ def test_readme_command(command, root, recording, trained, identified):
     command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))
     command = command.replace("TRAIN_FOLDER", str(trained)).replace("runs/train", f"{root}/train")
     command = command.replace("budget.minutes=4", "budget.minutes=0.05")
-    toy = [*TOY, "pipeline.train_minutes=null"] if "pipeline" in command else TOY
+    toy = TOY if re.search("stage=|oracle", command) else SHORT
+    if "pipeline" in command:
+        toy = [*SHORT, "pipeline.train_minutes=null"]
     if "search=ga" in command:
         toy = ["data.seconds=2", "data.ramp_poses=1", "search.0.population=4", "search.0.generations=2"]
         toy += ["friction.family=sigmoid", "identify.terms.commanded=[offset]", "identify.extra.commanded=[]"]
@@ -264,13 +291,14 @@ def test_exported_policy_is_the_trained_policy(trained):
 
 
 def test_every_algorithm_trains(root):
-    """A sweep over the other three writes a run folder with a policy each."""
-    out = succeed("-m", "algo=ddpg,sac,td3", f"root={root}", *TOY)
+    """A sweep over those that the grid leaves out writes a run folder with a policy each."""
+    out = succeed("-m", "algo=ddpg,sac", f"root={root}", *SHORT)
     folders = re.findall(r"written: (\S+)", out)
-    assert len(folders) == 3
+    assert len(folders) == 2
     assert all((Path(f) / "policy.onnx").is_file() for f in folders)
 
 
+@pytest.mark.slow  # test_checkpoint.py compares two trainings of one seed to the bit, one of them killed
 def test_same_seed_same_training(root, trained):
     """With a budget of environment steps, the seed decides every number."""
     succeed("name=again", f"root={root}", *TOY)
@@ -366,48 +394,42 @@ def one_line(done, pattern):
     assert re.search(pattern, lines[0])
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistake_gets_one_line(mistake, recording, tmp_path):
-    """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
-    text = recording.read_text()
+@pytest.fixture(scope="module")
+def logs(recording, tmp_path_factory) -> dict[str, Path]:
+    """The recording, and what is wrong about a file: the words of MISTAKES, with the paths that they stand for."""
+    folder, text = tmp_path_factory.mktemp("logs"), recording.read_text()
     rows = text.splitlines()
-    (tmp_path / "nan.csv").write_text(
-        "\n".join([*rows[:500], rows[500].replace(rows[500].split(",")[1], "nan", 1), *rows[501:]])
-    )
-    (tmp_path / "back.csv").write_text("\n".join([*rows[:500], rows[400], *rows[500:]]))
     six = [
         ",".join(v for k, v in zip(rows[0].split(","), r.split(","), strict=True) if not k.endswith("7"))
         for r in rows
     ]
-    (tmp_path / "six.csv").write_text("\n".join(six))
-    (tmp_path / "copy.csv").write_text("\n".join(rows[:1500]))
-    values = np.loadtxt(recording, delimiter=",", skiprows=1)
-    for name, q in (
-        ("still", values[0, 1:8] + 1e-3 * (values[:, 1:8] - values[0, 1:8])),
-        ("degrees", np.degrees(values[:, 1:8])),
-    ):
-        table = np.column_stack([values[:, :1], q, values[:, 8:]])
-        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
-    noise = np.random.default_rng(0).standard_normal(values.shape)
-    for name, table in (
-        ("milli", np.column_stack([values[:, :15], 1e3 * values[:, 15:]])),
-        ("again", values + noise * ([0] + [1e-4] * 7 + [1e-3] * 7 + [0.05] * 14)),
-    ):
-        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=rows[0], comments="")
-    places = {
-        "COPY": tmp_path / "copy.csv",
-        "STILL": tmp_path / "still.csv",
-        "DEGREES": tmp_path / "degrees.csv",
-        "MILLI": tmp_path / "milli.csv",
-        "AGAIN": tmp_path / "again.csv",
-        "LOG": recording,
-        "NAN": tmp_path / "nan.csv",
-        "BACK": tmp_path / "back.csv",
-        "SIX": tmp_path / "six.csv",
+    broken = {
+        "NAN": [*rows[:500], rows[500].replace(rows[500].split(",")[1], "nan", 1), *rows[501:]],
+        "BACK": [*rows[:500], rows[400], *rows[500:]],
+        "SIX": six,
+        "COPY": rows[:1500],
     }
-    command = mistake
-    for word, path in places.items():
-        command = command.replace(word, str(path))
+    values = np.loadtxt(recording, delimiter=",", skiprows=1)
+    t, q, dq, torques = values[:, :1], values[:, 1:8], values[:, 8:15], values[:, 15:]
+    noise = np.random.default_rng(0).standard_normal(values.shape)
+    tables = {
+        "STILL": np.column_stack([t, q[0] + 1e-3 * (q - q[0]), dq, torques]),
+        "DEGREES": np.column_stack([t, np.degrees(q), dq, torques]),
+        "MILLI": np.column_stack([t, q, dq, 1e3 * torques]),
+        "AGAIN": values + noise * ([0] + [1e-4] * 7 + [1e-3] * 7 + [0.05] * 14),
+    }
+    paths = {name: folder / f"{name.lower()}.csv" for name in (*broken, *tables)}
+    for name, lines in broken.items():
+        paths[name].write_text("\n".join(lines))
+    for name, table in tables.items():
+        np.savetxt(paths[name], table, delimiter=",", header=rows[0], comments="")
+    return {"LOG": recording} | paths
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_gets_one_line(mistake, logs, tmp_path):
+    """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
+    command = re.sub("|".join(logs), lambda found: str(logs[found[0]]), mistake)
     done = r2s(*command.split(), f"root={tmp_path / 'runs'}")
     one_line(done, MISTAKES[mistake])
     assert not (tmp_path / "runs").exists()
@@ -466,10 +488,11 @@ def test_a_training_transfers_without_the_identification_that_it_came_from(ident
     folder = tmp_path / "identified"
     shutil.copytree(identified, folder)
     words = [f"calibration={folder}", "dr=identified", "name=a"]
-    succeed(*words, f"root={tmp_path}", *TOY)
+    succeed(*words, f"root={tmp_path}", *SHORT)
     rows = []
     for _ in range(2):
-        out = succeed("stage=transfer", f"policy={tmp_path / 'train' / 'a'}", f"root={tmp_path}", *TOY)
+        words = [f"policy={tmp_path / 'train' / 'a'}", "evaluation.episodes=1", f"root={tmp_path}", *TOY]
+        out = succeed("stage=transfer", *words)
         (written,) = re.findall(r"written: (\S+)", out)
         rows.append(json.loads((Path(written) / "summary.json").read_text()))
         shutil.rmtree(folder, ignore_errors=True)
@@ -494,7 +517,7 @@ def test_another_arm_needs_no_more_than_its_file(root):
 
 def test_names_that_are_taken_get_one_line(tmp_path):
     """What is there was made otherwise, or by somebody else: it is neither used nor overwritten."""
-    words = [*TOY, f"root={tmp_path}", "name=a", "compile=false"]
+    words = [*SHORT, f"root={tmp_path}", "name=a", "compile=false"]
     succeed(*words)
     done = r2s(*words, "only_missing=true", "algo.gamma=0.9")
     assert done.returncode == 2
@@ -521,7 +544,13 @@ def test_the_same_policy_in_dart(trained, root):
     assert rows["dart"]["return_paper"] == pytest.approx(rows["mujoco"]["return_paper"], abs=1.0)
 
 
-@pytest.mark.parametrize(("arm", "package"), [("panda_emulated", "panda_py"), ("fr3_emulated", "pylibfranka")])
+@pytest.mark.parametrize(
+    ("arm", "package"),
+    [
+        ("panda_emulated", "panda_py"),
+        pytest.param("fr3_emulated", "pylibfranka", marks=pytest.mark.slow),  # above: once, with a policy of its own
+    ],
+)
 def test_a_policy_through_the_client_that_drives_hardware(trained, arm, package, tmp_path):
     """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit."""
     pytest.importorskip(package)
@@ -547,6 +576,7 @@ def test_help_does_not_import_torch():
     assert "LOADED []" in done.stdout, done.stdout[-500:] + done.stderr
 
 
+@pytest.mark.slow  # test_identify.py has it without the command
 @pytest.mark.skipif(not REAL.is_file(), reason="the real Panda recording is not beside this checkout")
 def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
     """The README's command on the real recording: held-out torque improves on average over the joints."""

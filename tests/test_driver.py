@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from conftest import conf
 from hypothesis import given, settings
@@ -96,10 +97,11 @@ def hostile(cycles, seed, robot=PANDA, check=None, m=125):
     return count, reflexes, stops
 
 
-def test_a_hostile_policy_never_breaks_a_rule():
+@pytest.mark.parametrize("least", [250_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_a_hostile_policy_never_breaks_a_rule(least):
     """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
-    cycles, reflexes, stops = hostile(1_000_000, seed=1)
-    assert cycles >= 1_000_000
+    cycles, reflexes, stops = hostile(least, seed=1)
+    assert cycles >= least
     assert not reflexes
     assert any("no finite action" in s for s in stops)
 

@@ -590,7 +590,7 @@ def test_an_interrupted_run_goes_on_to_the_same_end(arm, wrong, clean, motion, t
     how = {"family": "auto", "folds": 2, "keep_nominal": True}
     recording, searches = clean, [Genetic(population=12, generations=3), LeastSquares(max_evaluations=3)]
     if torque == "commanded":
-        recording, searches = motion.select(motion.t < 2.5), [TORQUE, LeastSquares(max_evaluations=2)]
+        recording, searches = motion.select(motion.t < 1.5), [TORQUE, LeastSquares(max_evaluations=2)]
         how = {"breakaway": 1.5, "stride": 20}
     whole, store = Store(), Store()
     expected = run(arm, wrong, recording, searches, memo=whole, **how)

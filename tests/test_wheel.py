@@ -41,28 +41,39 @@ def surroundings(installed: Path, folder: Path) -> dict[str, str]:
     return {"PYTHONPATH": f"{installed}{os.pathsep}{folder}", "PYTHONSAFEPATH": "1", "COLUMNS": "110"}
 
 
+def called(installed: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Call the installed `r2s WORDS` in a folder; nothing that it loaded of r2s is of the checkout."""
+    own = "[m for k, m in list(sys.modules.items()) if k.split('.')[0] == 'r2s' and getattr(m, '__file__', None)]"
+    seen = f"import atexit, sys\natexit.register(lambda: print('FROM', *{{m.__file__ for m in {own}}}))\n"
+    (folder / "r2s_seen.py").write_text(seen)
+    code = "import r2s_seen, sys; sys.argv[0] = 'r2s'; from r2s.cli import main; main()"
+    here = os.environ | surroundings(installed, folder)
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(command, cwd=folder, env=here, capture_output=True, text=True)
+    modules = done.stdout.split("FROM")[1].split()
+    assert modules
+    assert all(Path(m).is_relative_to(installed) for m in modules)
+    return done
+
+
+def test_installed_it_finds_its_settings(installed, tmp_path):
+    """`r2s` and `python -m r2s` compose from the conf of the wheel, whatever the folder."""
+    done = called(installed, tmp_path, "algo=tqq")
+    assert (done.returncode, "did you mean 'tqc'" in done.stderr) == (2, True), done.stdout + done.stderr
+    here = os.environ | surroundings(installed, tmp_path)
+    command = [sys.executable, "-m", "r2s", "--help"]
+    script = subprocess.run(command, cwd=tmp_path, env=here, capture_output=True, text=True)
+    assert (script.returncode, "stage=identify" in script.stdout) == (0, True), script.stdout + script.stderr
+
+
+@pytest.mark.slow
 def test_installed_it_runs_from_any_folder(installed, tmp_path):
     """`r2s stage=identify` writes runs/ where it is called, and takes nothing from the checkout."""
-    seen = (
-        "import atexit, sys\natexit.register(lambda: print('FROM', *{m.__file__ for m in list(sys.modules.values()) "
-    )
-    seen += "if m.__name__.split('.')[0] == 'r2s' and getattr(m, '__file__', None)}))\n"
-    (tmp_path / "r2s_seen.py").write_text(seen)
-    here = surroundings(installed, tmp_path)
-    code = "import r2s_seen, sys; sys.argv[0] = 'r2s'; from r2s.cli import main; main()"
-    command = [sys.executable, "-c", code, "stage=identify", "+experiment=toy"]
-    done = subprocess.run(command, cwd=tmp_path, env=os.environ | here, capture_output=True, text=True)
+    done = called(installed, tmp_path, "stage=identify", "+experiment=toy")
     assert done.returncode == 0, done.stdout + done.stderr
     (folder,) = re.findall(r"written: (\S+)", done.stdout)
     assert (tmp_path / folder / "parameters.yaml").is_file()
-    modules = done.stdout.split("FROM")[1].split()
-    assert len(modules) > 30
-    assert all(Path(m).is_relative_to(installed) for m in modules)
-    script = subprocess.run(
-        [sys.executable, "-m", "r2s", "algo=tqq"], cwd=tmp_path, env=os.environ | here, capture_output=True, text=True
-    )
-    assert script.returncode == 2
-    assert "did you mean 'tqc'" in script.stderr
+    assert len(done.stdout.split("FROM")[1].split()) > 30
 
 
 @pytest.mark.slow
