@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from r2s.engines.interface import Engine, Law
-from r2s.learning.evaluate import GOAL_SEED
+from r2s.learning.evaluate import fixed_draws
 from r2s.physics.actuation import Actuation, Motors
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import Guard
@@ -40,7 +40,7 @@ class EngineArms:
     ):
         self.robot, self._make, self._torque = robot, make, task.torque(robot)
         self._substeps, self._period = task.substeps, 1 / task.ctrl_hz
-        self._drawn = draw(np.random.default_rng(GOAL_SEED), count)
+        self._drawn = fixed_draws(draw, count)
         self._kinematics, self._command = Kinematics(robot), np.zeros(robot.n)
         self._actuation = Actuation(robot, 1, cutoff_hz=task.cutoff_hz)
 

@@ -52,12 +52,13 @@ class TaskEnv(EnvBase):
     ):
         super().__init__(device=None, batch_size=[nsim])
         self.robot, self.task, self.draw, self.nsim = robot, task, draw, nsim
-        self.rng = np.random.default_rng(seed)
+        own, of_goals = np.random.SeedSequence(seed).spawn(2)
+        self.rng = np.random.default_rng(own)
         self.arms = ArmBatch(robot, task, draw(self.rng, nsim), nsim, nthread)
         self.weights = task.paper_weights
         self._torque = task.torque(robot)
         self._stagger = stagger
-        self._pool = task.goals(robot, np.random.default_rng(seed + 1), POOL)
+        self._pool = task.goals(robot, np.random.default_rng(of_goals), POOL)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
         self._reference = np.ones(nsim)

@@ -1,4 +1,8 @@
-"""How well a policy does in simulation: 200 fixed episodes, deterministic, the same for every policy."""
+"""How well a policy does in simulation: 200 fixed episodes, deterministic, the same for every policy.
+
+Two sets of goals, starts and draws: a training is watched, and its best policy chosen, on SELECTED; what is reported
+of a policy comes from JUDGED, on which nothing was chosen, neither policies nor hyper-parameters.
+"""
 
 from collections.abc import Callable, Mapping
 
@@ -10,14 +14,23 @@ from r2s.physics.robot import Robot
 from r2s.tasks.episode import Acts, Episodes, rollout
 from r2s.tasks.task import Task
 
-GOAL_SEED = 7_000_000  # goals, starts and draws of every evaluation; trainings use their own seeds
+SELECTED, JUDGED = 7_000_000, 2_026_1122  # seeds; trainings use their own, below 2^20
 
 
-def fixed_episodes(robot: Robot, task: Task, count: int) -> tuple[np.ndarray, np.ndarray]:
+def streams(seed: int) -> list[np.random.Generator]:
+    """Return independent generators of starts, goals and draws."""
+    return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
+
+
+def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = JUDGED) -> tuple[np.ndarray, np.ndarray]:
     """Return starts (count, n) rad and goals (count, ...): the same for every policy, simulator and arm."""
-    rng = np.random.default_rng(GOAL_SEED)
-    starts = task.starts(robot, rng, count)
-    return starts, task.goals(robot, rng, count)
+    of_starts, of_goals, _ = streams(seed)
+    return task.starts(robot, of_starts, count), task.goals(robot, of_goals, count)
+
+
+def fixed_draws(draw: Callable[[np.random.Generator, int], Dynamics], count: int, seed: int = JUDGED) -> Dynamics:
+    """Return the dynamics of the arms of those episodes."""
+    return draw(streams(seed)[2], count)
 
 
 def make_evaluation(
@@ -27,14 +40,14 @@ def make_evaluation(
     *,
     episodes: int = 200,
     nthread: int = 0,
+    seed: int = JUDGED,
 ) -> Callable[[Acts], Episodes]:
     """Return policy -> Episodes: all fixed episodes at once, each arm with its own (fixed) draw of the dynamics.
 
     The function raises FloatingPointError where an action or a reward is not finite.
     """
-    drawn = draw(np.random.default_rng(GOAL_SEED), episodes)
-    arms = ArmBatch(robot, task, drawn, episodes, nthread)
-    starts, goals = fixed_episodes(robot, task, episodes)
+    arms = ArmBatch(robot, task, fixed_draws(draw, episodes, seed), episodes, nthread)
+    starts, goals = fixed_episodes(robot, task, episodes, seed)
 
     def evaluate(policy: Acts) -> Episodes:
         done = rollout(policy, arms, task, starts, goals)

@@ -57,6 +57,7 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         distance = row.get("distance_median_m")
         cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
         cells["return"] = number(row.get("return_paper"), "{:.1f}")
+        cells["at rest, %"] = number(None if row.get("rest") is None else 100 * row["rest"], "{:.1f}")
         table[label] = cells
     return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
 
@@ -68,6 +69,8 @@ def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         "torque from simulation, Nm": ("tau_rmse_Nm", 1, "{:.2g}"),
         "time to reach, s": ("time_to_reach_s", 1, "{:.2f}"),
         "overshoot, mm": ("overshoot_m", 1e3, "{:.1f}"),
+        "limited, %": ("limited", 100, "{:.1f}"),
+        "to position limits, rad": ("q_left_rad", 1, "{:.2f}"),
         "stops": ("stops", 1, "{:.0f}"),
     }
     table = {

@@ -37,12 +37,9 @@ class Trained:
     minutes: float | None
     """Its budget, None where env_steps were the budget."""
     curve: pd.DataFrame
-    """Its evaluations.csv."""
-
-    @property
-    def last(self) -> dict[str, float]:
-        """The last evaluation."""
-        return {str(k): float(v) for k, v in self.curve.iloc[-1].items()}
+    """Its evaluations.csv, on the goals that its best policy was chosen on."""
+    last: dict[str, float]
+    """What its last policy does on goals that nothing was chosen on: of its summary.json."""
 
     @property
     def learned(self) -> bool:
@@ -114,6 +111,7 @@ def _read(folder: Path) -> Trained:
         typed.get("experiment") == "toy",
         None if budget.get("env_steps") else budget.get("minutes"),
         curve,
+        {k: float(v) for k, v in json.loads((folder / "summary.json").read_text())["last"].items()},
     )
 
 

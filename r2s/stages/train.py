@@ -54,7 +54,7 @@ def train(cfg, overrides):
 
     from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.env import TaskEnv
-    from r2s.learning.evaluate import make_evaluation, selection_score
+    from r2s.learning.evaluate import SELECTED, make_evaluation, selection_score
     from r2s.learning.policy import export_onnx, load_policy, save_policy
     from r2s.learning.train import Listeners
     from r2s.learning.train import train as run_train
@@ -73,7 +73,8 @@ def train(cfg, overrides):
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
-    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
+    words = {"episodes": evaluation.episodes, "nthread": cfg.threads}
+    evaluate = make_evaluation(robot, task, draw, **words, seed=SELECTED)
     torque = torch.from_numpy(task.torque(robot))
     scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
     algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
@@ -120,10 +121,14 @@ def train(cfg, overrides):
         )
         progress.close()
         checkpoint.clear()
-        export_onnx(run.folder / "policy.onnx", load_policy(run.folder, robot, task), robot, task)
-        run.summary({"best": best, "last": last})
+        policy = load_policy(run.folder, robot, task)
+        export_onnx(run.folder / "policy.onnx", policy, robot, task)
+        judge = make_evaluation(robot, task, draw, **words)
+        judged = {"best": best | task.measures(judge(policy))}
+        judged["last"] = last | task.measures(judge(copy.deepcopy(algo.policy).cpu()))
+        run.summary(judged | {"best on the goals it was chosen on": best})
         pages.training(run, robot)
-        reach_table(console(), {"best": best, "last": last}, title(cfg))
+        reach_table(console(), judged, f"{title(cfg)}; on goals that nothing was chosen on")
     print(f"written: {run.folder}")
 
 
