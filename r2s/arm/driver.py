@@ -122,8 +122,7 @@ class Drivers:
             target: (m, n) Nm that the policies want; None where they have said nothing.
         """
         memory, said = self._memory, target is not None
-        seen = np.isfinite(q).all(1) & np.isfinite(dq).all(1)
-        self._q[seen], self._dq[seen] = q[seen], dq[seen]
+        seen = look(q, dq, self._q, self._dq)
         self._arms.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         bounds = self._torque, self._low, self._high, self._fast
         settings = self._deadline, self._factor, self._fade
@@ -147,6 +146,17 @@ class Drivers:
             return f"joint {j + 1} is at {q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
         j = int((np.abs(dq) / self._fast).argmax())
         return f"joint {j + 1} is at {dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"
+
+
+@njit(cache=True)
+def look(q, dq, to_q, to_dq):
+    """Write the states (m, n) that are finite into `to_q`, `to_dq`; return (m,), which they are."""
+    seen = np.empty(len(q), np.bool_)
+    for i in range(len(q)):
+        seen[i] = np.isfinite(q[i]).all() and np.isfinite(dq[i]).all()
+        if seen[i]:
+            to_q[i], to_dq[i] = q[i], dq[i]
+    return seen
 
 
 @njit(cache=True)

@@ -1,0 +1,105 @@
+"""What the driver's law does to a trained policy, seen every millisecond: python benchmarks/law.py RUN
+
+RUN is a run folder of stage=train. Its policy reaches for the first goals that nothing was chosen on, on arms of known
+truth with delays of 0 to 8 ms and on development twins; what is asked for and what is sent are written down in every
+cycle. docs/law.md is made of it.
+
+The action of the law is what is sent less what is asked for. Its spectrum is judged by its largest line above 20 Hz,
+against the largest below: a loop that shakes has its line there.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from common import MACHINE, ROOT, markdown
+from omegaconf import OmegaConf
+
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.simulated import SimulatedArm
+from r2s.arm.twin import Twin
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import load_policy
+from r2s.stages.build import make_dynamics, make_robot, make_task
+from r2s.stages.transfer import trained_config
+from r2s.tasks.episode import rollout
+
+DELAYS_MS = (0, 2, 4, 6, 8)
+TWINS = range(4)
+GOALS = 20
+
+
+class Watched:
+    """A driver that writes down what is asked for and what is sent, (cycles, n) Nm each."""
+
+    def __init__(self, driver):
+        self._driver = driver
+        self.asked, self.sent = [], []
+
+    def __getattr__(self, name):
+        return getattr(self._driver, name)
+
+    def __call__(self, state, target):
+        """Return the command of a cycle."""
+        command = self._driver(state, target)
+        self.asked.append(self._driver.effort.copy())
+        self.sent.append(command.copy())
+        return command
+
+
+def judged(arm, policy, task, starts, goals) -> dict[str, float]:
+    """Return one row: how the policy does on the arm, and what the law does to it."""
+    driven = DrivenArm(arm, task)
+    watched = driven._driver = Watched(driven._driver)
+    row = task.measures(rollout(policy, driven, task, starts, goals))
+    asked, sent = np.array(watched.asked), np.array(watched.sent)
+    cycles = task.steps * task.substeps
+    whole = len(sent) // cycles * cycles  # an episode that stopped is shorter
+    action = (sent - asked)[:whole].reshape(-1, cycles, sent.shape[1])
+    lines = np.abs(np.fft.rfft(action * np.hanning(cycles)[None, :, None], axis=1)).max((0, 2)) * 4 / cycles
+    hz = np.fft.rfftfreq(cycles, 1e-3)
+    return {
+        "< 1 cm, %": 100 * row["success_1cm"],
+        "at rest, %": 100 * row["rest"],
+        "stops": len(driven.stops),
+        "limited, % of cycles": 100 * row["limited"],
+        "line below 20 Hz, Nm": lines[(hz > 0) & (hz <= 20)].max(),
+        "line above, Nm": lines[hz > 20].max(),
+        "rms of steps sent / asked for": np.sqrt((np.diff(sent, axis=0) ** 2).mean() / (np.diff(asked, axis=0) ** 2).mean()),
+    }
+
+
+def main(folder: str) -> None:
+    """Write docs/law.md."""
+    cfg = OmegaConf.create({"policy": folder})
+    source, trained = trained_config(cfg)
+    robot, task = make_robot(trained), make_task(trained)
+    policy, dynamics = load_policy(source, robot, task), make_dynamics(trained, robot)
+    starts, goals = fixed_episodes(robot, task, GOALS)
+    rows = {}
+    for ms in DELAYS_MS:
+        arm = SimulatedArm(
+            robot, replace(dynamics, delay=1e-3 * ms, lag=np.float64(2e-3)), position_noise=1e-5, velocity_noise=3e-3
+        )
+        rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, policy, task, starts, goals)
+    for seed in TWINS:
+        rows[f"twin {seed}"] = judged(Twin(robot, seed), policy, task, starts, goals)
+    table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("arm")
+    text = f"""# The driver's law at 1 kHz
+
+`python benchmarks/law.py RUN` on {MACHINE}: a policy of {trained.algo.name}, {GOALS} goals on each arm, sensors with
+noise. The law's action is what is sent less what is asked for; a line is the largest of its spectrum over joints and
+episodes.
+
+{markdown(table.round(3))}
+"""
+    (ROOT / "docs" / "law.md").write_text(text)
+    print(table.round(3).to_string())
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
+        raise SystemExit(__doc__)
+    main(sys.argv[1])
