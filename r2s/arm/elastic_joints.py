@@ -1,12 +1,13 @@
 """Joints with elastic gears and dry friction that warms up, compiled: one 1 ms cycle of the second make of twin.
 
 Per joint, theta and w = dtheta/dt of the motor (at the joint's side of the gear), q and v of the link:
-    rotor dw/dt = motor torque + offset - s - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v
+    rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
-A motor at rest is held while the net torque on it lies within f at w = 0, and is at rest exactly; what it carries
-then is whatever the others do to it. warm = 1 - fall (1 - exp(-heat / 0.6)); ripple is a sum of sines of theta, of
-1 + 1 per turn of the joint, of the motor, and of the two lobes of a strain wave gear.
+L (w - v) is how the drive's own torque loop damps the gear. A motor at rest is held while the net torque on it lies
+within f at w = 0, and is at rest exactly; what it carries then is whatever the others do to it.
+warm = 1 - fall (1 - exp(-heat / 0.6)); ripple is 1 and a sine each of theta per turn of the joint, of the motor, and
+of half of that (the two lobes of a strain wave gear).
 
 Steps are those of Verlet: half a step of positions, a whole one of velocities with the forces there, half a step of
 positions; forces that depend on velocity are taken at the middle of the step, by one correction. Within a step a
@@ -24,8 +25,8 @@ from r2s.physics.newton_euler import equations
 C_NEG, C_POS, BREAK, MU, V_STRIBECK, SHAPE, VISCOUS, POWER, RATIO = range(9)
 RIPPLE, PHASE = 9, 12  # three each: of the joint's turn, the motor's and its half
 FALL, POWER_0, COOLING, HELP, HELP_VISCOUS, HELP_WIDTH = range(15, 21)
-ROTOR, STIFF, GEAR, DAMPING, DELAY, LAG = range(21, 27)
-OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(27, 36)
+ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
+OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
 # ... and of the state (rows, n)
 LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_SEEN, DQ_SEEN, TAU_SEEN, THETA_AT, W_AT, S_AT, STATES = range(13)
 HALF_WARM = 0.6  # of the heat of a quarter of the speed limit, over which friction falls
@@ -144,7 +145,7 @@ def advance(p, s, links, gravity, help, line, sent, cycle, steps, age, dt, work)
                 gear = spring[i] + p[GEAR, i] * (ahead_w[i] - ahead_v[i])
                 pull = drag(p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i], q[i], q[(i + 1) % n])
                 bias[i] = gear + pull - p[DAMPING, i] * ahead_v[i] - bias[i]
-                push = drive[i] - gear
+                push = drive[i] - gear - p[LOOP, i] * (ahead_w[i] - ahead_v[i])
                 after = _coming(p, w[i], ahead_w[i], push, gear, factor[i], h, i)
                 if correction == 1:
                     power[i] += (push - p[ROTOR, i] * (after - w[i]) / h) * 0.5 * (w[i] + after)

@@ -32,6 +32,7 @@ from r2s.arm.elastic_joints import (
     HELP_WIDTH,
     LAG,
     LINK_Q,
+    LOOP,
     MOTOR,
     MU,
     NOISE_TAU,
@@ -99,7 +100,9 @@ class ElasticTwin(HiddenArm):
         self._hidden = _draw_joints(robot, rng, inertia, unbalanced)
         if stiffness is not None:
             self._hidden[STIFF] = robot.tau_max * stiffness / robot.tau_max.max()
-        self._hidden[GEAR] = _gear_damping(self._hidden, inertia, rng.uniform(0.02, 0.06, robot.n))
+        whole = _critical(self._hidden, inertia)
+        self._hidden[GEAR] = whole * rng.uniform(0.02, 0.06, robot.n)
+        self._hidden[LOOP] = whole * rng.uniform(0.45, 0.7, robot.n)
         self._steps = _steps(self._hidden, inertia)
         if payload:
             self._links = links_of(robot, *carry(robot, payload, *links))
@@ -171,10 +174,10 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     felt = 1 / np.diag(np.linalg.inv(inertia))
     p = np.zeros((ROWS, n))
     size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
-    coulomb = 0.75 * size  # of which the control box takes a third; the rest of the size comes with speed
+    coulomb = 0.75 * size  # of which the control box takes a quarter; the rest of the size comes with speed
     lean = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[C_NEG], p[C_POS] = coulomb - lean + model.dof_frictionloss, coulomb + lean + model.dof_frictionloss
-    p[BREAK] = rng.uniform(1.15, 1.5, n)  # of the Coulomb level
+    p[BREAK] = rng.uniform(1.1, 1.35, n)  # of the Coulomb level
     p[MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm that the gear carries
     p[V_STRIBECK], p[SHAPE] = rng.uniform(0.02, 0.08, n), rng.uniform(1.0, 1.6, n)
     p[VISCOUS], p[POWER] = 0.5 * size * rng.uniform(0.7, 1.3, n), rng.uniform(0.6, 0.9, n)
@@ -182,24 +185,24 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     p[RIPPLE : RIPPLE + 3] = rng.uniform(0.01, 0.05, (3, n))
     p[PHASE : PHASE + 3] = rng.uniform(-np.pi, np.pi, (3, n))
     p[FALL], p[COOLING] = rng.uniform(0.13, 0.3, n), rng.uniform(60.0, 180.0, n)
-    share = rng.uniform(0.2, 0.4, n)
+    share = rng.uniform(0.15, 0.3, n)
     p[HELP], p[HELP_VISCOUS] = share * coulomb * rng.uniform(0.9, 1.1, n), share * p[VISCOUS]
     p[HELP_WIDTH] = rng.uniform(0.02, 0.05, n)  # rad/s
     p[ROTOR] = felt * rng.uniform(0.15, 0.3, n) + model.dof_armature
-    p[STIFF] = robot.tau_max * rng.uniform(80.0, 140.0, n)  # 1e4 Nm/rad of a Panda's strong joints
+    p[STIFF] = robot.tau_max * rng.uniform(125.0, 210.0, n)  # 1.5e4 Nm/rad of the strong joints of a Panda
     p[DAMPING] = model.dof_damping
-    p[DELAY] = rng.uniform(2.0, 4.5) * rng.uniform(0.75, 1.25, n) * 1e-3 / SIM_DT  # cycles
-    p[LAG] = rng.uniform(1e-3, 3e-3, n)  # s
+    p[DELAY] = rng.uniform(1.75, 3.75) * rng.uniform(0.75, 1.25, n) * 1e-3 / SIM_DT  # cycles
+    p[LAG] = rng.uniform(5e-4, 2e-3, n)  # s
     p[OFFSET : NOISE_TAU + 1] = draw_surroundings(robot, rng, 0.7 * coulomb, unbalanced)
     pace = WARM_SPEED * robot.dq_max
     p[POWER_0] = [pace[i] * level(p, pace[i], 0.0, 1.0, i) for i in range(n)]
     return p
 
 
-def _gear_damping(p: np.ndarray, inertia: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Return (n,) Nm s/rad that damps each gear's swing, with the other joints free, by this ratio."""
+def _critical(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """Return (n,) Nm s/rad of each gear, with the other joints free, beyond which it would not swing."""
     reduced = 1 / (1 / p[ROTOR] + np.diag(np.linalg.inv(inertia)))
-    return 2 * ratio * np.sqrt(p[STIFF] * reduced)
+    return 2 * np.sqrt(p[STIFF] * reduced)
 
 
 def _steps(p: np.ndarray, inertia: np.ndarray) -> int:
