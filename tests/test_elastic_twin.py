@@ -1,6 +1,10 @@
 """The second make of twin: dry friction that rests exactly, elastic gears that swing, a clock that is not one."""
 
+import json
+import subprocess
+import sys
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from r2s.errors import UserError
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import load_robot
 
+ROOT = Path(__file__).parent.parent
 PUSH = np.array([4, 5, 3.5, 4, 1.6, 1.0, 0.5])  # Nm
 HZ = 1.4 * np.array([1.1, 0.9, 1.3, 1.7, 2.3, 1.9, 2.1])
 
@@ -228,3 +233,14 @@ def test_what_is_too_stiff_is_said():
         ElasticTwin(panda(), 0, 0.0, 1e12)
     with pytest.raises(UserError, match=r"arm.payload: -1 is not allowed"):
         ElasticTwin(panda(), 0, -1)
+
+
+@pytest.mark.slow
+def test_the_pipeline_runs_on_it(tmp_path):
+    """Recorded, identified, trained in, transferred to and reported; a toy learns nothing."""
+    words = ["stage=pipeline", "+experiment=toy", "pipeline.train_minutes=null", "arm.make=2", f"root={tmp_path}"]
+    done = subprocess.run([sys.executable, "run.py", *words], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(next(tmp_path.glob("transfer/*/summary.json")).read_text())
+    assert summary["twin"]["success_5cm"] >= 0.0
+    assert (next(tmp_path.glob("pipeline/*")) / "report.md").is_file()

@@ -44,21 +44,21 @@ def equations(links, gravity, q, dq, mass, bias, work):
     ax, ay, az = -gravity[0], -gravity[1], -gravity[2]  # of its origin: falling up is standing still
     for i in range(n):
         k, s = links[i], work[i]
-        rx, ry, rz = _turned(R, k[0], k[1], k[2])
+        rx, ry, rz = turned(R, k[0], k[1], k[2])
         cx, cy, cz = _cross(wx, wy, wz, rx, ry, rz)
         ux, uy, uz = _cross(wx, wy, wz, cx, cy, cz)
         tx, ty, tz = _cross(ex, ey, ez, rx, ry, rz)
         ax, ay, az = ax + tx + ux, ay + ty + uy, az + tz + uz
         px, py, pz = px + rx, py + ry, pz + rz
-        R = _product(R, k, FRAME)
-        zx, zy, zz = _turned(R, k[AXIS], k[AXIS + 1], k[AXIS + 2])
-        R = _spun(R, k[AXIS], k[AXIS + 1], k[AXIS + 2], q[i])
+        R = product(R, k, FRAME)
+        zx, zy, zz = turned(R, k[AXIS], k[AXIS + 1], k[AXIS + 2])
+        R = spun(R, k[AXIS], k[AXIS + 1], k[AXIS + 2], q[i])
         v = dq[i]
         tx, ty, tz = _cross(wx, wy, wz, zx, zy, zz)
         ex, ey, ez = ex + tx * v, ey + ty * v, ez + tz * v
         wx, wy, wz = wx + zx * v, wy + zy * v, wz + zz * v
         m = k[MASS]
-        rx, ry, rz = _turned(R, k[COM], k[COM + 1], k[COM + 2])
+        rx, ry, rz = turned(R, k[COM], k[COM + 1], k[COM + 2])
         cx, cy, cz = _cross(wx, wy, wz, rx, ry, rz)
         ux, uy, uz = _cross(wx, wy, wz, cx, cy, cz)
         tx, ty, tz = _cross(ex, ey, ez, rx, ry, rz)
@@ -117,12 +117,13 @@ def _cross(ax, ay, az, bx, by, bz):
 
 
 @njit(cache=True, inline="always")
-def _turned(R, x, y, z):
+def turned(R, x, y, z):
+    """Return R (9 numbers, row by row) times a vector."""
     return R[0] * x + R[1] * y + R[2] * z, R[3] * x + R[4] * y + R[5] * z, R[6] * x + R[7] * y + R[8] * z
 
 
 @njit(cache=True, inline="always")
-def _product(R, k, at):
+def product(R, k, at):
     """Return R times the matrix that k holds from `at`."""
     return (
         R[0] * k[at] + R[1] * k[at + 3] + R[2] * k[at + 6],
@@ -138,7 +139,7 @@ def _product(R, k, at):
 
 
 @njit(cache=True, inline="always")
-def _spun(R, x, y, z, angle):
+def spun(R, x, y, z, angle):
     """Return R times the rotation by `angle` about the unit axis (Rodrigues)."""
     c, s = np.cos(angle), np.sin(angle)
     d = 1.0 - c
@@ -147,13 +148,13 @@ def _spun(R, x, y, z, angle):
         *(d * x * y + s * z, c + d * y * y, d * y * z - s * x),
         *(d * x * z - s * y, d * y * z + s * x, c + d * z * z),
     )
-    return _product(R, k, 0)
+    return product(R, k, 0)
 
 
 @njit(cache=True, inline="always")
 def _tensor(R, k):
     """Return xx, xy, xz, yy, yz, zz of a link's tensor in base axes."""
-    A = _product(R, k, TENSOR)
+    A = product(R, k, TENSOR)
     return (
         A[0] * R[0] + A[1] * R[1] + A[2] * R[2],
         A[0] * R[3] + A[1] * R[4] + A[2] * R[5],
