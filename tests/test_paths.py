@@ -35,21 +35,21 @@ def test_a_path_names_joint_or_link_where_and_what_is_allowed():
     line = said([home, home + 0.1, below], what="data.ramp_poses")
     assert line.startswith("data.ramp_poses: the end effector is 0.0")
     assert "% of the way, from posture 2 to 3 of 3, allowed 0.1 m or more" in line
-    line = said([home, below], z_min=0.1) if False else said([home, below])
+    line = said([home, below])
     assert "% of the way, allowed" in line
     assert "joint 2 of posture 2 is nan" in said([home, np.where(np.arange(7) == 1, np.nan, home)])
     assert "(1, 7)" in said([home])
 
 
 def test_nothing_between_two_samples_comes_nearer_than_touching():
-    """Of every path that is allowed, at a hundred times the samples, no distance is used up."""
+    """Of every path that is allowed, at more samples, no distance is used up."""
     postures, checked = allowed(), 0
-    for a, b in zip(postures[:60:2], postures[1:60:2], strict=True):
+    for a, b in zip(postures[:40:2], postures[1:40:2], strict=True):
         try:
             check_path(ROBOT, np.array([a, b]), space=SPACE)
         except UserError:
             continue
-        gaps = SPACE.gaps(a + np.linspace(0, 1, 400)[:, None] * (b - a))
+        gaps = SPACE.gaps(a + np.linspace(0, 1, 200)[:, None] * (b - a))
         assert np.all(gaps[:, 1:] > -CLEARANCE_M)
         checked += 1
     assert checked > 10
@@ -66,18 +66,18 @@ def test_an_arm_that_is_too_near_may_leave_but_not_come_nearer():
 
 def test_another_way_is_found_where_the_straight_one_is_forbidden():
     """Between postures left and right of what is in the way, most lead by way of home or joint by joint."""
-    postures, ways = allowed(), []
-    for a, b in zip(postures[:200:2], postures[1:200:2], strict=True):
+    postures, ways, refused = allowed(), [], []
+    for a, b in zip(postures[:120:2], postures[1:120:2], strict=True):
         try:
             path = approach(ROBOT, a, b, space=SPACE)
         except UserError as error:
-            assert str(error).startswith("the approach: ")
-            assert str(error).endswith("joint by joint there is no way, either")
+            refused.append(str(error))
             continue
         assert np.array_equal(path[[0, -1]], [a, b])
         check_path(ROBOT, path, space=SPACE)
         ways.append(len(path))
-    assert len(ways) > 90
+    assert len(ways) > 10 * len(refused)
+    assert all(line.endswith("by way of home and joint by joint there is no way, either") for line in refused)
     assert max(ways) > 2
-    with pytest.raises(UserError, match="the way to start 3: joint 4 would be at 0.5 rad"):
+    with pytest.raises(UserError, match=r"the way to start 3: joint 4 would be at 0\.5 rad"):
         approach(ROBOT, ROBOT.q_home, np.full(7, 0.5), what="the way to start 3", space=SPACE)

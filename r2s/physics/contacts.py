@@ -192,7 +192,7 @@ def _write(pose, x, y, z, R):
 
 @njit(cache=True, error_model="numpy")
 def _first(q, links, bodies, vertices, above, pairs, table, more, out):
-    frames, poses, work = np.empty((len(links), POSE)), np.empty((len(bodies), POSE)), np.empty((8, 3))
+    frames, poses, work = np.empty((len(links), POSE)), np.empty((len(bodies), POSE)), np.empty((10, 3))
     for arm in range(len(q)):
         _place_links(q[arm], links, frames)
         for g in range(len(bodies)):

@@ -54,7 +54,7 @@ def farthest(body, vertices, pose, dx, dy, dz):
 
 @njit(cache=True, error_model="numpy")
 def within(a, pose_a, b, pose_b, vertices, more, work):
-    """Return whether two bodies are nearer than `more` m to each other; work is (8, 3), anything."""
+    """Return whether two bodies are nearer than `more` m to each other; work is (10, 3), anything."""
     reach = a[ROUND] + b[ROUND] + more
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return _segments(a, pose_a, b, pose_b) <= reach * reach
@@ -100,33 +100,29 @@ def _segments(a, p, b, r):
 def _nearest(s, count, t):
     """Return the point of a simplex s (4, 3) of `count` corners that is nearest to the origin, and how many it needs.
 
-    Those that it needs come first in s afterwards; 4: the origin is inside. t: (4, 3), anything.
+    Those that it needs come first in s afterwards; 4: the origin is inside. t: (6, 3), anything.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1
     if count == 2:
         return _on_edge(s)
-    if count == 3:
-        return _on_triangle(s)
-    best, kept = np.inf, 4
-    x, y, z = 0.0, 0.0, 0.0
-    for face in range(4):
-        i, j, k = (face + 1) % 4, (face + 2) % 4, (face + 3) % 4
-        nx, ny, nz = _normal(s[i], s[j], s[k])
-        inner = nx * (s[face, 0] - s[i, 0]) + ny * (s[face, 1] - s[i, 1]) + nz * (s[face, 2] - s[i, 2])
-        outer = -(nx * s[i, 0] + ny * s[i, 1] + nz * s[i, 2])
-        if inner * outer > 0:
-            continue
+    best, x, y, z, kept = np.inf, 0.0, 0.0, 0.0, 4
+    for face in range(4 if count == 4 else 1):  # each has one function to be in: what is compiled twice takes twice
+        i, j, k = (face, face + 1, face + 2) if face < 2 else (0, face, 3 if face == 2 else 1)
+        if count == 4:
+            nx, ny, nz = _normal(s[i], s[j], s[k])
+            m = 6 - i - j - k
+            inner = nx * (s[m, 0] - s[i, 0]) + ny * (s[m, 1] - s[i, 1]) + nz * (s[m, 2] - s[i, 2])
+            if inner * -(nx * s[i, 0] + ny * s[i, 1] + nz * s[i, 2]) > 0:
+                continue
         t[0], t[1], t[2] = s[i], s[j], s[k]
         fx, fy, fz, n = _on_triangle(t)
         square = fx * fx + fy * fy + fz * fz
         if square < best:
-            best, x, y, z, kept, won = square, fx, fy, fz, n, face
-    if kept == 4:
-        return 0.0, 0.0, 0.0, 4
-    t[0], t[1], t[2] = s[(won + 1) % 4], s[(won + 2) % 4], s[(won + 3) % 4]
-    x, y, z, kept = _on_triangle(t)
-    s[:3] = t[:3]
+            best, x, y, z, kept = square, fx, fy, fz, n
+            t[3:] = t[:3]
+    if kept < 4:
+        s[:3] = t[3:]
     return x, y, z, kept
 
 
@@ -167,16 +163,12 @@ def _on_triangle(s):
     if vc >= 0 and uc <= vc:
         s[0] = c
         return s[0, 0], s[0, 1], s[0, 2], 1
-    wc = ua * vb - ub * va
+    wa, wb, wc = ub * vc - uc * vb, uc * va - ua * vc, ua * vb - ub * va
     if wc <= 0 and ua >= 0 and ub <= 0:
         return _on_edge(s)
-    wb = uc * va - ua * vc
-    if wb <= 0 and va >= 0 and vc <= 0:
-        s[1] = c
-        return _on_edge(s)
-    wa = ub * vc - uc * vb
-    if wa <= 0 and vb - ub >= 0 and uc - vc >= 0:
-        s[0] = c
+    other = wb <= 0 and va >= 0 and vc <= 0
+    if other or (wa <= 0 and vb - ub >= 0 and uc - vc >= 0):
+        s[1 if other else 0] = c
         return _on_edge(s)
     share = 1.0 / (wa + wb + wc)
     p, q = wb * share, wc * share  # of the edges to b and to c
