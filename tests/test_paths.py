@@ -44,7 +44,7 @@ def test_a_path_names_joint_or_link_where_and_what_is_allowed():
 def test_nothing_between_two_samples_comes_nearer_than_touching():
     """Of every path that is allowed, at more samples, no distance is used up."""
     postures, checked = allowed(), 0
-    for a, b in zip(postures[:40:2], postures[1:40:2], strict=True):
+    for a, b in zip(postures[:30:2], postures[1:30:2], strict=True):
         try:
             check_path(ROBOT, np.array([a, b]), space=SPACE)
         except UserError:
@@ -52,7 +52,7 @@ def test_nothing_between_two_samples_comes_nearer_than_touching():
         gaps = SPACE.gaps(a + np.linspace(0, 1, 200)[:, None] * (b - a))
         assert np.all(gaps[:, 1:] > -CLEARANCE_M)
         checked += 1
-    assert checked > 10
+    assert checked > 8
 
 
 def test_an_arm_that_is_too_near_may_leave_but_not_come_nearer():
@@ -67,7 +67,7 @@ def test_an_arm_that_is_too_near_may_leave_but_not_come_nearer():
 def test_another_way_is_found_where_the_straight_one_is_forbidden():
     """Between postures left and right of what is in the way, most lead by way of home or joint by joint."""
     postures, ways, refused = allowed(), [], []
-    for a, b in zip(postures[:120:2], postures[1:120:2], strict=True):
+    for a, b in zip(postures[:70:2], postures[1:70:2], strict=True):
         try:
             path = approach(ROBOT, a, b, space=SPACE)
         except UserError as error:

@@ -198,7 +198,8 @@ def _first(q, links, bodies, vertices, above, pairs, table, more, out):
         for g in range(len(bodies)):
             body, link = bodies[g], int(bodies[g, LINK])
             if link < 0:
-                poses[g] = body[LOCAL:]
+                for c in range(POSE):
+                    poses[g, c] = body[LOCAL + c]
                 continue
             f = frames[link]
             R = (f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11])
@@ -217,7 +218,7 @@ def _look(bodies, poses, vertices, above, pairs, table, more, work):
         if farthest(body, vertices, pose, 0.0, 0.0, -1.0)[2] - body[convex.ROUND] <= table + more:
             return k
     for k in range(len(pairs)):
-        a, b = pairs[k]
+        a, b = pairs[k, 0], pairs[k, 1]
         p, r = poses[a], poses[b]
         x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
         far = bodies[a, BOUND] + bodies[b, BOUND] + more

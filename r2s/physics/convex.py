@@ -115,15 +115,23 @@ def _nearest(s, count, t):
             inner = nx * (s[m, 0] - s[i, 0]) + ny * (s[m, 1] - s[i, 1]) + nz * (s[m, 2] - s[i, 2])
             if inner * -(nx * s[i, 0] + ny * s[i, 1] + nz * s[i, 2]) > 0:
                 continue
-        t[0], t[1], t[2] = s[i], s[j], s[k]
+        _copy(t, 0, s, i)
+        _copy(t, 1, s, j)
+        _copy(t, 2, s, k)
         fx, fy, fz, n = _on_triangle(t)
         square = fx * fx + fy * fy + fz * fz
         if square < best:
             best, x, y, z, kept = square, fx, fy, fz, n
-            t[3:] = t[:3]
-    if kept < 4:
-        s[:3] = t[3:]
+            for m in range(3):
+                _copy(t, 3 + m, t, m)
+    for m in range(3 if kept < 4 else 0):
+        _copy(s, m, t, 3 + m)
     return x, y, z, kept
+
+
+@njit(cache=True, error_model="numpy")
+def _copy(to, i, s, k):
+    to[i, 0], to[i, 1], to[i, 2] = s[k, 0], s[k, 1], s[k, 2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -141,7 +149,7 @@ def _on_edge(s):
     if along <= 0.0 or square == 0.0:
         return s[0, 0], s[0, 1], s[0, 2], 1
     if along >= square:
-        s[0] = s[1]
+        _copy(s, 0, s, 1)
         return s[0, 0], s[0, 1], s[0, 2], 1
     share = along / square
     return s[0, 0] + share * ux, s[0, 1] + share * uy, s[0, 2] + share * uz, 2
@@ -158,17 +166,17 @@ def _on_triangle(s):
     if ua <= 0 and va <= 0:
         return a[0], a[1], a[2], 1
     if ub >= 0 and vb <= ub:
-        s[0] = b
-        return s[0, 0], s[0, 1], s[0, 2], 1
+        _copy(s, 0, s, 1)
+        return b[0], b[1], b[2], 1
     if vc >= 0 and uc <= vc:
-        s[0] = c
-        return s[0, 0], s[0, 1], s[0, 2], 1
+        _copy(s, 0, s, 2)
+        return c[0], c[1], c[2], 1
     wa, wb, wc = ub * vc - uc * vb, uc * va - ua * vc, ua * vb - ub * va
     if wc <= 0 and ua >= 0 and ub <= 0:
         return _on_edge(s)
     other = wb <= 0 and va >= 0 and vc <= 0
     if other or (wa <= 0 and vb - ub >= 0 and uc - vc >= 0):
-        s[1 if other else 0] = c
+        _copy(s, 1 if other else 0, s, 2)
         return _on_edge(s)
     share = 1.0 / (wa + wb + wc)
     p, q = wb * share, wc * share  # of the edges to b and to c
