@@ -1,4 +1,4 @@
-"""The hidden twin: the stand-in for a real arm, with everything in it that the trained simulator lacks.
+"""The first make of hidden twin: the stand-in for a real arm, with what a rigid simulator with friction lacks.
 
 Another engine (DART), friction of another family (LuGre: bristles, Stribeck, load and direction dependence,
 breakaway), torque offsets, wrong masses, centres and tensors under a gravity compensation that believes the
@@ -17,10 +17,18 @@ Friction, per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), bristle z rad
 import numpy as np
 from numba import njit
 
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.hidden_arm import (
+    ENCODER,
+    NOISE_BLOCK,
+    HiddenArm,
+    Links,
+    carry,
+    drag,
+    draw_links,
+    draw_surroundings,
+    magnitudes,
+)
 from r2s.engines.dart import DartEngine
-from r2s.errors import check_number
-from r2s.physics.description import Bodies
 from r2s.physics.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
@@ -29,43 +37,25 @@ DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMAT
 # ... and of the state (rows, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_FILTERED, Q_SEEN, TAU_SEEN, BENT = range(12)
 
-
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, or each reversal would kick
-ENCODER = 2e-5  # rad
-NOISE_BLOCK = 1000  # cycles of noise drawn at once
 MASS_EVERY = 4  # cycles between mass matrices for the implicit solve; DART itself always has the current one
 STOP_MARGIN = 0.1  # rad from the position limits, where the arm stops itself, to the mechanical stops
 
 
-class Twin:
-    """An `Arm` (r2s/arm/interface.py) of which only the seed is known.
+class Twin(HiddenArm):
+    """The first make; arguments as of `HiddenArm`.
 
-    The same seed, noise and calls give bit-identical states. Noise restarts at every `move_to`, from a
-    stream of its own for each episode: the k-th episode of a twin has the same noise whatever the episodes
-    before it did, so an evaluation on a fresh twin is reproducible. Time and bristles restart too; the robot
-    drawn stays.
+    Time and bristles restart at every `move_to`, too: an evaluation on a fresh twin is reproducible.
 
     Args:
-        robot: what it is believed to be. seed: of the robot drawn around that.
-        payload: kg in the hand, a point mass that the gravity compensation does not know of.
-        stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque; None: rigid. The
-            encoders are on the motors' side, so that q and dq lack what the load bends; the gears do not swing.
-        noise: of the sensors, another stream for each: two recordings of one robot have not the same noise.
-
-    Raises:
-        UserError: a payload that is negative, a stiffness that is not above 0, or either not finite.
+        stiffness: None: rigid gears. The encoders are on the motors' side, so that q and dq lack what the load bends;
+            the gears do not swing.
     """
 
     def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None, noise: int = 0):
-        check_number("arm.seed", seed, "[0, inf)", whole=True)
-        check_number("arm.payload", payload, "[0, inf)")
-        if stiffness is not None:
-            check_number("arm.stiffness", stiffness, "(0, inf)")
-        self.robot = robot
-        check_number("arm.noise", noise, "[0, inf)", whole=True)
-        self._seed, self._stream = int(seed), int(noise)
+        super().__init__(robot, seed, payload, stiffness, noise)
         rng = np.random.default_rng([self._seed, 0])
-        links = _draw_links(robot, rng)
+        links = draw_links(robot, rng)
         self._engine = _engine(robot, links)
         self._nominal = DartEngine(robot, gravity=True)
         at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
@@ -74,7 +64,7 @@ class Twin:
         if stiffness:
             self._hidden[COMPLIANCE] = robot.tau_max.max() / (robot.tau_max * stiffness)
         if payload:
-            self._engine = _engine(robot, _carry(robot, payload, *links))
+            self._engine = _engine(robot, carry(robot, payload, *links))
         delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles
         lag = rng.uniform(1e-3, 3e-3)  # s
         filter_hz = rng.uniform(60.0, 120.0)
@@ -82,50 +72,7 @@ class Twin:
         self._dq_filter = -np.expm1(-2 * np.pi * filter_hz * SIM_DT)
         self._line = np.zeros((int(delay) + 2, robot.n))
         self._state = np.zeros((12, robot.n))
-        self._reflexes = Reflexes(robot)
-        self._episode = 0
-        self._stopped: str | None = "no motion was started; call move_to first"
         self._start(robot.q_home)
-
-    def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; bristles carry what gravity compensation leaves."""
-        q = np.array(q, dtype=float)
-        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
-            raise ArmStopped(f"move_to needs {self.robot.n} finite joint angles; it got {q}")
-        self._reflexes.state(q, np.zeros(self.robot.n))
-        self._start(q)
-        self._episode += 1
-        self._stopped = None
-        return self.read()
-
-    def read(self) -> ArmState:
-        """Return the sensors' view of the current cycle."""
-        s = self._state
-        return ArmState(
-            self._cycle * SIM_DT,
-            s[Q_SEEN].copy(),
-            s[DQ_FILTERED].copy(),
-            s[TAU_SEEN].copy(),
-            self._tau_J_d.copy(),
-        )
-
-    def command(self, tau: np.ndarray) -> None:
-        """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
-        if self._stopped is not None:
-            raise ArmStopped(f"the arm is stopped: {self._stopped}")
-        tau = np.array(tau, dtype=float)
-        try:
-            self._reflexes.command(tau, self._tau_J_d)
-            self._advance(tau)
-            self._reflexes.state(self._q, self._dq)
-        except ArmStopped as reason:
-            self._stopped = str(reason)
-            raise
-
-    def stop(self) -> None:
-        """End the motion; `command` is refused until the next `move_to`."""
-        if self._stopped is None:
-            self._stopped = "stop was called"
 
     def _start(self, q: np.ndarray) -> None:
         n = self.robot.n
@@ -154,6 +101,10 @@ class Twin:
         self._cycle += 1
         self._sense(before)
 
+    def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = self._state
+        return s[Q_SEEN], s[DQ_FILTERED], s[TAU_SEEN]
+
     def _sense(self, before: np.ndarray) -> None:
         row = self._cycle % NOISE_BLOCK
         if row == 0:
@@ -164,37 +115,9 @@ class Twin:
         )  # fmt: skip
 
 
-def _draw_links(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return true masses, centres and tensors; U: uniform."""
-    model = robot.model(gravity=True)
-    n, bodies = robot.n, model.jnt_bodyid
-    small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # arms smaller than a Panda's wrist
-    masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
-    coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
-    scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
-    return masses, coms, robot.inertia * scale[:, None, None]
-
-
-def _engine(robot: Robot, links: tuple[np.ndarray, np.ndarray, np.ndarray]) -> DartEngine:
+def _engine(robot: Robot, links: Links) -> DartEngine:
     masses, coms, inertias = links
     return DartEngine(robot, gravity=True, masses=masses, coms=coms, inertias=inertias, stop_margin=STOP_MARGIN)
-
-
-def _carry(
-    robot: Robot, payload: float, masses: np.ndarray, coms: np.ndarray, inertias: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the links with a point mass of `payload` kg at the end effector."""
-    model = robot.model(gravity=True)
-    site = model.site(robot.ee_site).id
-    _, pose = Bodies(model).moving_parent(model.site_bodyid[site])
-    hand = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
-    total = masses[-1] + payload
-    centre = (masses[-1] * coms[-1] + payload * hand) / total
-    arms = (masses[-1], coms[-1] - centre), (payload, hand - centre)
-    added = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
-    last = np.arange(robot.n) == robot.n - 1
-    inertias = inertias + np.where(last[:, None, None], added, 0.0)
-    return np.where(last, total, masses), np.where(last[:, None], centre, coms), inertias
 
 
 def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
@@ -208,9 +131,8 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
 
     """
     n = robot.n
-    level, offset_range, drag_max, noise_max = _magnitudes(robot)
     p = np.empty((18, n))
-    level = level * rng.uniform(0.7, 1.3, n)
+    level = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
     coulomb = 0.6 * level  # the rest of the level comes with speed
     lean = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
     p[C_NEG], p[C_POS] = coulomb - lean, coulomb + lean
@@ -220,36 +142,10 @@ def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, un
     p[S0] = p[BREAK] * coulomb / rng.uniform(3e-4, 8e-4, n)  # breaks away after U(0.3, 0.8) mrad
     p[S1] = 2 * rng.uniform(0.2, 0.4, n) * np.sqrt(p[S0] * inertia)  # damping ratio of the bristles
     p[S2] = 0.4 * level * rng.uniform(0.7, 1.3, n)
-    p[OFFSET] = rng.uniform(offset_range[:, 0], offset_range[:, 1]) * rng.choice([-1, 1], n)
-    # Table I is what is left of gravity and offset together; an arm that drifts at home would be recalibrated
-    hold = 0.7 * coulomb
-    p[OFFSET] = np.clip(p[OFFSET], -hold - unbalanced, hold - unbalanced)
-    p[DRAG_OWN] = drag_max * rng.uniform(0.15, 0.7, n)
-    p[DRAG_NEXT] = drag_max * rng.uniform(0.0, 0.3, n)  # a cable along two joints
-    p[DRAG_WAVES] = rng.uniform(0.7, 2.0, n)  # rad per rad
-    p[DRAG_PHASE] = rng.uniform(-np.pi, np.pi, n)
-    p[NOISE_Q] = rng.uniform(0.5e-5, 1.5e-5, n)
-    p[NOISE_DQ] = rng.uniform(2e-3, 4e-3, n)  # before the filter
-    p[NOISE_TAU] = noise_max * rng.uniform(0.5, 1.0, n)
+    p[OFFSET : NOISE_TAU + 1] = draw_surroundings(robot, rng, 0.7 * coulomb, unbalanced)
     p[ARMATURE] = robot.model(gravity=False).dof_armature
     p[COMPLIANCE] = 0.0
     return p
-
-
-def _magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return friction level at speed, range of |offset| (n, 2), largest cable drag and sensor noise, Nm.
-
-    A Panda has the size of the paper's Tables I and IV; other arms get it in proportion to their torque
-    limits.
-    """
-    big = robot.tau_max >= 40
-    if robot.n == 7 and np.allclose(robot.tau_max, [87] * 4 + [12] * 3):
-        level = 0.5 * np.array([3.40, 1.98, 2.51, 2.44, 2.60, 1.19, 1.55])  # phi1 / 2, Table IV NEW
-    else:
-        level = np.minimum(0.05 * robot.tau_max, 0.45 * robot.tau_max**0.25)
-    small = np.minimum(1.0, robot.tau_max / 12)
-    offset = np.where(big[:, None], [0.05, 0.7], small[:, None] * [0.01, 0.08])
-    return level, offset, np.where(big, 0.3, 0.08 * small), np.where(big, 0.3, 0.1 * small)
 
 
 @njit(cache=True)
@@ -261,9 +157,9 @@ def _stribeck(p, z, v, load, i):
 
 
 @njit(cache=True)
-def _drag(p, q, i):
-    wave = np.sin(p[DRAG_WAVES, i] * q[i] + p[DRAG_PHASE, i])
-    return p[DRAG_OWN, i] * wave + p[DRAG_NEXT, i] * np.sin(q[(i + 1) % len(q)] - p[DRAG_PHASE, i])
+def _dragged(p, q, i):
+    own, along, waves, phase = p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i]
+    return drag(own, along, waves, phase, q[i], q[(i + 1) % len(q)])
 
 
 @njit(cache=True)
@@ -271,7 +167,7 @@ def _rest(p, s, q, believed, true):
     """Set the state of an arm at rest: bristles carry what `believed` leaves of the `true` gravity torque."""
     s[:] = 0
     for i in range(len(q)):
-        left = believed[i] + p[OFFSET, i] + _drag(p, q, i)
+        left = believed[i] + p[OFFSET, i] + _dragged(p, q, i)
         level = 0.95 * _stribeck(p, left - true[i], 0.0, believed[i], i)
         s[FRICTION, i] = min(max(left - true[i], -level), level)
         s[Z, i] = s[FRICTION, i] / p[S0, i]
@@ -299,7 +195,7 @@ def _drive(p, s, line, mass, tau, q, v, gravity, cycle, delay, lag, h):
     for i in range(n):
         delayed = (1 - late) * line[newer, i] + late * line[older, i]
         s[MOTOR, i] += lag * (delayed - s[MOTOR, i])
-        passive[i] = gravity[i] + p[OFFSET, i] + _drag(p, q, i)
+        passive[i] = gravity[i] + p[OFFSET, i] + _dragged(p, q, i)
         s[DRIVE, i] = s[MOTOR, i] + passive[i]
         s[LEVEL, i] = _stribeck(p, s[Z, i], v[i], gravity[i], i)
         limit = s[LEVEL, i] / p[S0, i]

@@ -11,12 +11,11 @@ import mujoco
 import numpy as np
 
 from r2s.errors import UserError
+from r2s.physics.contacts import TABLE_M, name_of, watched
 from r2s.physics.robot import SIM_DT, Robot
 
-TABLE_M = 0.0  # height of the table in the base frame, by default
 TOOL_M = 0.1  # least height of the end effector, by default: the MJCF holds no tool
 CLEARANCE_M = 0.03  # between a link and the table or another link: what a tracking error of 30 mrad covers
-HOUSING_M = 0.045  # geoms nearer than this at q_home are parts of one joint's housing
 FAR_M = 0.1  # farther apart, the bounding spheres do
 GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # of tau_max, for |gravity| + |dynamics| + friction
@@ -190,18 +189,12 @@ def friction_margin(robot: Robot) -> np.ndarray:
 class Space:
     """Distances of an arm's links from the table and from each other.
 
-    Left out, because nothing there can go wrong or nothing can be told:
-
-    - of the table: geoms on the base, and on links that only vertical axes carry; no joint moves them up or down.
-    - of each other: links next to each other, which touch in their joint, and pairs of geoms that are near at
-      q_home: two parts of a joint's housing two links apart, as in the Panda's shoulder, not a collision.
-
-    Where a file has geoms that collide, the others are for looking at and do not count. Planes and height fields are
-    surroundings, not the arm.
+    What is left out of them says r2s/physics/contacts.py.
 
     Attributes:
         clearance: (K,) m, kept by each distance: the end effector's height above z_min (it has this much to spare in
             a search, not here), the links' above the table, the pairs'.
+        reach: m that no point of the arm is farther than from any of its joints.
 
     """
 
@@ -209,18 +202,22 @@ class Space:
         self.model = robot.model(gravity=False)
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site(robot.ee_site).id
-        geoms, link = self._shapes()
+        moving = self.model.jnt_bodyid
+        parts = np.isin(self.model.geom_bodyid, np.arange(moving[0], self.model.nbody))
+        farthest = (np.linalg.norm(self.model.geom_pos, axis=1) + self.model.geom_rbound)[parts].max(initial=0.0)
+        links = np.linalg.norm(self.model.body_pos[moving[0] + 1 :], axis=1).sum()
+        self.reach = float(links + farthest)
+        found = watched(robot, self.model, table=bool(np.isfinite(table)))
         self.table, self.floor = table, z_min
-        self.above = [g for g in geoms if np.isfinite(table) and not self._level(link[g])]
-        pairs = [(a, b) for a in geoms for b in geoms if link[b] - link[a] >= 2]
+        self.above, self.pairs = found.above, found.pairs
         self._pose(robot.q_home)
-        self.pairs = [(a, b) for a, b in pairs if self._distance(a, b) >= HOUSING_M]
         at_home = self._heights(self.data.geom_xpos[None], self.data.geom_xmat[None])[0] - table
         if (at_home <= 0).any():
             worst = int(at_home.argmin())
+            name = name_of(self.model, self.above[worst])
             raise UserError(
-                f"excitation: {self._name(self.above[worst])} reaches {-at_home[worst]:.3f} m below the table at "
-                f"{table:g} m already at robot.q_home; give another height of the table, -inf for none"
+                f"excitation: {name} reaches {-at_home[worst]:.3f} m below the table at {table:g} m already at "
+                "robot.q_home; give another height of the table, -inf for none"
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm that folds low comes back to where it was
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
@@ -244,34 +241,20 @@ class Space:
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):
             row, which = bad[0]
-            raise UserError(f"excitation: {self._explain(int(which), gaps[row, which], when(row))}")
+            raise UserError(f"excitation: {self.explain(int(which), gaps[row, which], when(row))}")
 
-    def _explain(self, which: int, gap: float, when: str) -> str:
+    def explain(self, which: int, gap: float, when: str) -> str:
+        """Return in words how near it comes where column `which` of `gaps` is `gap` m, `when`."""
         if which == 0:
             seen = gap + self.floor
             return f"the end effector is {seen:.3f} m above the base plane {when}, allowed {self.floor:g} m or more"
         allowed = self.clearance[which]
         if which <= len(self.above):
-            name, other = self._name(self.above[which - 1]), "above the table"
+            name, other = name_of(self.model, self.above[which - 1]), "above the table"
         else:
             a, b = self.pairs[which - 1 - len(self.above)]
-            name, other = self._name(a), f"from {self._name(b)}"
+            name, other = name_of(self.model, a), f"from {name_of(self.model, b)}"
         return f"{name} is {gap + allowed:.3f} m {other} {when}, allowed {allowed:.3g} m or more"
-
-    def _shapes(self) -> tuple[list[int], np.ndarray]:
-        """Return the geoms that count, and (ngeom,) the number of the joint that moves each, from 1; 0: the base."""
-        m = self.model
-        link = np.searchsorted(m.jnt_bodyid, m.body_weldid[m.geom_bodyid], side="right")
-        kind = mujoco.mjtGeom
-        solid = ~np.isin(m.geom_type, [kind.mjGEOM_PLANE, kind.mjGEOM_HFIELD])
-        colliding = solid & ((m.geom_contype != 0) | (m.geom_conaffinity != 0))
-        return np.flatnonzero(colliding if colliding.any() else solid).tolist(), link
-
-    def _level(self, link: int) -> bool:
-        """Return whether no joint up to this one changes the height of what it carries."""
-        self.data.qpos[:] = self.model.qpos0
-        mujoco.mj_kinematics(self.model, self.data)
-        return bool(np.all(np.abs(self.data.xaxis[:link, 2]) > 1 - 1e-9))
 
     def _pose(self, q: np.ndarray) -> None:
         self.data.qpos[:] = q
@@ -316,10 +299,6 @@ class Space:
                 return -(up @ m.mesh_vert[first : first + m.mesh_vertnum[mesh]].T).min(1)
             case _:
                 return np.full(len(up), m.geom_rbound[g])
-
-    def _name(self, geom: int) -> str:
-        body = self.model.geom_bodyid[geom]
-        return f"link '{self.model.body(body).name}'" if self.model.body(body).name else f"the link of body {body}"
 
 
 def _every(motion: Motion) -> np.ndarray:

@@ -129,14 +129,18 @@ def record_motion(cfg, robot, motion, k, label):
 
 def record_ramps(cfg, robot):
     """Return the ramps of the breakaway protocol about the home posture, or None where none are asked for."""
+    import numpy as np
+
     from r2s.arm.ramp import poses_about, ramp
+    from r2s.excitation.paths import check_path
     from r2s.progress import Progress
 
     if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
         return None
+    poses = poses_about(robot, cfg.data.ramp_poses)
+    check_path(robot, np.array([robot.q_home, *poses]), what="data.ramp_poses")
     progress = Progress("ramp the joints until they move")
     with opened_source(cfg, robot, 2) as arm:
-        poses = poses_about(robot, cfg.data.ramp_poses)
         out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
     progress.close(f"{out.recording.duration:.1f} s of ramps")
     return out

@@ -53,8 +53,12 @@ def trained_config(cfg):
 
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
+    import numpy as np
+
     from r2s.arm.deploy import DrivenArm
     from r2s.engines.episodes import EngineArms
+    from r2s.excitation.paths import check_path
+    from r2s.excitation.safety import Space
     from r2s.learning.batch import ArmBatch
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
     from r2s.learning.policy import load_policy
@@ -71,6 +75,10 @@ def transfer(cfg, overrides):
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
+    if cfg.arm.name != "none":
+        space = Space(robot)
+        for k, start in enumerate(starts, 1):
+            check_path(robot, np.array([robot.q_home, start]), what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
     dynamics = draw = None

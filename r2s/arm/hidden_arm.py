@@ -1,0 +1,168 @@
+"""What the hidden twins have in common: an arm of which only the seed is known, and how large its errors are.
+
+Each make (twin.py, elastic_twin.py) draws a robot from its seed around the one it is believed to be, and has drives
+and friction of its own. Nothing but the make itself reads what was drawn.
+"""
+
+import numpy as np
+from numba import njit
+
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.errors import check_number
+from r2s.physics.description import Bodies
+from r2s.physics.robot import SIM_DT, Robot
+
+ENCODER = 2e-5  # rad
+NOISE_BLOCK = 1000  # cycles of noise drawn at once
+
+Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (n,) kg, centres (n, 3) m, tensors (n, 3, 3) kg m^2
+
+
+class HiddenArm:
+    """An `Arm` (r2s/arm/interface.py) of which only the seed is known; a make says what moves it.
+
+    The same seed, noise and calls give bit-identical states. Noise restarts at every `move_to`, from a stream of its
+    own for each episode: the k-th episode of a twin has the same noise whatever the episodes before it did.
+
+    A make has `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command, `_seen()`, the sensors'
+    q, dq and tau_J, `_q` and `_dq`, which the reflexes watch, `_cycle` and `_tau_J_d`.
+
+    Args:
+        robot: what it is believed to be. seed: of the robot drawn around that.
+        payload: kg in the hand, a point mass that the gravity compensation does not know of.
+        stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque.
+        noise: of the sensors, another stream for each: two recordings of one robot have not the same noise.
+
+    Raises:
+        UserError: a payload that is negative, a stiffness that is not above 0, or either not finite.
+    """
+
+    def __init__(self, robot: Robot, seed: int, payload: float, stiffness: float | None, noise: int):
+        check_number("arm.seed", seed, "[0, inf)", whole=True)
+        check_number("arm.payload", payload, "[0, inf)")
+        if stiffness is not None:
+            check_number("arm.stiffness", stiffness, "(0, inf)")
+        check_number("arm.noise", noise, "[0, inf)", whole=True)
+        self.robot = robot
+        self._seed, self._stream = int(seed), int(noise)
+        self._reflexes = Reflexes(robot)
+        self._episode = 0
+        self._stopped: str | None = "no motion was started; call move_to first"
+        self._cycle, self._tau_J_d = 0, np.zeros(robot.n)
+        self._q, self._dq = robot.q_home, np.zeros(robot.n)
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Place the arm at rest at q (n,) rad; friction carries what gravity compensation leaves."""
+        q = np.array(q, dtype=float)
+        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
+            raise ArmStopped(f"move_to needs {self.robot.n} finite joint angles; it got {q}")
+        self._reflexes.state(q, np.zeros(self.robot.n))
+        self._start(q)
+        self._episode += 1
+        self._stopped = None
+        return self.read()
+
+    def read(self) -> ArmState:
+        """Return the sensors' view of the current cycle."""
+        q, dq, tau_J = self._seen()
+        return ArmState(self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._tau_J_d.copy())
+
+    def command(self, tau: np.ndarray) -> None:
+        """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
+        if self._stopped is not None:
+            raise ArmStopped(f"the arm is stopped: {self._stopped}")
+        tau = np.array(tau, dtype=float)
+        try:
+            self._reflexes.command(tau, self._tau_J_d)
+            self._advance(tau)
+            self._reflexes.state(self._q, self._dq)
+        except ArmStopped as reason:
+            self._stopped = str(reason)
+            raise
+
+    def stop(self) -> None:
+        """End the motion; `command` is refused until the next `move_to`."""
+        if self._stopped is None:
+            self._stopped = "stop was called"
+
+    def _start(self, q: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _advance(self, tau: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        raise NotImplementedError
+
+
+def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
+    """Return true masses, centres and tensors; U: uniform."""
+    model = robot.model(gravity=True)
+    n, bodies = robot.n, model.jnt_bodyid
+    small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # arms smaller than a Panda's wrist
+    masses = model.body_mass[bodies] * rng.uniform(0.98, 1.02, n)  # U(0.98, 1.02) of the nominal mass
+    coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
+    scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
+    return masses, coms, robot.inertia * scale[:, None, None]
+
+
+def carry(robot: Robot, payload: float, masses: np.ndarray, coms: np.ndarray, inertias: np.ndarray) -> Links:
+    """Return the links with a point mass of `payload` kg at the end effector."""
+    model = robot.model(gravity=True)
+    site = model.site(robot.ee_site).id
+    _, pose = Bodies(model).moving_parent(model.site_bodyid[site])
+    hand = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
+    total = masses[-1] + payload
+    centre = (masses[-1] * coms[-1] + payload * hand) / total
+    arms = (masses[-1], coms[-1] - centre), (payload, hand - centre)
+    added = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
+    last = np.arange(robot.n) == robot.n - 1
+    inertias = inertias + np.where(last[:, None, None], added, 0.0)
+    return np.where(last, total, masses), np.where(last[:, None], centre, coms), inertias
+
+
+def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return friction level at speed, range of |offset| (n, 2), largest cable drag and sensor noise, Nm.
+
+    A Panda has the size of the paper's Tables I and IV; other arms get it in proportion to their torque
+    limits.
+    """
+    big = robot.tau_max >= 40
+    if robot.n == 7 and np.allclose(robot.tau_max, [87] * 4 + [12] * 3):
+        level = 0.5 * np.array([3.40, 1.98, 2.51, 2.44, 2.60, 1.19, 1.55])  # phi1 / 2, Table IV NEW
+    else:
+        level = np.minimum(0.05 * robot.tau_max, 0.45 * robot.tau_max**0.25)
+    small = np.minimum(1.0, robot.tau_max / 12)
+    offset = np.where(big[:, None], [0.05, 0.7], small[:, None] * [0.01, 0.08])
+    return level, offset, np.where(big, 0.3, 0.08 * small), np.where(big, 0.3, 0.1 * small)
+
+
+def draw_surroundings(robot: Robot, rng: np.random.Generator, hold: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
+    """Return (8, n): torque offset, Nm; cable drag, the arguments of `drag`; noise of q, dq and tau_J.
+
+    Args:
+        robot, rng: the arm, and the stream to draw from.
+        hold: (n,) Nm that friction surely holds. unbalanced: (n,) Nm, what the gravity compensation leaves at home.
+    """
+    _, offset_range, drag_max, noise_max = magnitudes(robot)
+    n = robot.n
+    offset = rng.uniform(offset_range[:, 0], offset_range[:, 1]) * rng.choice([-1, 1], n)
+    return np.array(
+        [
+            # Table I is what is left of gravity and offset together; an arm that drifts at home would be recalibrated
+            np.clip(offset, -hold - unbalanced, hold - unbalanced),
+            drag_max * rng.uniform(0.15, 0.7, n),
+            drag_max * rng.uniform(0.0, 0.3, n),  # a cable along two joints
+            rng.uniform(0.7, 2.0, n),  # rad per rad
+            rng.uniform(-np.pi, np.pi, n),
+            rng.uniform(0.5e-5, 1.5e-5, n),
+            rng.uniform(2e-3, 4e-3, n),  # before the filter
+            noise_max * rng.uniform(0.5, 1.0, n),
+        ]
+    )
+
+
+@njit(cache=True)
+def drag(own, along, waves, phase, q, after):
+    """Return Nm that a cable pulls a joint at q with; the next joint is at `after`."""
+    return own * np.sin(waves * q + phase) + along * np.sin(after - phase)
