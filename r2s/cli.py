@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.stages.build import CONF, unread
+from r2s.stages.build import CONF, loaded, unread
 
 STAGES = ("train", "identify", "transfer", "compare", "pipeline")
+WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
+MOST_THREADS = 4096
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
@@ -132,13 +134,13 @@ def resumed(cfg, overrides):
         raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
     if extra := [o for o in overrides if not o.startswith("resume=")]:
         raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
-    before = OmegaConf.load(folder / "config.yaml")
+    before = loaded(folder / "config.yaml")
     if before.stage not in ("identify", "train"):
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
-    return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
+    return before, OmegaConf.to_container(loaded(folder / "overrides.yaml"))
 
 
 def is_there(cfg, overrides):
@@ -157,7 +159,7 @@ def is_there(cfg, overrides):
         beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
         return {w for w in words if not w.startswith(beside)}
 
-    before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
+    before = typed(OmegaConf.to_container(loaded(folder / "overrides.yaml")))
     if other := sorted(before ^ typed(overrides)):
         raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
     if is_done(folder):
@@ -167,26 +169,49 @@ def is_there(cfg, overrides):
     return False
 
 
+def check_words(cfg):
+    """Check the options that name a file or folder; a number is a name, too."""
+    for key in WORDS:
+        value = cfg[key]
+        if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
+            raise UserError(f"{key}: {value!r} is not allowed; a name or null is")
+        if value is not None:
+            cfg[key] = str(value)
+    if cfg.root is None:
+        raise UserError("root: null is not allowed; a folder is")
+    if not isinstance(cfg.only_missing, bool):
+        raise UserError(f"only_missing: {cfg.only_missing!r} is not allowed; true and false are")
+
+
 def run_job(cfg):
     """Call the stage of one composed config; a mistake ends the job (`failed`)."""
     from hydra.core.hydra_config import HydraConfig
-    from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     overrides = list(HydraConfig.get().overrides.task)
     try:
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
         check_number("seed", cfg.seed, "[0, inf)", whole=True)
-        check_number("threads", cfg.threads, "[0, inf)", whole=True)
+        check_number("threads", cfg.threads, f"[0, {MOST_THREADS}]", whole=True)
+        check_words(cfg)
         if cfg.resume:
             cfg, overrides = resumed(cfg, overrides)
         elif cfg.only_missing and is_there(cfg, overrides):
             return
         getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
-    except (UserError, FloatingPointError, InterpolationResolutionError) as error:
+    except (UserError, FloatingPointError) as error:
         failed(" ".join(str(error).split()))
     except MissingMandatoryValue as error:
         failed(f"{error.full_key} must be given: {error.full_key}=...")
+    except OmegaConfBaseException as error:
+        failed(" ".join(str(error).split()))
+    except OSError as error:  # a full disk, a folder that may not be written
+        if error.errno is None:
+            raise
+        failed(f"{error.strerror}{f': {error.filename}' if error.filename else ''}; what was whole before is still")
+    except MemoryError as error:
+        failed(f"not enough memory: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
         sys.exit(130)

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, nearest
+from r2s.files import whole
 from r2s.identification.parameters import (
     TIMING,
     WHOLE_ARM,
@@ -72,8 +73,10 @@ def save_parameters(
     rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for the reader; parameters are loaded
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
-    np.savez_compressed(path.with_name("posterior.npz"), names=np.array(space.names), samples=found.samples)
+    with whole(path.with_name("posterior.npz")) as part:  # first: parameters.yaml says that both are there
+        np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
+    with whole(path) as part:
+        part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
 FIXED = ("phi", "offset", "inertia")
@@ -147,7 +150,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
             f"dr=identified: no posterior.npz at {path.parent}; calibration= must be a run of stage=identify"
         )
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             names, samples = file["names"].tolist(), file["samples"]
         if samples.shape != (len(samples), len(names)):
             raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")

@@ -253,6 +253,7 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         inputs=inputs,
         parents=parents,
         resume=cfg.resume,
+        only=cfg.only_missing,
     )
 
 
@@ -270,6 +271,22 @@ def console():
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 110)
+
+
+def loaded(path):
+    """Return a YAML file of a run folder as a config.
+
+    Raises:
+        UserError: it cannot be read, or is no YAML.
+    """
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return OmegaConf.load(path)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
 
 
 def set_threads(cfg):
