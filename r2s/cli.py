@@ -14,7 +14,8 @@ from typing import Any
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.stages.build import CONF, loaded, unread
 
-STAGES = ("train", "identify", "transfer", "compare", "pipeline")
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
+RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 
@@ -135,8 +136,8 @@ def resumed(cfg, overrides):
     if extra := [o for o in overrides if not o.startswith("resume=")]:
         raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
     before = loaded(folder / "config.yaml")
-    if before.stage not in ("identify", "train"):
-        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
+    if before.stage not in RESUMED:
+        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMED)}")
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
