@@ -30,11 +30,11 @@ from faulty import command, ended, forked, one_line, preload, say
 SEED = 19
 KEPT = ROOT / "runs" / "faults"
 KILLS = {"train": 12, "identify": 8, "transfer": 6, "compare": 6, "sweep": 5, "tune": 3}
-TOY = ["+experiment=toy", "compile=false", "threads=1"]
+TOY = ["+experiment=toy", "threads=1"]
 QUICK = [*TOY, "budget.env_steps=960", "evaluation.env_steps=320", "algo.learning_starts=160"]
 QUICK += ["evaluation.episodes=2", "algo.batch_size=16", "algo.hidden=[16,16]"]
 IDENTIFY = ["stage=identify", *TOY, "data=simulated", "data.seconds=2"]
-CLOCK = ("wall_clock_s",)
+CLOCK = ("wall_clock_s", "seconds")
 
 
 def words_of(stage: str, root: Path, name: str) -> list[str]:
@@ -206,7 +206,7 @@ def places(root: Path, err: Path) -> None:
         folder = root / "train" / name
         if not folder.exists():
             return True
-        status, text = say([f"resume={folder}"], err)
+        status, _ = say([f"resume={folder}"], err)
         return status == 0 and results(folder) == reference
 
     for size in (200, 3_000, 20_000, 60_000):

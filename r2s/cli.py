@@ -7,6 +7,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
@@ -46,6 +48,10 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
             configs = [compose("config", job) for job in jobs]
         except (HydraException, OmegaConfBaseException, UnknownOption):
             raise _first_mistake(words, own, groups) from None
+        for cfg in configs:  # Hydra asks for it before the job does
+            root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
+            if isinstance(root, bool) or not isinstance(root, str | int | float):
+                raise UserError(f"root: {root} is not allowed; a folder is")
         for name in names:
             reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
             if reasons and all(reasons):
@@ -123,10 +129,16 @@ def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]],
     return UserError(f"{word}: {' '.join(str(error).split())}")
 
 
+def typed_in(folder):
+    """Return what the user typed for a run folder."""
+    words = loaded(folder / "overrides.yaml")
+    if any(not isinstance(w, str) for w in words) or isinstance(words, Mapping):
+        raise UserError(f"{folder / 'overrides.yaml'} is damaged: it is no list of KEY=VALUE")
+    return list(words)
+
+
 def resumed(cfg, overrides):
     """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
-    from omegaconf import OmegaConf
-
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -141,13 +153,11 @@ def resumed(cfg, overrides):
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
-    return before, OmegaConf.to_container(loaded(folder / "overrides.yaml"))
+    return before, typed_in(folder)
 
 
 def is_there(cfg, overrides):
     """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
-    from omegaconf import OmegaConf
-
     from r2s.runs import is_done
 
     if not cfg.name:
@@ -160,7 +170,7 @@ def is_there(cfg, overrides):
         beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
         return {w for w in words if not w.startswith(beside)}
 
-    before = typed(OmegaConf.to_container(loaded(folder / "overrides.yaml")))
+    before = typed(typed_in(folder))
     if other := sorted(before ^ typed(overrides)):
         raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
     if is_done(folder):
@@ -187,10 +197,9 @@ def check_words(cfg):
 def run_job(cfg):
     """Call the stage of one composed config; a mistake ends the job (`failed`)."""
     from hydra.core.hydra_config import HydraConfig
-    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     overrides = list(HydraConfig.get().overrides.task)
-    try:
+    with said_in_one_line():
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
         check_number("seed", cfg.seed, "[0, inf)", whole=True)
@@ -201,6 +210,15 @@ def run_job(cfg):
         elif cfg.only_missing and is_there(cfg, overrides):
             return
         getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
+
+
+@contextmanager
+def said_in_one_line():
+    """End a job (`failed`) with one line where a mistake, a full disk or Ctrl-C ends what is done in here."""
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+    try:
+        yield
     except (UserError, FloatingPointError) as error:
         failed(" ".join(str(error).split()))
     except MissingMandatoryValue as error:

@@ -156,12 +156,7 @@ class Run:
             path.parent.mkdir(exist_ok=True)
             with whole(path) as part:
                 np.savez(part, **done)  # type: ignore[arg-type]
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                return {k: file[k] for k in file.files}
-        except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
-            seen = " ".join(str(error).split())
-            raise UserError(f"resume: {path} is damaged ({seen}); remove it, and this step is done again") from None
+        return load_arrays(path)
 
     def figure(self, name: str) -> Path:
         """Return the path of a figure, figures/<name>.png."""
@@ -197,6 +192,9 @@ class Run:
         try:
             rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
             kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
+            # what a run that had come to its end evaluated once more, at the same step, comes again
+            last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
+            del kept[last + 1 :]
         except ValueError as error:
             raise UserError(f"resume: {path} is damaged ({error})") from None
         with whole(path) as part, open(part, "w", newline="") as file:
@@ -225,6 +223,29 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
     with whole(path) as part:
         part.write_text(json.dumps(finite(document), indent=1) + "\n")
+
+
+def load_arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of a file of checkpoints.
+
+    Raises:
+        UserError: it is not what a run wrote.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {k: file[k] for k in file.files}
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        KeyError,
+        NotImplementedError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"resume: {path} is damaged ({seen}); remove it, and this step is done again") from None
 
 
 def read_summary(folder: str | Path, what: str) -> dict[str, Any]:

@@ -148,7 +148,7 @@ def tune(cfg, overrides):
             study_name="tune",
             storage=f"sqlite:///{run.folder / 'study.db'}",
             sampler=None,
-            direction=MEASURES[how.measure],
+            direction=MEASURES[how.measure],  # type: ignore[arg-type]
             load_if_exists=True,
         )
         # what was drawn is in the storage; the stream of a tune that goes on is another one
