@@ -231,6 +231,7 @@ def places(root: Path, err: Path) -> None:
     seconds = json.loads((root / "train" / "clock" / "meta.json").read_text())["wall_clock_s"] if same else -1
     note("training: the clock jumps an hour back and on", status, text, same and 0 < seconds < 600, wanted=0)
     two_at_once(root, err, note, reference)
+    lost_worker(root, err, note, reference)
     (KEPT / "places.json").write_text(json.dumps(rows, indent=1))
 
 
@@ -266,6 +267,23 @@ def as_nobody(root: Path, err: Path, note) -> None:
         status, text = say(words, err, before=nobody)
         whole = before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
         note(f"{where} a folder of another user", status, text, whole and not (root / "train" / "mine").exists())
+
+
+def lost_worker(root: Path, err: Path, note, reference: dict) -> None:
+    """Kill one of the two workers of a sweep side by side, as the system does where memory is short."""
+    import psutil
+
+    words = [*words_of("sweep", root, "worker"), "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    pid = forked(command(words), err)
+    while not (begun := list((root / "train").glob("worker_*/metrics.csv"))):
+        time.sleep(0.05)
+    worker = json.loads((begun[0].parent / "meta.json").read_text())["process"]["pid"]
+    assert pid in [p.pid for p in psutil.Process(worker).parents()]
+    os.kill(worker, signal.SIGKILL)
+    status, text = ended(pid), err.read_text()
+    again, _ = say(words, err)
+    same = again == 0 and results(root / "train" / "worker_0") == reference
+    note("a worker of a sweep is killed (joblib)", status, text, same and len(list(root.glob("train/worker*"))) == 2)
 
 
 def two_at_once(root: Path, err: Path, note, reference: dict) -> None:

@@ -19,6 +19,9 @@ STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
+LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true, repeated, it goes on"
+    "the system ended a worker of the sweep, as where memory is short; what is done stays: only_missing=true goes on"
+)
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
@@ -250,8 +253,13 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
+                os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints what a launcher raises, and exits
             try:
                 job()
+            except Exception as error:
+                if type(error).__name__ != "TerminatedWorkerError":  # joblib's
+                    raise
+                raise UserError(LOST) from None
             finally:
                 end_workers()
             lines = Path(folder) / "failed.txt"
