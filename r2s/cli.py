@@ -19,9 +19,7 @@ STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
-LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true, repeated, it goes on"
-    "the system ended a worker of the sweep, as where memory is short; what is done stays: only_missing=true goes on"
-)
+LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
