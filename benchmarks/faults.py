@@ -368,7 +368,7 @@ def main() -> None:
     """Do the parts that were asked for, and write the page."""
     asked = sys.argv[1:] or ["kills", "places", "files", "mutations", "page"]
     KEPT.mkdir(parents=True, exist_ok=True)
-    err = KEPT / "err.txt"
+    err = KEPT / f"err_{os.getpid()}.txt"
     if set(asked) - {"page"}:
         preload()
     with tempfile.TemporaryDirectory() as at:

@@ -199,8 +199,8 @@ def run_job(cfg):
     """Call the stage of one composed config; a mistake ends the job (`failed`)."""
     from hydra.core.hydra_config import HydraConfig
 
-    overrides = list(HydraConfig.get().overrides.task)
     with said_in_one_line():
+        overrides = list(HydraConfig.get().overrides.task)
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
         check_number("seed", cfg.seed, "[0, inf)", whole=True)
@@ -266,6 +266,8 @@ def main():
                 sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
+    except OSError as error:  # of Hydra, before any job
+        sys.exit(stop(f"{error.strerror}{f': {error.filename}' if error.filename else ''}"))
     finally:
         end_workers()
 

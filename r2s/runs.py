@@ -240,7 +240,6 @@ def load_arrays(path: Path) -> dict[str, Any]:
         EOFError,
         RuntimeError,
         KeyError,
-        NotImplementedError,
         BadZipFile,
         zlib.error,
     ) as error:

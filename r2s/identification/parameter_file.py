@@ -1,6 +1,7 @@
 """parameters.yaml and posterior.npz: what carries an identification to the other stages."""
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -154,7 +155,16 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
             names, samples = file["names"].tolist(), file["samples"]
         if samples.shape != (len(samples), len(names)):
             raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")
-    except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        OSError,
+        EOFError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         seen = " ".join(str(error).split())
         raise UserError(f"dr=identified: {path} is not a posterior.npz of r2s ({seen})") from None
     if names != space.names:

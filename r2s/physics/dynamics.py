@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
@@ -133,6 +133,7 @@ def nominal_dynamics(
     high = joints("friction.breakaway_positive", breakaway_positive)
     if np.any(low > 0) or np.any(high < 0):
         raise UserError("friction.breakaway: the negative edges must be <= 0 and the positive ones >= 0")
+    check_number("friction.dq_min", dq_min, "[0, 10]")
     named = SIGMOID if family == "auto" else friction_family(family)
     phi = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1)
     return replace(
