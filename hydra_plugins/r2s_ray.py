@@ -5,6 +5,7 @@ only_missing=true may be, for it goes on in its run folder, where any other woul
 """
 
 import os
+import secrets
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,6 +45,10 @@ class RayLauncher(Launcher):
         """
         from r2s.errors import UserError
 
+        if self.address is None and "ray" not in sys.modules:
+            # Ray listens at all addresses of the machine: nobody gets in without this word
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         try:
             import ray
         except ImportError:

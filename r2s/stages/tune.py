@@ -1,6 +1,7 @@
 """stage=tune: look for settings of a training; each trial is a run of stage=train in a folder of its own."""
 
 import os
+import re
 import signal
 import subprocess
 import time
@@ -33,7 +34,7 @@ class Tune:
         trials: in all. workers: trainings at once, of one thread each; None: as many as threads=.
         startup: trials drawn at random before any is modelled or pruned.
         measure: of the last evaluation, what is looked for.
-        space: {option: [values] or {low, high, log}}.
+        space: {option: [values], or the text that `span` reads}.
         against: glob of trainings to be compared with, such as those of a grid.
 
     Raises:
@@ -58,24 +59,42 @@ class Tune:
                 f"{nearest(str(self.measure), MEASURES)}"
             )
         if not isinstance(self.space, Mapping) or not self.space:
-            raise UserError(f"tune.space: {self.space!r} is no space; {{option: [values] or {{low, high, log}}}} is")
+            raise UserError(f"tune.space: {self.space!r} is no space; {{option: [values] or log(low, high)}} is")
         for key, axis in self.space.items():
-            if isinstance(axis, Mapping) and axis.keys() - {"log"} == {"low", "high"}:
-                log = axis.get("log", False)
-                check_number(f"tune.space.{key}.low", axis["low"], "(0, inf)" if log else "(-inf, inf)")
-                check_number(f"tune.space.{key}.high", axis["high"], f"({axis['low']}, inf)")
-            elif not (isinstance(axis, list) and axis):
-                raise UserError(f"tune.space.{key}: {axis!r} is not allowed; [values] or {{low, high, log}} are")
+            if not isinstance(axis, list):
+                span(key, axis)
+            elif not axis or any(isinstance(value, list | dict) for value in axis):
+                raise UserError(f"tune.space.{key}: {axis} is not allowed; [values] are, as in [128, 256]")
+
+
+def span(key: str, axis: Any) -> tuple[float, float, bool]:
+    """Return (low, high, logarithmic) of an axis as it is typed: "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
+
+    Raises:
+        UserError: it is no such text.
+    """
+    found = re.fullmatch(r"(log|interval)\(([^,]+),([^,]+)\)", str(axis).replace(" ", ""))
+    try:
+        if found is None:
+            raise ValueError
+        low, high, log = float(found[2]), float(found[3]), found[1] == "log"
+    except ValueError:
+        allowed = "[values], log(low, high) and interval(low, high) are"
+        raise UserError(f"tune.space.{key}: {axis!r} is not allowed; {allowed}") from None
+    check_number(f"tune.space.{key}", low, "(0, inf)" if log else "(-inf, inf)")
+    check_number(f"tune.space.{key}", high, f"({low}, inf)")
+    return low, high, log
 
 
 def suggested(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a trial: {option: value}."""
     out = {}
     for key, axis in space.items():
-        if isinstance(axis, Mapping):
-            out[key] = float(f"{trial.suggest_float(key, axis['low'], axis['high'], log=axis.get('log', False)):.4g}")
-        else:
+        if isinstance(axis, list):
             out[key] = trial.suggest_categorical(key, axis)
+        else:
+            low, high, log = span(key, axis)
+            out[key] = float(f"{trial.suggest_float(key, low, high, log=log):.4g}")
     return out
 
 
