@@ -611,9 +611,10 @@ def mutate(at: Path, err: Path) -> dict:
         folder.mkdir()
         own = part(folder, err)
         print(part.__name__, Counter(r["end"] for r in own), flush=True)
+        for r in own:
+            if r["end"] in ("traceback", "nonsense") or r.get("left"):
+                print(json.dumps(r, ensure_ascii=False), flush=True)
         rows += own
     bad = [r for r in rows if r["end"] in ("traceback", "nonsense") or r.get("left")]
-    for r in bad:
-        print(json.dumps(r, ensure_ascii=False), flush=True)
     counts = {kind: Counter(r["end"] for r in rows if r["kind"] == kind) for kind in COUNTS}
     return {"counts": counts, "bad": bad, "left": sum(len(r.get("left", [])) for r in rows), "seeds": SEEDS}
