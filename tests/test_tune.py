@@ -78,7 +78,7 @@ def test_without_a_grid_nothing_is_compared():
 
 @pytest.mark.slow
 def test_a_search_that_was_killed_goes_on(tmp_path):
-    """Its trials end in the folders that they were begun in, each once; the study is one file; a grid stands beside."""
+    """Its trials end in the folders that they were begun in, once; the study is one file; a grid is beside."""
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
