@@ -45,6 +45,8 @@ MENDED = """## What was found and mended
 | a config whose group is a number, or lacks a key | mutations | r2s/stages/build.py |
 | a single row with 1e12 Nm, or a jump of a joint through radians in a millisecond, was taken | mutations | r2s/identification/checks.py |
 | an evaluations.csv with a number that is none, or without a column | mutations | r2s/reporting/trainings.py |
+| numbers in parameters.yaml that no arm has: a link without mass, friction that gives energy, a delay of days | mutations | r2s/identification/parameter_file.py |
+| a trial of tune was told as failed: its training, left running by the killed tune, was faster to take the folder than the one that went on | kills | r2s/stages/tune.py: it waits |
 | a posterior.npz with a damaged stream | mutations | r2s/identification/parameter_file.py |"""
 
 PINS = """## The pins

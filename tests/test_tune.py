@@ -105,7 +105,8 @@ def test_a_search_that_was_killed_goes_on(tmp_path):
     for k, row in trials.iterrows():
         steps = pd.read_csv(tmp_path / "train" / f"t_{k}" / "evaluations.csv")["env_steps"].tolist()
         assert steps == sorted(steps)
-        assert len(steps) == len(set(steps)) + (row["state"] == "complete"), "the end is evaluated once more, once"
+        again = len(steps) - len(set(steps))  # the end is evaluated once more; who is pruned there has that, too
+        assert again == 1 if row["state"] == "complete" else again in (0, 1)
     assert (folder / "study.db").is_file()
     assert "Against the grid" in (folder / "report.md").read_text()
     best = json.loads((folder / "summary.json").read_text())["best"]

@@ -147,9 +147,9 @@ def dynamics_of(robot, friction, inertia):
     for group, settings in (("friction", friction), ("inertia", inertia)):
         if not isinstance(settings, Mapping):
             raise UserError(f"{group}: {settings!r} is no group of settings")
-    if inertia.keys() != {"scale"}:
-        raise UserError(f"inertia: it has {choices(inertia) or 'nothing'}; allowed: scale")
-    check_words(nominal_dynamics, "inertia", inertia)
+    if "scale" not in inertia:
+        raise UserError(f"inertia: it has no scale; it has {choices(inertia) or 'nothing'}")
+    check_words(nominal_dynamics, "inertia", {"scale": inertia["scale"]})
     return called(nominal_dynamics, "friction", {**friction, "inertia_scale": inertia["scale"]}, robot)
 
 

@@ -251,6 +251,9 @@ def followed(study, one, measure):
         study.tell(one.trial, state=optuna.trial.TrialState.PRUNED)
         return True
     said = one.ended()
+    if "is still at it" in said or "is taken" in said:  # a training that a killed tune left running was faster
+        one.begin()
+        return False
     if status == 0:
         study.tell(one.trial, rows[-1][measure])
     elif status < 0 and one.begun < PATIENCE:  # the system ended it, as where memory is short
