@@ -1,15 +1,19 @@
 """2,000 recordings, files of run folders and command lines, each changed so that it is nonsense or damaged.
 
-Hypothesis draws them, from fixed seeds. Each is read in a process of its own, up to where a run folder would be made.
+Hypothesis draws them, from fixed seeds. Files are read here, a command is typed in a process of its own, up to where
+its run folder would be made.
 Three ends are good: one line that begins with `error:` and exit status 2; a command that may stand; a file whose
 content may stand, judged here by what it holds and not by the code that read it.
 """
 
+import contextlib
+import io
 import json
 import math
 import os
-import re
 import shutil
+import traceback
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -176,29 +180,26 @@ def drawn(kind: str, one: Callable, count: int) -> None:
     run()
 
 
-def judged(work: Callable[[], str], err: Path) -> tuple[str, str]:
-    """Do `work` in a process of its own; return how it ended and what it said.
+def judged(work: Callable[[], str]) -> tuple[str, str]:
+    """Do `work`; return how it ended and what it said.
 
     `work` returns "" where what was accepted may stand, else why it is nonsense.
     """
+    from r2s.errors import UserError
 
-    def said() -> None:
-        from r2s.errors import UserError
-
-        try:
-            print(f"accepted: {work()}")
-        except UserError as error:
-            text = str(error)
-            print(f"error: {text}")
-            os._exit(2 if "\n" not in text else 3)
-
-    status = ended(forked(said, err), 120.0)
-    text = err.read_text(errors="replace")
-    if status == 2 and one_line(text):
-        return "refused", text.strip()
-    if status == 0 and (found := re.search(r"^accepted: (.*)$", text, flags=re.M)):
-        return ("stands", "") if not found[1] else ("nonsense", found[1])
-    return "traceback", text[-1500:] or f"exit status {status}"
+    out = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(out), contextlib.redirect_stdout(out), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reason = work()
+    except UserError as error:
+        return ("refused" if "\n" not in str(error) else "traceback"), str(error)
+    except SystemExit as end:  # of a command
+        line = one_line(out.getvalue())
+        return ("refused", line) if end.code == 2 and line else ("traceback", out.getvalue())
+    except BaseException:
+        return "traceback", traceback.format_exc()[-1500:]
+    return ("nonsense", reason) if reason else ("stands", "")
 
 
 def mutate_recordings(at: Path, err: Path) -> list[dict]:
@@ -241,7 +242,7 @@ def mutate_recordings(at: Path, err: Path) -> list[dict]:
                     return "a speed or a torque that no joint has"
             return "" if may_stand else f"{what}: taken as right"
 
-        end, said = judged(work, err)
+        end, said = judged(work)
         rows.append({"kind": "recordings", "what": f"{suffix}: {what}", "end": end, "said": said})
 
     drawn("recordings", one, COUNTS["recordings"])
@@ -347,7 +348,7 @@ def mutate_files(at: Path, err: Path) -> list[dict]:
         else:
             content, what = damaged(draw, path.read_bytes())
             path.write_bytes(content)
-        end, said = judged(lambda: READ[name](folder, task), err)
+        end, said = judged(lambda: READ[name](folder, task))
         rows.append({"kind": "files", "what": f"{name}: {what}", "end": end, "said": said})
 
     drawn("files", one, COUNTS["files"])

@@ -11,6 +11,7 @@ from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
 
 HOLDS = ("command", "net")
+BEYOND = 1e4  # Nm, s/rad, rad/s: what a friction parameter cannot be
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ def nominal_dynamics(
         array = per_joint(name, value, robot.n, f"the {robot.n} joints of {robot.name}")
         if not np.all(np.isfinite(array)):
             raise UserError(f"{name}: {array.tolist()} has a value that is not finite")
+        if np.abs(array).max() > BEYOND:
+            raise UserError(f"{name}: {array.tolist()} has a value beyond any arm's; at most {BEYOND:g} is allowed")
         return array
 
     phi = np.stack([joints("friction.phi1", phi1), joints("friction.phi2", phi2)], -1)
