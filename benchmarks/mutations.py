@@ -90,7 +90,8 @@ def spoiled(draw, frame: pd.DataFrame) -> tuple[pd.DataFrame, str, bool]:
     if kind == "time":
         value = draw(st.sampled_from([math.nan, -1.0, 1e18, math.inf, 0.0]))
         out.loc[at, "t"] = value
-        return out, f"t is {value:g} at row {at}", False
+        # a row apart from all others in time is dropped, and where a clock starts anew so does a trajectory
+        return out, f"t is {value:g} at row {at}", value in (0.0, 1e18)
     if kind == "clock":
         factor = draw(st.sampled_from([1e3, 1e6, 1e9, -1.0, 0.0]))
         out["t"] *= factor
@@ -121,10 +122,15 @@ def spoiled(draw, frame: pd.DataFrame) -> tuple[pd.DataFrame, str, bool]:
         out[[f"tau_J{j}" for j in range(1, 8)]] = 0.0
         return out, "no torque", False
     if kind == "twice":
-        return pd.concat([out, out.iloc[at:]], ignore_index=True), f"rows from {at} on come twice", False
+        # from the first 0.1 s on it is a motion that was recorded twice
+        return pd.concat([out, out.iloc[at:]], ignore_index=True), f"rows from {at} on come twice", at <= 100
     swap = draw(st.sampled_from([(1, 2), (2, 4), (4, 6)]))
     names = {f"{x}{a}": f"{x}{b}" for x in ("q", "tau_J") for a, b in (swap, swap[::-1])}
-    return out.rename(columns=names), f"joints {swap[0]} and {swap[1]} changed places", False
+    return (
+        out.rename(columns=names),
+        f"joints {swap[0]} and {swap[1]} changed places",
+        swap == (1, 2),
+    )  # these move alike
 
 
 SPOILS = (
