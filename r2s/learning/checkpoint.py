@@ -75,7 +75,7 @@ def save_tensors(path: Path, content: dict[str, Any]) -> None:
         try:
             torch.save(content, part)
         except RuntimeError as error:  # so torch says it
-            if "PytorchStreamWriter" not in str(error):
+            if not any(words in str(error) for words in ("PytorchStreamWriter", "iostream error")):
                 raise
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
 
