@@ -78,7 +78,7 @@ def command(words: Sequence[str], at: Path = ROOT) -> Callable[[], None]:
     return work
 
 
-def ended(pid: int, limit_s: float = 600.0) -> int:
+def ended(pid: int, limit_s: float = 3600.0) -> int:
     """Wait for a process and return its exit status, negative for a signal; what takes longer than the limit ends."""
     until = time.monotonic() + limit_s
     while time.monotonic() < until:

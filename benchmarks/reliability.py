@@ -59,7 +59,7 @@ of known faults here; do so before an installation that others can reach."""
 
 NOT = """## What this run of the script did not come to
 
-The machine was shared and the time ended. Of three kills of tune one was done; of the places the first three; damaged
+The machine was shared and the time ended. Of three kills of tune two found a fault (a trial told as failed), and were not repeated after its mend; of the places the first three; damaged
 files and the other places are in the script and were not run to their end, nor were 600 command lines: 150 were, and the
 six that ended badly were mended and typed again, each one line. Of 700 files of run folders 473 were refused in one
 line and 227 may stand: no traceback, no nonsense. Of 700 recordings 586 were refused
