@@ -7,14 +7,19 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.stages.build import CONF, unread
+from r2s.stages.build import CONF, loaded, unread
 
-STAGES = ("train", "identify", "transfer", "compare", "pipeline")
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
+RESUMED = ("identify", "train", "tune")
+WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
+MOST_THREADS = 4096
+LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
@@ -31,6 +36,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
@@ -43,6 +49,10 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
             configs = [compose("config", job) for job in jobs]
         except (HydraException, OmegaConfBaseException, UnknownOption):
             raise _first_mistake(words, own, groups) from None
+        for cfg in configs:  # Hydra asks for it before the job does
+            root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
+            if isinstance(root, bool) or not isinstance(root, str | int | float):
+                raise UserError(f"root: {root} is not allowed; a folder is")
         for name in names:
             reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
             if reasons and all(reasons):
@@ -120,10 +130,16 @@ def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]],
     return UserError(f"{word}: {' '.join(str(error).split())}")
 
 
+def typed_in(folder):
+    """Return what the user typed for a run folder."""
+    words = loaded(folder / "overrides.yaml")
+    if any(not isinstance(w, str) for w in words) or isinstance(words, Mapping):
+        raise UserError(f"{folder / 'overrides.yaml'} is damaged: it is no list of KEY=VALUE")
+    return list(words)
+
+
 def resumed(cfg, overrides):
     """Return config and overrides of the run folder `resume=`, which then goes on where it stopped."""
-    from omegaconf import OmegaConf
-
     from r2s.runs import is_done
 
     folder = Path(cfg.resume)
@@ -132,19 +148,17 @@ def resumed(cfg, overrides):
         raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
     if extra := [o for o in overrides if not o.startswith("resume=")]:
         raise UserError(f"resume: a run goes on with its own config; leave out {' '.join(extra)}")
-    before = OmegaConf.load(folder / "config.yaml")
-    if before.stage not in ("identify", "train"):
-        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: identify, train")
+    before = loaded(folder / "config.yaml")
+    if before.stage not in RESUMED:
+        raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMED)}")
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
-    return before, OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml"))
+    return before, typed_in(folder)
 
 
 def is_there(cfg, overrides):
     """Return whether the run folder of this job is finished; where it was stopped, let the job go on in it."""
-    from omegaconf import OmegaConf
-
     from r2s.runs import is_done
 
     if not cfg.name:
@@ -157,7 +171,7 @@ def is_there(cfg, overrides):
         beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
         return {w for w in words if not w.startswith(beside)}
 
-    before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
+    before = typed(typed_in(folder))
     if other := sorted(before ^ typed(overrides)):
         raise UserError(f"only_missing: {folder} was made otherwise ({', '.join(other)}); give another name=")
     if is_done(folder):
@@ -167,26 +181,57 @@ def is_there(cfg, overrides):
     return False
 
 
+def check_words(cfg):
+    """Check the options that name a file or folder; a number is a name, too."""
+    for key in WORDS:
+        value = cfg[key]
+        if value is not None and (isinstance(value, bool) or not isinstance(value, str | int | float) or value == ""):
+            raise UserError(f"{key}: {value!r} is not allowed; a name or null is")
+        if value is not None:
+            cfg[key] = str(value)
+    if cfg.root is None:
+        raise UserError("root: null is not allowed; a folder is")
+    if not isinstance(cfg.only_missing, bool):
+        raise UserError(f"only_missing: {cfg.only_missing!r} is not allowed; true and false are")
+
+
 def run_job(cfg):
     """Call the stage of one composed config; a mistake ends the job (`failed`)."""
     from hydra.core.hydra_config import HydraConfig
-    from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
-    overrides = list(HydraConfig.get().overrides.task)
-    try:
+    with said_in_one_line():
+        overrides = list(HydraConfig.get().overrides.task)
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
         check_number("seed", cfg.seed, "[0, inf)", whole=True)
-        check_number("threads", cfg.threads, "[0, inf)", whole=True)
+        check_number("threads", cfg.threads, f"[0, {MOST_THREADS}]", whole=True)
+        check_words(cfg)
         if cfg.resume:
             cfg, overrides = resumed(cfg, overrides)
         elif cfg.only_missing and is_there(cfg, overrides):
             return
         getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
-    except (UserError, FloatingPointError, InterpolationResolutionError) as error:
+
+
+@contextmanager
+def said_in_one_line():
+    """End a job (`failed`) with one line where a mistake, a full disk or Ctrl-C ends what is done in here."""
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+    try:
+        yield
+    except (UserError, FloatingPointError) as error:
         failed(" ".join(str(error).split()))
     except MissingMandatoryValue as error:
         failed(f"{error.full_key} must be given: {error.full_key}=...")
+    except OmegaConfBaseException as error:
+        failed(" ".join(str(error).split()))
+    except OSError as error:  # a full disk, a folder that may not be written
+        if error.errno is None:
+            raise
+        failed(f"{error.strerror}{f': {error.filename}' if error.filename else ''}; what was whole before is still")
+    except MemoryError as error:
+        failed(f"not enough memory: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
         sys.exit(130)
@@ -206,8 +251,13 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
+                os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints what a launcher raises, and exits
             try:
                 job()
+            except Exception as error:
+                if type(error).__name__ != "TerminatedWorkerError":  # joblib's
+                    raise
+                raise UserError(LOST) from None
             finally:
                 end_workers()
             lines = Path(folder) / "failed.txt"
@@ -216,6 +266,8 @@ def main():
                 sys.exit(stop(f"{count} job{'s' * (count > 1)} of the sweep failed, see above; the others are done"))
     except UserError as error:
         sys.exit(stop(error))
+    except OSError as error:  # of Hydra, before any job
+        sys.exit(stop(f"{error.strerror}{f': {error.filename}' if error.filename else ''}"))
     finally:
         end_workers()
 

@@ -1,22 +1,28 @@
 """Run folders: runs/<stage>/<name>/ with the config, who ran what where, tables that grow, and the last word.
 
-meta.json says `running` from the first moment, so a killed run is seen for what it was.
+meta.json says `running` from the first moment, so a killed run is seen for what it was. A folder appears whole, and
+belongs to one process at a time: the lock on its overrides.yaml ends with the process, however that ends.
 """
 
 import csv
+import errno
+import fcntl
 import hashlib
 import json
 import math
 import os
 import platform
 import re
+import shutil
 import subprocess
 import time
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -42,10 +48,14 @@ class Run:
 
     Args:
         root: where run folders live. stage, name: runs/<stage>/<name>; the name gets a number where it is taken.
+        only: the name gets no number; a name that is taken is a mistake.
         config: the composed config as YAML. overrides: what the user typed.
         seed: of the run. threads: as asked for.
         inputs: files it reads, for their sha256. parents: run folders it starts from.
         resume: a run folder to go on in, instead of making one; its inputs must be what they were.
+
+    Raises:
+        UserError: the folder cannot be made, another process has it, or what is in it cannot be gone on with.
     """
 
     def __init__(
@@ -61,10 +71,10 @@ class Run:
         inputs: Iterable[str | Path] = (),
         parents: Iterable[str | Path] = (),
         resume: str | Path | None = None,
+        only: bool = False,
     ):
         overrides = list(overrides)
-        self.folder = Path(resume) if resume else _make_folder(root / stage, name or default_name(overrides))
-        self._began = time.time()
+        self._began = time.monotonic()  # the clock of the wall may jump
         self._tables: dict[str, Any] = {}
         self._meta: dict[str, Any] = {
             "status": "running",
@@ -81,23 +91,51 @@ class Run:
             "parents": [str(p) for p in parents],
         }
         if resume:
-            self._check_inputs(json.loads((self.folder / "meta.json").read_text())["inputs"])
-        (self.folder / "config.yaml").write_text(config)
-        (self.folder / "overrides.yaml").write_text("".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n")
-        self._write_meta()
+            self.folder = Path(resume)
+            self._lock = _lock(self.folder)
+            try:
+                self._check_inputs(read_meta(self.folder)["inputs"])
+                with whole(self.folder / "config.yaml") as part:
+                    part.write_text(config)
+                self._write_meta()
+            except BaseException:
+                os.close(self._lock)
+                raise
+            return
+        parent = root / stage
+        try:
+            self.folder = _begin(parent)
+            try:
+                (self.folder / "config.yaml").write_text(config)
+                typed = "".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n"
+                (self.folder / "overrides.yaml").write_text(typed)
+                self._write_meta()
+                self._lock = _lock(self.folder)
+                self.folder = _take_name(self.folder, parent, name or default_name(overrides), only)
+            except BaseException:
+                shutil.rmtree(self.folder, ignore_errors=True)
+                raise
+        except OSError as error:
+            raise UserError(f"root: no run folder can be made in {parent}: {error.strerror or error}") from None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
-        for _, file in self._tables.values():
-            file.close()
-        self._meta["wall_clock_s"] = round(time.time() - self._began, 3)
+        self._meta["wall_clock_s"] = round(time.monotonic() - self._began, 3)
         interrupted = kind is KeyboardInterrupt
         self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
-        self._write_meta()
+        try:
+            for _, file in self._tables.values():
+                file.close()
+            self._write_meta()
+        except OSError:  # the disk is full: meta.json stays as it was, as that of a killed run does
+            if error is None:
+                raise
+        finally:
+            os.close(self._lock)
 
     def _check_inputs(self, before: Mapping[str, str]) -> None:
         for path, digest in self._meta["inputs"].items():
@@ -108,6 +146,9 @@ class Run:
         """Return the arrays that `make` returns, or that it returned when this run did this step before.
 
         They are kept in checkpoints/<name>.npz, so that a resumed run goes on after its last whole step.
+
+        Raises:
+            UserError: the file is not what was written; the step is done again where it is removed.
         """
         path = self.folder / "checkpoints" / f"{name.replace(' ', '_')}.npz"
         if not path.is_file():
@@ -115,8 +156,7 @@ class Run:
             path.parent.mkdir(exist_ok=True)
             with whole(path) as part:
                 np.savez(part, **done)  # type: ignore[arg-type]
-        with np.load(path) as file:
-            return {k: file[k] for k in file.files}
+        return load_arrays(path)
 
     def figure(self, name: str) -> Path:
         """Return the path of a figure, figures/<name>.png."""
@@ -135,16 +175,32 @@ class Run:
         file.flush()
 
     def rewind(self, table: str, column: str, most: float) -> list[dict[str, float]]:
-        """Keep the rows of <table>.csv whose `column` is at most that, go on after them, and return them."""
+        """Keep the rows of <table>.csv whose `column` is at most that, go on after them, and return them.
+
+        A last row that was cut off is none. The rows stay as they were written.
+        """
         path = self.folder / f"{table}.csv"
         if not path.is_file():
             return []
         with open(path, newline="") as file:
-            rows = [{k: float(v) if v else math.nan for k, v in row.items()} for row in csv.DictReader(file)]
-        path.unlink()
-        kept = [row for row in rows if row[column] <= most]
-        for row in kept:
-            self.log(table, {k: int(v) if v.is_integer() else v for k, v in row.items()})
+            lines = file.readlines()
+        if lines and not lines[-1].endswith("\n"):
+            del lines[-1]
+        if not lines:
+            return []
+        head = next(csv.reader(lines[:1]))
+        try:
+            rows = [[float(v) if v else math.nan for v in row] for row in csv.reader(lines[1:])]
+            kept = [dict(zip(head, row, strict=True)) for row in rows if row[head.index(column)] <= most]
+            # what a run that had come to its end evaluated once more, at the same step, comes again
+            last = next((k for k, row in enumerate(kept) if row[column] == most), len(kept))
+            del kept[last + 1 :]
+        except ValueError as error:
+            raise UserError(f"resume: {path} is damaged ({error})") from None
+        with whole(path) as part, open(part, "w", newline="") as file:
+            file.writelines(lines[: 1 + len(kept)])
+        file = open(path, "a", newline="")  # noqa: SIM115 (closed in __exit__)
+        self._tables[table] = csv.DictWriter(file, head), file
         return kept
 
     def summary(self, document: Mapping[str, Any]) -> None:
@@ -169,27 +225,89 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         part.write_text(json.dumps(finite(document), indent=1) + "\n")
 
 
+def load_arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of a file of checkpoints.
+
+    Raises:
+        UserError: it is not what a run wrote.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {k: file[k] for k in file.files}
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        KeyError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"resume: {path} is damaged ({seen}); remove it, and this step is done again") from None
+
+
 def read_summary(folder: str | Path, what: str) -> dict[str, Any]:
     """Return the summary.json of a run folder; `what` names it in the UserError when there is none."""
     path = Path(folder) / "summary.json"
     if not path.is_file():
         raise UserError(f"{what}: {folder} is no finished run folder (it has no summary.json)")
-    return json.loads(path.read_text())
+    return _read_json(path)
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """Return the meta.json of a run folder.
+
+    Raises:
+        UserError: it is not what a run writes.
+    """
+    meta = _read_json(folder / "meta.json")
+    if not {"status", "inputs"} <= meta.keys():
+        raise UserError(f"{folder / 'meta.json'} is not of a run: it has no status or no inputs")
+    return meta
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not isinstance(document, dict):
+        raise UserError(f"{path} is damaged: it holds no names and values")
+    return document
 
 
 def is_done(folder: Path) -> bool:
-    """Return whether a run is finished; raises UserError if a process of this computer still writes into it."""
-    meta = json.loads((folder / "meta.json").read_text())
-    process = meta.get("process", {})
-    if meta["status"] != "running" or process.get("host") != platform.node() or process["pid"] == os.getpid():
-        return meta["status"] == "done"
+    """Return whether a run is finished; raises UserError if a process still writes into it."""
+    meta = read_meta(folder)
+    if meta["status"] == "running":
+        os.close(_lock(folder))
+    return meta["status"] == "done"
+
+
+def _lock(folder: Path) -> int:
+    """Take a run folder for this process; return what holds it, a file descriptor to close.
+
+    The system lets go of it when the process ends. A file system without locks (some of networks) refuses none.
+
+    Raises:
+        UserError: another process has it.
+    """
+    path = folder / "overrides.yaml"
     try:
-        os.kill(process["pid"], 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass  # another user's
-    raise UserError(f"{folder}: process {process['pid']} is still at it; wait for it, or stop it")
+        lock = os.open(path, os.O_RDWR)  # NFS locks only what may be written
+    except OSError as error:
+        raise UserError(f"resume: {path} cannot be opened: {error.strerror}") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        process = read_meta(folder).get("process", {})
+        who = f"process {process.get('pid')} of {process.get('host')}"
+        raise UserError(f"{folder}: {who} is still at it; wait for it, or stop it") from None
+    except OSError:
+        pass
+    return lock
 
 
 def default_name(overrides: Iterable[str]) -> str:
@@ -205,18 +323,29 @@ def sha256(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _make_folder(parent: Path, name: str) -> Path:
-    if not re.fullmatch(r"[^/\\]+", name):
-        raise UserError(f"name: '{name}' cannot be a folder's name")
+def _begin(parent: Path) -> Path:
+    """Return a new folder in `parent` that is no run folder yet: a process that is killed now leaves none."""
     parent.mkdir(parents=True, exist_ok=True)
-    for k in range(1, 1000):
-        folder = parent / (name if k == 1 else f"{name}_{k}")
+    folder = parent / f".{os.getpid()}_{time.time_ns()}"
+    folder.mkdir()
+    return folder
+
+
+def _take_name(folder: Path, parent: Path, name: str, only: bool) -> Path:
+    """Give a folder its name, the first that is free of name, name_2, ...; with `only` the name itself."""
+    if not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name.startswith("."):
+        raise UserError(f"name: {name!r} cannot be a folder's name")
+    for k in range(1, 2 if only else 1000):
+        final = parent / (name if k == 1 else f"{name}_{k}")
         try:
-            folder.mkdir()
-        except FileExistsError:
+            os.rename(folder, final)  # over an empty folder, too; whoever comes second finds it full
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise
             continue
-        return folder
-    raise UserError(f"name: {parent / name} and its numbered followers are all taken")
+        return final
+    taken = "is" if only else "and its numbered followers are all"
+    raise UserError(f"name: {parent / name} {taken} taken")
 
 
 def _git() -> dict[str, Any]:

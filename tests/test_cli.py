@@ -1,5 +1,6 @@
 """The front door: the README's own commands at toy size, and a user's mistakes."""
 
+import fcntl
 import json
 import multiprocessing
 import os
@@ -530,9 +531,11 @@ def test_names_that_are_taken_get_one_line(tmp_path):
     meta = tmp_path / "train" / "a" / "meta.json"
     process = {"host": platform.node(), "pid": os.getpid()}
     meta.write_text(json.dumps(json.loads(meta.read_text()) | {"status": "running", "process": process}))
-    done = r2s(f"resume={tmp_path / 'train' / 'a'}")
+    with open(meta.with_name("overrides.yaml"), "r+") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)  # as a run does
+        done = r2s(f"resume={tmp_path / 'train' / 'a'}")
     assert done.returncode == 2
-    assert re.search(rf"process {os.getpid()} is still at it", done.stderr)
+    assert re.search(rf"process {os.getpid()} of .* is still at it", done.stderr)
 
 
 def test_the_same_policy_in_dart(trained, root):

@@ -9,11 +9,15 @@ from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
+SPIKE = 5.0  # times the fastest joint and the largest torque: what no sensor's noise reaches
+JUMP = 0.05  # rad, that q may jump beside, as encoders do
+
 
 def check_recording(robot: Robot, recording: Recording) -> None:
     """Raise UserError if a user's recording does not fit the arm (`check_motion`) or is in other units."""
     check_motion(robot, recording)
     check_numbers(robot, recording)
+    _check_spikes(robot, recording)
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
@@ -27,6 +31,25 @@ def check_motion(robot: Robot, recording: Recording) -> None:
             f"the recording has not enough motion to identify anything: {recording.duration:.2f} s in which the "
             f"joint that moves most moves {moved.max():.4f} rad; at least 1 s and {MOVED:g} rad are needed"
         )
+
+
+def _check_spikes(robot: Robot, recording: Recording) -> None:
+    """Raise UserError where a row has what no row of this arm can have, as a damaged file does."""
+    r = recording
+    speed = SPIKE * robot.dq_max
+    jumps = np.zeros_like(r.q)
+    for s in r.stretches:
+        step = np.abs(np.diff(r.q[s], axis=0)) - JUMP
+        jumps[s][1:] = step / (np.diff(r.t[s])[:, None] * speed)
+    seen = {"q": (jumps, "rad after a jump"), "dq": (np.abs(r.dq) / speed, "rad/s")}
+    seen["tau"] = np.abs(r.tau) / (SPIKE * robot.tau_max), "Nm"
+    for field, (share, unit) in seen.items():
+        row, j = np.unravel_index(share.argmax(), share.shape)
+        if share[row, j] > 1:
+            raise UserError(
+                f"the recording: {field} of joint {j + 1} is {getattr(r, field)[row, j]:.4g} {unit} at row {row}, "
+                f"more than {SPIKE:g} times what {robot.name} can: is the file damaged?"
+            )
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:

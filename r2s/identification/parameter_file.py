@@ -1,6 +1,7 @@
 """parameters.yaml and posterior.npz: what carries an identification to the other stages."""
 
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from r2s.errors import UserError, nearest
+from r2s.errors import UserError, check_number, nearest
+from r2s.files import whole
 from r2s.identification.parameters import (
     TIMING,
     WHOLE_ARM,
@@ -72,10 +74,13 @@ def save_parameters(
     rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for the reader; parameters are loaded
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
-    np.savez_compressed(path.with_name("posterior.npz"), names=np.array(space.names), samples=found.samples)
+    with whole(path.with_name("posterior.npz")) as part:  # first: parameters.yaml says that both are there
+        np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
+    with whole(path) as part:
+        part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
+MOST_NM, FARTHEST_M = 1e4, 10.0  # of friction and offsets; of a link's centre from its joint
 FIXED = ("phi", "offset", "inertia")
 # files of before may lack them: then they are the robot's, or 0
 LATER = ("mass", "com", "armature", "load", "drag", "gain")
@@ -131,7 +136,25 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
     )
     everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}
     space = parameter_space(robot, nominal, everything)
-    return space, np.concatenate([numbers(k, found[k]["value"], space.size(k)) for k in space.blocks])
+    x = np.concatenate([numbers(k, found[k]["value"], space.size(k)) for k in space.blocks])
+    _check_physical(space.dynamics(x))
+    return space, x
+
+
+def _check_physical(d: Dynamics) -> None:
+    """Raise ValueError where these are the dynamics of no arm: a damaged file may hold any number."""
+    for name in ("dq_min", "delay", "lag"):
+        check_number(name, float(getattr(d, name)), "[0, 10]" if name == "dq_min" else "[0, 1]")
+    fast = np.ones(d.phi.shape[:-1])
+    gives = (d.friction(fast) < 0) | (d.friction(-fast) > 0) | (d.load < 0) | (d.armature < 0)
+    edges = (d.breakaway[..., 0] > 0) | (d.breakaway[..., 1] < 0)
+    no_body = (d.mass <= 0) | (np.linalg.eigvalsh(d.inertia)[..., 0] <= 0) | (np.abs(d.com).max(-1) > FARTHEST_M)
+    beyond = (np.abs(d.offset) > MOST_NM) | (np.abs(d.friction(fast)) > MOST_NM) | (np.abs(d.gain) >= 1)
+    reasons = {"friction or a rotor that gives energy": gives, "edges of breakaway on one side": edges}
+    reasons |= {"a link that no body can be": no_body, "an offset, friction or a gain beyond any arm": beyond}
+    for reason, joints in reasons.items():
+        if joints.any():
+            raise ValueError(f"joint {int(joints.argmax()) + 1} has {reason}")
 
 
 def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
@@ -147,11 +170,20 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
             f"dr=identified: no posterior.npz at {path.parent}; calibration= must be a run of stage=identify"
         )
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             names, samples = file["names"].tolist(), file["samples"]
         if samples.shape != (len(samples), len(names)):
             raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")
-    except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        OSError,
+        EOFError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         seen = " ".join(str(error).split())
         raise UserError(f"dr=identified: {path} is not a posterior.npz of r2s ({seen})") from None
     if names != space.names:

@@ -4,6 +4,8 @@ The transitions are written once, as they come; the state names how many of them
 checkpoints leaves nothing half done. Tensors, numbers and names only: torch.load(weights_only=True) reads it all.
 """
 
+import errno
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
+from r2s.errors import UserError
 from r2s.files import whole
 
 
@@ -26,7 +29,7 @@ class Checkpoint:
     def env_steps(self) -> int:
         """Environment steps that it holds; 0 where there is none."""
         path = self.folder / "state.pt"
-        return torch.load(path, weights_only=True)["seen"] if path.is_file() else 0
+        return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 
     def save(self, state: dict[str, Any], replay: TensorDictReplayBuffer, seen: int, size: int) -> None:
         """Write the state and the transitions since the last call.
@@ -40,19 +43,23 @@ class Checkpoint:
             rows, self._chunks = torch.arange(self._kept, seen) % size, [*self._chunks, chunk]
         else:  # all that was kept has been overwritten
             rows, self._chunks = torch.arange(size), [chunk]
-        _write(self.folder / chunk, replay[rows].to_dict())
-        _write(self.folder / "state.pt", state | {"seen": seen, "chunks": self._chunks})
+        save_tensors(self.folder / chunk, replay[rows].to_dict())
+        save_tensors(self.folder / "state.pt", state | {"seen": seen, "chunks": self._chunks})
         self._kept = seen
 
     def load(self, replay: TensorDictReplayBuffer, size: int) -> dict[str, Any] | None:
-        """Return the state that was saved last, and fill `replay` with what it had seen; None where there is none."""
+        """Return the state that was saved last, and fill `replay` with what it had seen; None where there is none.
+
+        Raises:
+            UserError: a file of it is missing or damaged.
+        """
         path = self.folder / "state.pt"
         if not path.is_file():
             return None
-        state = torch.load(path, weights_only=True)
+        state = load_tensors(path, "resume")
         self._kept, self._chunks = state["seen"], state["chunks"]
         for chunk in self._chunks:
-            rows = torch.load(self.folder / chunk, weights_only=True)
+            rows = load_tensors(self.folder / chunk, "resume")
             replay.extend(TensorDict(rows, batch_size=[len(rows["action"])]))
         replay.writer.load_state_dict({"_cursor": self._kept % size})
         return state
@@ -62,7 +69,28 @@ class Checkpoint:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
-    """Write a file that appears only once it is whole."""
+def save_tensors(path: Path, content: dict[str, Any]) -> None:
+    """Write a file that appears only once it is whole; raises OSError where there is no room for it."""
     with whole(path) as part:
-        torch.save(content, part)
+        try:
+            torch.save(content, part)
+        except RuntimeError as error:  # so torch says it
+            if not any(words in str(error) for words in ("PytorchStreamWriter", "iostream error")):
+                raise
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+
+
+def load_tensors(path: Path, what: str) -> dict[str, Any]:
+    """Return what `save_tensors` wrote: tensors, numbers and names, never a pickled object.
+
+    Raises:
+        UserError: the file is missing or damaged; `what` names it.
+    """
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception as error:  # reading what is damaged may fail in any way
+        seen = " ".join(str(error).split())[:100]
+        raise UserError(f"{what}: {path} cannot be read, it is missing or damaged ({seen})") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{what}: {path} is not what r2s wrote")
+    return content

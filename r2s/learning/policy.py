@@ -9,6 +9,8 @@ from pathlib import Path
 import torch
 
 from r2s.errors import UserError
+from r2s.files import whole
+from r2s.learning.checkpoint import load_tensors, save_tensors
 from r2s.learning.networks import Actor, Normalizer, Policy
 from r2s.physics.robot import Robot
 from r2s.tasks.task import Task
@@ -24,22 +26,24 @@ def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
 def save_policy(folder: Path, policy: Policy) -> None:
     """Write policy.pt: the state dict and the sizes that it fits."""
     linear = [m.out_features for m in policy.actor.body if isinstance(m, torch.nn.Linear)]
-    torch.save({"state": policy.state_dict(), "hidden": linear[:-1]}, folder / "policy.pt")
+    save_tensors(folder / "policy.pt", {"state": policy.state_dict(), "hidden": linear[:-1]})
 
 
 def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
     """Return the policy of a run folder.
 
     Raises:
-        UserError: no policy.pt there, or one of another arm.
+        UserError: no policy.pt there, a damaged one, or one of another arm.
     """
     path = Path(folder) / "policy.pt"
     if not path.is_file():
         raise UserError(f"policy: no policy.pt in {folder}")
-    saved = torch.load(path, weights_only=True)
-    policy = make_policy(robot, task, tuple(saved["hidden"]))
+    saved = load_tensors(path, "policy")
     try:
+        policy = make_policy(robot, task, tuple(saved["hidden"]))
         policy.load_state_dict(saved["state"])
+    except KeyError as error:
+        raise UserError(f"policy: {path} is not what r2s wrote: it has no {error}") from None
     except RuntimeError:
         raise UserError(f"policy: {path} does not fit {robot.name} with {robot.n} joints") from None
     return policy.eval()
@@ -55,21 +59,29 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
     example = torch.zeros(2, len(policy.normalizer.mean))
     quiet = contextlib.redirect_stdout(io.StringIO())
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings(), quiet:
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals
-        torch.onnx.export(
-            policy,
-            (example,),
-            str(path),
-            input_names=["observation"],
-            output_names=["torque"],
-            dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
-            external_data=False,
-            verbose=False,
-        )
-    model = onnx.load(path)
+    with whole(path) as part:
+        with warnings.catch_warnings(), quiet:
+            warnings.simplefilter("ignore")  # the exporter warns of its own internals
+            torch.onnx.export(
+                policy,
+                (example,),
+                str(part),
+                input_names=["observation"],
+                output_names=["torque"],
+                dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
+                external_data=False,
+                verbose=False,
+            )
+        model = onnx.load(part)
+        for key, value in _facts(policy, robot, task).items():
+            model.metadata_props.add(key=key, value=value)
+        onnx.save(model, part)
+
+
+def _facts(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
+    """Return what a driver has to know."""
     arm = robot.model(gravity=False)
-    facts = {
+    return {
         "robot": robot.name,
         "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
         "observation": task.observed,
@@ -83,6 +95,3 @@ def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
         "low_pass_hz": str(task.cutoff_hz),
         "torque": "without gravity, before low-pass, clip and rate limit",
     }
-    for key, value in facts.items():
-        model.metadata_props.add(key=key, value=value)
-    onnx.save(model, path)

@@ -22,7 +22,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.errors import UserError, check_number
-from r2s.learning.checkpoint import Checkpoint
+from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
@@ -247,7 +247,7 @@ def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any],
     """Write what led to the error and return one that says so."""
     if path is None:
         return FloatingPointError(f"{error}, after {when}")
-    torch.save(_tensors(where), path)
+    save_tensors(path, _tensors(where))
     return FloatingPointError(f"{error}, after {when}; replay it with r2s.learning.train.replay_dump on {path}")
 
 
@@ -263,7 +263,7 @@ def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Pol
     """
     if not path.is_file():
         raise UserError(f"{path} is no dump of a training")
-    where = torch.load(path, weights_only=True)
+    where = load_tensors(path, "dump")
     if "algo" in where:
         algo.load_state_dict(where["algo"])
         if "batch" not in where:

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
 
 HOLDS = ("command", "net")
+BEYOND = 1e4  # Nm, s/rad, rad/s: what a friction parameter cannot be
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ def nominal_dynamics(
         array = per_joint(name, value, robot.n, f"the {robot.n} joints of {robot.name}")
         if not np.all(np.isfinite(array)):
             raise UserError(f"{name}: {array.tolist()} has a value that is not finite")
+        if np.abs(array).max() > BEYOND:
+            raise UserError(f"{name}: {array.tolist()} has a value beyond any arm's; at most {BEYOND:g} is allowed")
         return array
 
     phi = np.stack([joints("friction.phi1", phi1), joints("friction.phi2", phi2)], -1)
@@ -133,6 +136,7 @@ def nominal_dynamics(
     high = joints("friction.breakaway_positive", breakaway_positive)
     if np.any(low > 0) or np.any(high < 0):
         raise UserError("friction.breakaway: the negative edges must be <= 0 and the positive ones >= 0")
+    check_number("friction.dq_min", dq_min, "[0, 10]")
     named = SIGMOID if family == "auto" else friction_family(family)
     phi = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1)
     return replace(

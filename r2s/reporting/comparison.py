@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 
 from r2s.reporting.statistics import improvement, interquartile_mean, interval
-from r2s.reporting.trainings import Trained
+from r2s.reporting.trainings import MEASURES, Trained
 
-MEASURES = ("success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_paper")
 LOWER_IS_BETTER = ("distance_median_m",)
 
 

@@ -211,7 +211,7 @@ def pipeline(
             if where != "mujoco":
                 episodes[f"{where}, {label} model"] = unstack(path)
     curves = {label: pd.read_csv(folder / "evaluations.csv") for label, folder in trained.items()}
-    with np.load(identified / "torque.npz") as saved:
+    with np.load(identified / "torque.npz", allow_pickle=False) as saved:
         predicted = {k: saved[k] for k in ("nominal", "identified")}
         overlay = Overlay(saved["t"], saved["measured"], predicted)
     title = "torque of validation motion"
@@ -243,5 +243,5 @@ def first(episodes: Episodes) -> list[Episode]:
 
 def unstack(path: Path) -> list[Episode]:
     """Return the first few of the episodes that `transfer` saved."""
-    with np.load(path) as saved:
+    with np.load(path, allow_pickle=False) as saved:
         return first(Episodes(**saved))

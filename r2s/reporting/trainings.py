@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -14,6 +15,7 @@ from r2s.errors import UserError
 # parts of a config that a training reads, beside its seed: runs that agree in them are seeds of one group
 READ = ("algo", "budget", "calibration", "dr", "friction", "inertia", "reward")
 ALIKE = ("robot", "task")  # parts without whose agreement nothing can be compared
+MEASURES = ("success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_paper")
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
 BUDGETS_APART = 2.0  # how many times the smaller budget the larger one may be
 UNFINISHED = {"running": "unfinished", "stopped": "stopped", "failed": "failed"}
@@ -100,6 +102,8 @@ def _read(folder: Path) -> Trained:
     curve = pd.read_csv(folder / "evaluations.csv")
     if curve.empty:
         raise ValueError("no evaluation")
+    if not np.isfinite(curve[["env_steps", "wall_clock_s", *MEASURES]].astype(float).to_numpy()).all():
+        raise ValueError("an evaluation that is not finite")
     return Trained(
         folder,
         int(config["seed"]),

@@ -47,17 +47,18 @@ def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
     Raises:
         UserError: there is no such part, or not with these arguments.
     """
+    make = target(node, group)
     settings = plain(node)
     settings = {k: v for k, v in settings.items() if k not in ("_target_", "name", *beside)}
-    return called(target(node, group), group, settings, *given)
+    return called(make, group, settings, *given)
 
 
 def target(node: Any, group: str) -> Callable[..., Any]:
     """Return what a config node's `_target_` names: a class or a function of an importable module."""
     from hydra.utils import get_object
 
-    path = node.get("_target_")
-    if not path:
+    path = node.get("_target_") if isinstance(node, Mapping) else None
+    if not isinstance(path, str) or not path:
         raise UserError(f"{group}: its yaml has no _target_, the dotted path of what makes it")
     try:
         return get_object(path)
@@ -143,15 +144,20 @@ def dynamics_of(robot, friction, inertia):
     """Return the dynamics that a file of conf/friction and one of conf/inertia describe."""
     from r2s.physics.dynamics import nominal_dynamics
 
-    check_words(nominal_dynamics, "friction", friction)
+    for group, settings in (("friction", friction), ("inertia", inertia)):
+        if not isinstance(settings, Mapping):
+            raise UserError(f"{group}: {settings!r} is no group of settings")
+    if "scale" not in inertia:
+        raise UserError(f"inertia: it has no scale; it has {choices(inertia) or 'nothing'}")
     check_words(nominal_dynamics, "inertia", {"scale": inertia["scale"]})
-    return nominal_dynamics(robot, **friction, inertia_scale=inertia["scale"])
+    return called(nominal_dynamics, "friction", {**friction, "inertia_scale": inertia["scale"]}, robot)
 
 
 def make_task(cfg):
     """Return conf/task; its lists are tuples there, a task is a fixed thing."""
+    make = target(cfg.task, "task")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
-    return called(target(cfg.task, "task"), "task", settings)
+    return called(make, "task", settings)
 
 
 def make_draw(cfg, robot, center):
@@ -253,6 +259,7 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         inputs=inputs,
         parents=parents,
         resume=cfg.resume,
+        only=cfg.only_missing,
     )
 
 
@@ -270,6 +277,22 @@ def console():
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 110)
+
+
+def loaded(path):
+    """Return a YAML file of a run folder as a config.
+
+    Raises:
+        UserError: it cannot be read, or is no YAML.
+    """
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return OmegaConf.load(path)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
 
 
 def set_threads(cfg):

@@ -165,14 +165,17 @@ def keep_calibration(cfg, folder):
     """Copy what was identified into the run folder: it transfers without the one that it came from."""
     import shutil
 
+    from r2s.files import whole
+
     if not cfg.calibration or (folder / CALIBRATION[0]).is_file():
         return
     source = Path(cfg.calibration)
-    for name in CALIBRATION:
+    for name in reversed(CALIBRATION):  # where the first is, all are
         path = source / name if source.is_dir() else source.with_name(name)
         path = source if name == CALIBRATION[0] and not source.is_dir() else path
         if path.is_file():
-            shutil.copyfile(path, folder / name)
+            with whole(folder / name) as part:
+                shutil.copyfile(path, part)
 
 
 def title(cfg):

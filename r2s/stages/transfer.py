@@ -7,6 +7,7 @@ from r2s.errors import UserError, check_number, nearest
 from r2s.stages.build import (
     console,
     is_learner,
+    loaded,
     make_controller,
     make_draw,
     make_dynamics,
@@ -36,14 +37,12 @@ def trained_config(cfg):
     Raises:
         UserError: it is no finished training.
     """
-    from omegaconf import OmegaConf
-
     source = Path(cfg.policy) if cfg.policy else None
     if source is None or not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
         names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
         near = nearest(source.name, names) if source else ""
         raise UserError(f"policy: '{cfg.policy}' is no finished run folder of stage=train{near}")
-    trained = OmegaConf.load(source / "config.yaml")
+    trained = loaded(source / "config.yaml")
     if trained.stage != "train":
         raise UserError(f"policy: {source} is a run of stage={trained.stage}; allowed: train")
     if trained.calibration:

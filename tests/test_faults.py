@@ -1,0 +1,202 @@
+"""A run folder holds data and says the truth of itself, whatever happens; benchmarks/faults.py does worse to it."""
+
+import ast
+import fcntl
+import json
+import os
+import re
+import shutil
+import tomllib
+from importlib.metadata import PackageNotFoundError, requires
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+from packaging.requirements import Requirement
+
+from r2s.errors import UserError
+from r2s.learning.checkpoint import load_tensors, save_tensors
+from r2s.runs import Run, is_done, load_arrays, read_summary
+
+SOURCES = [*sorted((ROOT / "r2s").rglob("*.py")), *sorted((ROOT / "hydra_plugins").glob("*.py")), ROOT / "run.py"]
+NEVER = {
+    "pickle.load",
+    "pickle.loads",
+    "pickle.Unpickler",
+    "joblib.load",
+    "pd.read_pickle",
+    "dill.load",
+    "eval",
+    "exec",
+}
+NEVER |= {"yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.jit.load", "marshal.loads", "shelve.open"}
+ALWAYS = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False)}
+SERVES = {"bind", "serve_grpc", "serve_web", "serve_web_viewer", "HTTPServer", "ThreadingHTTPServer", "create_server"}
+NO_SOCKET = ("batch", "_batch", "inspect.signature(make)")  # whose bind is another
+HOSTS = ("self.address", "candidate", "'127.0.0.1'", "LOOPBACK")  # the first two: r2s/arm/emulator/server.py checks
+
+
+def calls(path):
+    """Return (name, call) of every call in a file: ("np.load", node)."""
+    tree = ast.parse(path.read_text())
+    return [(ast.unparse(node.func), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_nothing_that_is_read_runs(path):
+    """No pickle is loaded, and what could load one is told not to."""
+    for name, call in calls(path):
+        assert name not in NEVER, f"{path}:{call.lineno}: {name}"
+        if name in ALWAYS:
+            key, value = ALWAYS[name]
+            told = {k.arg: ast.literal_eval(k.value) for k in call.keywords if isinstance(k.value, ast.Constant)}
+            assert told.get(key) is value, f"{path}:{call.lineno}: {name} without {key}={value}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_servers_listen_on_loopback_only(path):
+    """What binds a socket or serves says which address, and that is one of this machine alone."""
+    assert not re.search(r"""["'](0\.0\.0\.0|::)["']""", path.read_text())
+    for name, call in calls(path):
+        owner, _, verb = name.rpartition(".")
+        if verb not in SERVES or any(owner.endswith(other) for other in NO_SOCKET):
+            continue
+        words = ast.unparse(call)
+        assert any(host in words for host in HOSTS), f"{path}:{call.lineno}: {words} names no loopback address"
+
+
+def test_every_pin_is_there():
+    """constraints.txt names every package that r2s needs, and what those need: an audit of it misses none."""
+    pins = {line.split("==")[0].lower().replace("_", "-") for line in (ROOT / "constraints.txt").read_text().split()}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    own = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    for extra in re.findall(r"\w+", own[len(project["dependencies"])])[1:]:  # of r2s[bags,...]
+        own += project["optional-dependencies"][extra]
+    waiting, seen, extras = ["r2s"], set(), {}
+    while waiting:
+        package = waiting.pop()
+        try:
+            needed = own if package == "r2s" else requires(package) or []
+        except PackageNotFoundError:
+            continue  # of another system
+        for requirement in map(Requirement, needed):
+            name = requirement.name.lower().replace("_", "-")
+            wanted = [{"extra": e} for e in extras.get(package, {""})]
+            if requirement.marker and not any(requirement.marker.evaluate(w) for w in wanted):
+                continue
+            if name not in seen:
+                seen.add(name)
+                extras.setdefault(name, {""}).update(requirement.extras)
+                waiting.append(name)
+    assert len(seen) > 50
+    builds = {"r2s", "setuptools"}  # of which the environment has its own
+    missing = {n for n in seen - pins - builds if not n.startswith(("nvidia", "cuda", "triton"))}
+    assert missing == set()
+
+
+def opened(root, **change):
+    """Return a run folder, open."""
+    words = {"config": "stage: train\n", "overrides": ["seed=1"], "seed": 1, "threads": 1} | change
+    return Run(root, "train", words.pop("name", "a"), **words)
+
+
+def test_a_run_belongs_to_one_process_at_a_time(tmp_path):
+    """While it is open nobody goes on in it; a name that must be this one is not given twice."""
+    with opened(tmp_path) as run:
+        assert json.loads((run.folder / "meta.json").read_text())["status"] == "running"
+        with pytest.raises(UserError, match=rf"process {os.getpid()} of .* is still at it"):
+            is_done(run.folder)
+        with pytest.raises(UserError, match=r"is still at it"):
+            opened(tmp_path, resume=run.folder)
+        with pytest.raises(UserError, match=r"train/a is taken"):
+            opened(tmp_path, only=True)
+        assert {p.name for p in run.folder.parent.iterdir()} == {"a"}
+    assert is_done(run.folder)
+    with opened(tmp_path) as other:
+        assert other.folder.name == "a_2"
+
+
+def test_a_process_id_that_another_program_has_now_is_no_reason_to_wait(tmp_path):
+    """The lock says who is at it, not the number in meta.json: after a restart that may be anybody's."""
+    with opened(tmp_path) as run:
+        pass
+    meta = json.loads((run.folder / "meta.json").read_text())
+    meta |= {"status": "running", "process": meta["process"] | {"pid": 1}}
+    (run.folder / "meta.json").write_text(json.dumps(meta))
+    assert not is_done(run.folder)
+    with open(run.folder / "overrides.yaml", "r+") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(UserError, match=r"process 1 of .* is still at it"):
+            is_done(run.folder)
+
+
+@pytest.mark.parametrize("name", ["..", ".", ".hidden", "a/b", "a\0b", "a\nb", "x" * 300])
+def test_a_name_that_no_folder_can_have(name, tmp_path):
+    with pytest.raises(UserError):
+        opened(tmp_path, name=name)
+    assert not list(tmp_path.rglob("*.yaml"))
+
+
+def test_rewinding_keeps_what_was_whole_as_it_was_written(tmp_path):
+    """Rows after the checkpoint, the evaluation at the end of a run, and a row that was cut off go."""
+    with opened(tmp_path) as run:
+        for steps in (100, 200, 300):
+            run.log("evaluations", {"env_steps": steps, "x": steps / 7})
+    path = run.folder / "evaluations.csv"
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"300,42.9\r\n400,5")
+    with opened(tmp_path, resume=run.folder) as again:
+        rows = again.rewind("evaluations", "env_steps", 300)
+        assert path.read_bytes() == whole
+        assert [row["env_steps"] for row in rows] == [100, 200, 300]
+        again.log("evaluations", {"env_steps": 400, "x": 1.0})
+    assert path.read_bytes() == whole + b"400,1\r\n"
+    with opened(tmp_path, resume=run.folder) as again:
+        assert len(again.rewind("evaluations", "env_steps", 0)) == 0
+    assert path.read_bytes() == b"env_steps,x\r\n"
+
+
+def test_a_disk_that_is_full_takes_nothing_away(tmp_path, monkeypatch):
+    """A run that cannot write its last word stays marked as running, and raises what was wrong."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    run = opened(tmp_path)
+    before = (run.folder / "meta.json").read_bytes()
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space left"), run:
+        run.summary({"x": 1})
+    monkeypatch.undo()
+    assert (run.folder / "meta.json").read_bytes() == before
+    assert not (run.folder / "summary.json").exists()
+    assert not list(run.folder.glob("*.part*"))
+    assert not is_done(run.folder)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+def test_what_is_cut_off_is_said_in_one_line(share, tmp_path):
+    """Tensors, arrays and JSON that are not whole raise a UserError that names the file."""
+    save_tensors(tmp_path / "a.pt", {"x": torch.zeros(100)})
+    np.savez(tmp_path / "a.npz", x=np.arange(100.0))
+    (tmp_path / "summary.json").write_text(json.dumps({"best": {"x": 1.0}}))
+    readers = {"a.pt": lambda p: load_tensors(p, "policy"), "a.npz": load_arrays}
+    readers["summary.json"] = lambda p: read_summary(p.parent, "policy")
+    for name, read in readers.items():
+        path = tmp_path / name
+        assert read(path)
+        path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+        with pytest.raises(UserError, match=re.escape(str(path))) as said:
+            read(path)
+        assert "\n" not in str(said.value)
+
+
+def test_a_pickled_object_in_a_run_folder_is_refused(tmp_path):
+    """Also where it would do nothing bad."""
+    torch.save({"seen": shutil.which}, tmp_path / "state.pt")
+    with pytest.raises(UserError, match=r"state.pt cannot be read"):
+        load_tensors(tmp_path / "state.pt", "resume")
+    np.savez(tmp_path / "a.npz", x=np.array([shutil.which], dtype=object))
+    with pytest.raises(UserError, match=r"a.npz is damaged"):
+        load_arrays(tmp_path / "a.npz")
