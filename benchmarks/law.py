@@ -67,7 +67,9 @@ def judged(arm, policy, task, starts, goals) -> dict[str, float]:
         "limited, % of cycles": 100 * row["limited"],
         "line below 20 Hz, Nm": lines[(hz > 0) & (hz <= 20)].max(),
         "line above, Nm": lines[hz > 20].max(),
-        "rms of steps sent / asked for": np.sqrt((np.diff(sent, axis=0) ** 2).mean() / (np.diff(asked, axis=0) ** 2).mean()),
+        "rms of steps sent / asked for": np.sqrt(
+            (np.diff(sent, axis=0) ** 2).mean() / (np.diff(asked, axis=0) ** 2).mean()
+        ),
     }
 
 

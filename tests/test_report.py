@@ -553,8 +553,8 @@ def test_the_reach_table_shows_percent_and_dashes_for_what_is_missing(console):
     lines = printed(console).splitlines()
     mujoco_line = next(line for line in lines if "[mujoco]" in line).split()
     arm_line = next(line for line in lines if " arm " in line).split()
-    assert mujoco_line[1:] == ["50.0", "50.0", "50.0", "50.0", "12.3", "-31.2"]
-    assert arm_line[1:] == ["100.0", "-", "-", "-", "-", "-"]
+    assert mujoco_line[1:] == ["50.0", "50.0", "50.0", "50.0", "12.3", "-31.2", "-"]
+    assert arm_line[1:] == ["100.0", *"------"]
 
 
 def test_the_markdown_report_links_figures_relative_and_holds_the_tables(tmp_path, panda, identified):

@@ -16,7 +16,7 @@ from numba import njit
 
 from r2s.arm.interface import ArmState
 from r2s.physics.actuation import condition, low_pass_factor
-from r2s.physics.limits import BRAKE_S, STEP, TAU_MAX, WORK, guard, limits
+from r2s.physics.limits import BRAKE_S, MOST, STEP, TAU_MAX, WORK, guard, limits
 from r2s.physics.robot import SIM_DT, Robot
 
 DEADLINE_S = 0.05  # without a fresh finite target, or PERIODS of a slow policy: then the arm is braked, and stopped
@@ -34,6 +34,7 @@ class Memory(NamedTuple):
     Attributes:
         target: (m, n) Nm, the last finite one. filtered, effort: (m, n) Nm, as of `Actuation`.
         sent: (m, n) Nm, the last command.
+        share: (m,), of the allowed speeds that is left: 1, or less and less while the arm is brought to rest.
         cycle, silent, damped: (m,), cycles in all, since the last finite target, and of bringing to rest.
         why: (m,), RUNS or why the arm is brought to rest. rests: (m,), whether it is at rest.
         limited: (m,), cycles in which the law changed what was asked for.
@@ -43,6 +44,7 @@ class Memory(NamedTuple):
     filtered: np.ndarray
     effort: np.ndarray
     sent: np.ndarray
+    share: np.ndarray
     cycle: np.ndarray
     silent: np.ndarray
     damped: np.ndarray
@@ -54,7 +56,7 @@ class Memory(NamedTuple):
     def fresh(m: int, n: int) -> "Memory":
         """Return that of m arms of n joints before their first cycle, without torque."""
         count = np.zeros((5, m), dtype=np.int64)
-        return Memory(*np.zeros((4, m, n)), *count, np.zeros(m, dtype=bool))  # type: ignore[call-arg]
+        return Memory(*np.zeros((4, m, n)), np.ones(m), *count, np.zeros(m, dtype=bool))  # type: ignore[call-arg]
 
 
 class Drivers:
@@ -104,8 +106,8 @@ class Drivers:
 
     @property
     def limited(self) -> np.ndarray:
-        """(m,), the share of the cycles in which the law changed what was asked for."""
-        return self._memory.limited / np.maximum(self._memory.cycle, 1)
+        """(m,), in how many cycles of the motion the law changed what was asked for."""
+        return self._memory.limited
 
     @property
     def done(self) -> np.ndarray:
@@ -182,8 +184,11 @@ def drive(
         stopping = memory.why[i] != RUNS
         memory.damped[i] += stopping
         memory.rests[i] = seen[i] and (np.abs(dq[i]) < STILL).all()
-        if stopping:
+        if stopping:  # from the speed that there is, at once
             memory.target[i] = 0.0
+            if seen[i] and memory.damped[i] == 1:
+                memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, MOST]).max())
+            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
         at = slice(i, i + 1)
         condition(
             memory.target[at], memory.filtered[at], memory.effort[at], memory.cycle[at], 1, factor, fade,
@@ -191,8 +196,8 @@ def drive(
         )  # fmt: skip
         last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
         if seen[i]:
-            share = max(0.0, 1.0 - memory.damped[i] * SIM_DT / BRAKE_S)
-            changed = guard(q[i], dq[i], effort[0, 0], last, share, mass[i], bias[i], limits, work, out[i])
+            share, now = memory.share[i], effort[0, 0]
+            changed = guard(q[i], dq[i], now, last, share, mass[i], bias[i], limits, work, out[i])
             memory.limited[i] += changed
         else:
             for j in range(n):
@@ -222,9 +227,9 @@ class Driver:
         return self._drivers.effort[0]
 
     @property
-    def limited(self) -> float:
-        """The share of the cycles in which the law changed what was asked for."""
-        return float(self._drivers.limited[0])
+    def limited(self) -> int:
+        """In how many cycles of the motion the law changed what was asked for."""
+        return int(self._drivers.limited[0])
 
     @property
     def done(self) -> bool:

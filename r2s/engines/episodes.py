@@ -51,6 +51,7 @@ class EngineArms:
         self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque)
         self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
         self._actuation.reset()
+        self._limited = 0
         self._command = np.zeros(self.robot.n)
         self._now, self._steps = (starts[0], np.zeros(self.robot.n)), 0
         self._engine.reset(*self._now)
@@ -58,6 +59,7 @@ class EngineArms:
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torque (1, n) Nm."""
+        self._limited = self._guard.changed
         for effort in self._actuation(np.clip(target, -self._torque, self._torque), self._substeps)[0]:
             self._command = self._guard(*self._now, effort, self._command)
             applied = self._motors(self._command[None, None])[0, 0]
@@ -73,5 +75,5 @@ class EngineArms:
         q, dq = self._now
         ee, jacobian = self._kinematics(q)
         tau, effort, t = self._command[None], self._actuation.last, np.array([self._steps * self._period])
-        limited = np.array([self._guard.changed / max(self._guard.cycles, 1)])
+        limited = np.array([(self._guard.changed - self._limited) / self._substeps])
         return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited)

@@ -37,6 +37,7 @@ class ArmBatch:
         self.sim.drive(limits(robot, self._torque))
         self.actuation = Actuation(robot, width, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
         self.stops: list = []
+        self._limited = np.zeros(width)  # cycles before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
@@ -47,13 +48,15 @@ class ArmBatch:
         """Put the arms `ids` (all by default) at rest at starts (m, n) rad; return the state of all."""
         self.sim.reset(starts, np.zeros_like(starts), ids)
         self.actuation.reset(ids)
-        self._steps[slice(None) if ids is None else ids] = 0
+        at = slice(None) if ids is None else ids
+        self._steps[at], self._limited[at] = 0, 0.0
         return self.read()
 
     def read(self) -> State:
         """Return the present state of all arms; its arrays are views."""
         sim, effort, t = self.sim, self.actuation.last, self._steps * self._period
-        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, effort, self._stopped, sim.limited)
+        limited = (sim.limited - self._limited) / self._substeps
+        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, effort, self._stopped, limited)
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torques (width, n) Nm; return the state then.
@@ -63,6 +66,7 @@ class ArmBatch:
         """
         check_finite("action", target, self._steps)
         within = np.minimum(np.maximum(target, -self._torque), self._torque)  # np.clip takes its time
+        self._limited[:] = self.sim.limited
         self.sim.rollout(self.actuation(within, self._substeps), record=())
         self.sim.kinematics()
         self._steps += 1
@@ -75,13 +79,13 @@ class ArmBatch:
     def state(self) -> dict:
         """Return copies of all that the next steps depend on, for `set_state`."""
         parts = {name: getattr(self, name).state() for name in ("sim", "actuation")}
-        return parts | {"_steps": self._steps.copy()}
+        return parts | {"_steps": self._steps.copy(), "_limited": self._limited.copy()}
 
     def set_state(self, state: Mapping) -> None:
         """Go back to what `state` returned; the same targets then lead to the same states, bit for bit."""
         for name in ("sim", "actuation"):
             getattr(self, name).set_state(state[name])
-        self._steps[:] = state["_steps"]
+        self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:

@@ -78,7 +78,7 @@ class Guard:
     """The law for one arm, with the inertia of its model; `guard` for arguments.
 
     Attributes:
-        cycles: so far. changed: in how many of them the law changed what was asked for.
+        changed: in how many cycles so far the law changed what was asked for.
 
     Args:
         model: one arm without gravity. robot, torque: as of `limits`.
@@ -87,7 +87,7 @@ class Guard:
     def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray):
         self._model, self._data, self._limits = model, mujoco.MjData(model), limits(robot, torque)
         self._work = np.empty((2 * robot.n + WORK, robot.n))
-        self.cycles = self.changed = 0
+        self.changed = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, effort: np.ndarray, last: np.ndarray) -> np.ndarray:
         """Return the command (n,) Nm for the effort (n,) Nm at q, dq (n,), after the command `last` (n,) Nm."""
@@ -97,7 +97,6 @@ class Guard:
         mujoco.mj_fwdVelocity(self._model, data)
         now = data.M, data.qfrc_bias, self._limits, self._work
         self.changed += guard(q, dq, effort, last, 1.0, *now, out)
-        self.cycles += 1
         return out
 
 

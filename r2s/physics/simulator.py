@@ -128,9 +128,8 @@ class Simulator:
 
     @property
     def limited(self) -> np.ndarray:
-        """(nsim,), in which share of the cycles since `reset` the driver's law changed what was asked for."""
-        n = self.robot.n
-        return self._memory[:, native.LIMITED * n] / np.maximum(self._memory[:, native.CYCLE * n], 1.0)
+        """(nsim,), in how many cycles since `reset` the driver's law changed what was asked for."""
+        return self._memory[:, native.LIMITED * self.robot.n]
 
     @property
     def ee(self) -> np.ndarray:

@@ -89,9 +89,9 @@ def rollout(
             ddq = (state.dq - before) * task.ctrl_hz
             distance[now, k], terms = task.judge(state, ddq, goals[now], reference)
             reward[now, k] = terms @ weights
+            limited[now] += state.limited / task.steps
             q[now, k], dq[now, k], ee[now, k], tau[now, k] = state.q, state.dq, state.ee, state.tau
             before = dq[now, k]
-        limited[now] = state.limited
         distance[now, -1][arms.end()] = np.inf  # reached means reached and held by an arm that still runs
         progress(min(first + width, count), count)
     t = (1 + np.arange(task.steps)) / task.ctrl_hz

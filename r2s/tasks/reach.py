@@ -75,7 +75,7 @@ class ReachTask:
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(3,), of the terms that make eq. (2)."""
+        """(4,), of the terms that make eq. (2)."""
         return rewards.PAPER
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -136,8 +136,8 @@ class ReachTask:
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m and the reward terms (m, 3) of r2s/tasks/rewards.py; see `Task.judge`."""
-        return _judge(state.ee, goals, reference, state.dq, ddq)
+        """Return the distance (m,) m and the reward terms (m, 4) of r2s/tasks/rewards.py; see `Task.judge`."""
+        return _judge(state.ee, goals, reference, state.dq, ddq, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
@@ -199,9 +199,9 @@ def observe(
 
 
 @njit(cache=True)
-def _judge(ee, goal, reference, dq, ddq):
+def _judge(ee, goal, reference, dq, ddq, limited):
     distance = np.empty(len(ee))
     for i in range(len(ee)):
         x, y, z = goal[i, 0] - ee[i, 0], goal[i, 1] - ee[i, 1], goal[i, 2] - ee[i, 2]
         distance[i] = np.sqrt(x * x + y * y + z * z)
-    return distance, rewards.terms(distance, reference, dq, ddq)
+    return distance, rewards.terms(distance, reference, dq, ddq, limited)

@@ -1,6 +1,7 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
-A reward is a weighted sum of terms. The replay buffer keeps the terms, so that when the curriculum moves its weights
+A reward is a weighted sum of terms; two of them are not in the paper: a bonus for precision, and a price of asking for
+what the driver's law does not let through. The replay buffer keeps the terms, so that when the curriculum moves its weights
 every stored transition is worth what the present weights say.
 """
 
@@ -14,39 +15,47 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
-STILL = 0.2  # rad/s, scale of its stillness: a redundant arm can drift with its hand on the goal
-TERMS = ("distance", "smoothness", "precision")
+STILL = 0.2  # rad/s, scale of its stillness, of the fastest joint: a hand can lie on the axis of one that turns
+TERMS = ("distance", "smoothness", "precision", "limited")
 
 
 @njit(cache=True)
-def terms(distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return (m, 3): the two halves of eq. (2), which add up to it, and a bonus for precision.
+def terms(
+    distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
+) -> np.ndarray:
+    """Return (m, 4): the two halves of eq. (2), which add up to it, a bonus for precision, and what the law changed.
 
     distance    -k1 d, with d the distance over the initial one
     smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2) (1 - mean tanh(|dq| / 0.2 rad/s) / 2)
+    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2) (1 - max tanh(|dq| / 0.2 rad/s) / 2)
+    limited     -limited
 
     Args:
         distance, distance0: (m,) m, now and at the start of the episode.
         dq: (m, n) rad/s.
         ddq: (m, n) rad/s^2, mean over the last control period.
+        limited: (m,), in which share of it the driver's law changed what was asked for.
     """
-    out = np.empty((len(distance), 3))
+    out = np.empty((len(distance), 4))
     for i in range(len(distance)):
         d = distance[i] / distance0[i]
         speed, jerkiness, moving = 0.0, 0.0, 0.0
         for j in range(dq.shape[1]):
             speed += np.tanh(abs(dq[i, j]))
             jerkiness += np.tanh(abs(ddq[i, j]))
-            moving += np.tanh(abs(dq[i, j]) / STILL)
+            moving = max(moving, np.tanh(abs(dq[i, j]) / STILL))
         near = 1.0 - 0.5 * (np.tanh(distance[i] / PRECISION_M[0]) + np.tanh(distance[i] / PRECISION_M[1]))
         out[i, 0] = -K1 * d
         out[i, 1] = -K2 * speed - K3 * jerkiness / abs(K4 - min(1.0, d)) - K5 * jerkiness / (K6 + d)
-        out[i, 2] = near * (1.0 - 0.5 * moving / dq.shape[1])
+        out[i, 2] = near * (1.0 - 0.5 * moving)
+        out[i, 3] = -limited[i]
     return out
 
 
-PAPER = np.array([1.0, 1.0, 0.0])  # weights of the terms that make eq. (2)
+PAPER = np.array([1.0, 1.0, 0.0, 0.0])  # weights of the terms that make eq. (2)
+
+
+WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
 
 
 @dataclass(frozen=True)
@@ -58,7 +67,7 @@ class Curriculum:
     fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
     Attributes:
-        smoothness, precision: weights before and after.
+        smoothness, precision, limited: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
 
     Raises:
@@ -67,10 +76,11 @@ class Curriculum:
 
     smoothness: Sequence[float]
     precision: Sequence[float]
+    limited: Sequence[float]
     anneal: Sequence[float]
 
     def __post_init__(self):
-        for name, interval in (("smoothness", "[0, inf)"), ("precision", "[0, inf)"), ("anneal", "[0, 1]")):
+        for name, interval in (*WEIGHTS, ("anneal", "[0, 1]")):
             pair = getattr(self, name)
             if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
                 raise UserError(f"reward.{name}: {pair} is not allowed; two numbers are, before and after")
@@ -78,8 +88,8 @@ class Curriculum:
                 check_number(f"reward.{name}", number, interval)
 
     def __call__(self, progress: float) -> np.ndarray:
-        """Return the (3,) weights at `progress`, the fraction of the training budget that is spent."""
+        """Return the (4,) weights at `progress`, the fraction of the training budget that is spent."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
-        moving = [before + at * (after - before) for before, after in (self.smoothness, self.precision)]
+        moving = [before + at * (after - before) for before, after in (self.smoothness, self.precision, self.limited)]
         return np.array([1.0, *moving])

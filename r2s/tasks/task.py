@@ -21,7 +21,7 @@ class State:
         ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target as it has come through the low-pass.
         stopped: (m,), whether the arm has ended its motion.
-        limited: (m,), in which share of the cycles of their episodes the driver's law changed what was asked for.
+        limited: (m,), in which share of the last control period the driver's law changed what was asked for.
     """
 
     t: np.ndarray
