@@ -151,7 +151,7 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
     """A few lost packets are borne; each fault ends the motion with libfranka's reason, and can be cleared."""
     _, make, _ = client
     asked = []
-    arm = make(panda, faulty, clear=lambda reason: asked.append(reason) is None)
+    arm = make(panda, faulty, operator=lambda reason: asked.append(reason) is None)
     here = arm.read().q
     arm.move_to(here)
     seen = drive(arm, 60)
@@ -197,7 +197,7 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[fault]) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         starts = np.stack([panda.q_home, panda.q_home])
         goals = fixed_episodes(panda, task, 2)[1]
         driven = DrivenArm(arm, task)
@@ -219,7 +219,7 @@ def test_a_stop_button_ends_a_deployment(client, panda):
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
         driven = DrivenArm(arm, task)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
@@ -241,7 +241,7 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
         with pytest.raises(ArmStopped, match=r"nobody cleared that: .*joint_position_limits_violation"):
             arm.move_to(panda.q_home)
         arm.close()
-        arm = make(panda, address, clear=lambda reason: True)  # the reflex outlives the connection
+        arm = make(panda, address, operator=lambda reason: True)  # the reflex outlives the connection
         target = panda.q_home + np.array([0, 0, 0, 0, 0, 0, 0.05])
         assert np.abs(arm.move_to(target).q - target).max() < 2e-3
         for bad, reason in ((np.full(7, np.nan), "nan, must be finite"), (np.full(7, 2.0), r"steps by \+2.000 Nm")):
@@ -260,7 +260,7 @@ def test_real_time_does_not_wait(client, panda):
     """At 1 kHz a client that stalls loses its motion; a machine that stalls a little does not."""
     _, make, version = client
     with Emulator(partial(Bare, panda), version=version, realtime=True, patience=400) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         arm.move_to(panda.q_home)
         drive(arm, 200, BARE)
         arm.stop()
