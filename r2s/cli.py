@@ -11,9 +11,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.stages.build import CONF, unread
 
+STOPPED = 3  # exit status of a run that a stopped arm has ended
 STAGES = ("train", "identify", "transfer", "compare", "pipeline")
 
 
@@ -168,7 +169,7 @@ def is_there(cfg, overrides):
 
 
 def run_job(cfg):
-    """Call the stage of one composed config; a mistake ends the job (`failed`)."""
+    """Call the stage of one composed config; a mistake ends the job (`failed`), a stopped arm the whole sweep."""
     from hydra.core.hydra_config import HydraConfig
     from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
@@ -187,6 +188,9 @@ def run_job(cfg):
         failed(" ".join(str(error).split()))
     except MissingMandatoryValue as error:
         failed(f"{error.full_key} must be given: {error.full_key}=...")
+    except Stopped as reason:
+        print(f"stopped: {' '.join(str(reason).split())}", file=sys.stderr)
+        sys.exit(STOPPED)
     except KeyboardInterrupt:
         print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
         sys.exit(130)

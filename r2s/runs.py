@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from r2s.errors import UserError
+from r2s.errors import Stopped, UserError
 from r2s.files import whole
 
 PACKAGES = (
@@ -93,7 +93,7 @@ class Run:
         for _, file in self._tables.values():
             file.close()
         self._meta["wall_clock_s"] = round(time.time() - self._began, 3)
-        interrupted = kind is KeyboardInterrupt
+        interrupted = kind in (KeyboardInterrupt, Stopped)
         self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")

@@ -94,7 +94,9 @@ def _emulated(client: Callable[..., Franka], version: int, twin: partial[Twin], 
 
 def _operator(where: str) -> Callable[[str], bool]:
     if where != "terminal":
-        raise UserError(f"operator: '{where}' is not allowed; terminal is, where somebody types that the arm may go on")
+        raise UserError(
+            f"operator: '{where}' is not allowed; terminal is, where somebody types that the arm may go on"
+        )
     return operator_agrees
 
 

@@ -27,7 +27,9 @@ from r2s.physics.robot import SIM_DT, Robot
 SPEED = 0.2  # of dq_max, on the way to a place
 ACCELERATION = 0.2  # of ddq_max
 SETTLE_S = 3.0  # at most, at the end of the way
-TORQUE_SHARE = 0.2  # of tau_max, the most that the way may take: what somebody who holds a link meets (docs/safety.md)
+TORQUE_SHARE = (
+    0.2  # of tau_max, the most that the way may take: what somebody who holds a link meets (docs/safety.md)
+)
 ASTRAY = 0.1  # rad off the way, at which it is given up
 PULL = 15.0  # of tau_max per rad and s, of the integral that then overcomes breakaway
 PULL_SHARE = 0.15  # of tau_max, at most
@@ -178,110 +180,12 @@ class Franka:
 
     def stop(self) -> None:
         """Damp what still moves, for at most half a second, and end the motion."""
-        try:
-            if self._moving:
-                if self._stopped is None:
-                    self._own.begin()
-                    self._own.rest()
-                self._end()
-        except ArmStopped as reason:
-            self._stopped = self.blocked = str(reason)
-        self._moving = False
-        if self._stopped is None:
-            self._stopped = "stop was called"
-
-    def close(self) -> None:
-        """Drop the connection."""
-        ...
-
-
-class Franka:
-    """An `Arm` (r2s/arm/interface.py) behind a `Client`, with somebody beside it (`Operated`).
-
-    The motion of a caller begins with its first `command`; from then on the arm wants one per millisecond.
-
-    Attributes:
-        operator, blocked: see `Operated`. Whatever ended a motion blocks the arm but `stop`: a reflex, a stop button,
-            also one that was released since, a command that was refused, a way that was given up.
-
-    Args:
-        robot: the arm's limits and nominal model.
-        client: the connection.
-        operator: asked with the reason before the arm moves again after a stop. By default nobody is there:
-            `move_to` refuses until another connection begins with an arm that is ready.
-        collision: at which external force the arm stops itself.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        client: Client,
-        operator: Callable[[str], bool] | None = None,
-        collision: Collision = CAUTIOUS,
-    ):
-        if robot.n != 7:
-            raise UserError(f"a Franka arm has 7 joints; {robot.name} has {robot.n}")
-        self.robot, self.operator = robot, operator
-        self.blocked: str | None = None
-        self._client, self._collision = client, collision
-        self._reflexes = Reflexes(robot)
-        self._moving, self._closed, self._watched = False, False, False
-        self._stopped: str | None = "no motion was started; call move_to first"
-        self._rest()
-        # a cycle of references would keep an arm that nobody has any more, and its connection
-        self._own = Driven(weakref.proxy(self), Driver(robot, TORQUE_SHARE * robot.tau_max, cutoff_hz=CUTOFF_HZ))
-
-    def move_to(self, q: np.ndarray) -> ArmState:
-        """Go to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
-
-        Raises:
-            NotCleared: the arm has stopped before, and no operator agreed that it may move.
-            ArmStopped: q is outside the limits, the arm is not ready, it stops on the way, it is 0.1 rad off its
-                way, or it does not come within 10 mrad.
-
-        """
-        q = np.array(q, dtype=float)
-        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
-            raise ArmStopped(f"move_to needs {self.robot.n} finite joint angles; it got {q}")
-        self._reflexes.state(q, np.zeros(self.robot.n))
-        self.stop()
-        self._ready()
-        self._stopped = None
-        if np.abs(self._state.q - q).max() > NEAR:
-            self._go(q)
-        return self._state
-
-    def read(self) -> ArmState:
-        """Return the state of the current cycle; before a motion's first command, of the arm at rest."""
-        return self._state
-
-    def command(self, tau: np.ndarray) -> None:
-        """Send tau (7,) Nm without gravity and wait for the next cycle; the first one starts the motion.
-
-        Raises:
-            ArmStopped: in libfranka's words if the arm stopped itself; or the command is one that it would not
-                take, which is not sent: the arm is brought to rest instead.
-
-        """
-        if self._stopped is not None:
-            raise ArmStopped(f"the arm is stopped: {self._stopped}")
-        tau = np.array(tau, dtype=float)
-        try:
-            self._reflexes.command(tau, self._state.tau_J_d)
-        except ArmStopped as refused:
-            self.stop()
-            self._stopped = self.blocked = str(refused)
-            raise
-        self._send(tau)
-
-    def stop(self) -> None:
-        """Damp what still moves, for at most half a second, and end the motion."""
-        try:
-            if self._moving:
-                self._damp()
-                self._end()
-        except ArmStopped as reason:
-            self._stopped = str(reason)
+        for part in (self._damp, self._end):  # an arm whose driver gave up damping it is still to be stopped
+            try:
+                if self._moving:
+                    part()
+            except ArmStopped as reason:
+                self._stopped = self.blocked = str(reason)
         self._moving = False
         if self._stopped is None:
             self._stopped = "stop was called"
@@ -306,6 +210,11 @@ class Franka:
     def _sample(self, s: Any) -> ArmState:
         t = (_ms(s) - self._begun) * SIM_DT
         return ArmState(t, np.array(s.q), np.array(s.dq), np.array(s.tau_J), np.array(s.tau_J_d))
+
+    def _damp(self) -> None:
+        if self._stopped is None:
+            self._own.begin()
+            self._own.rest()
 
     def _end(self) -> None:
         self._moving = False
@@ -365,6 +274,9 @@ class Franka:
                     before = left
                 own(follow(k, s) + pull)
             self._end()
+        except ArmStopped as reason:
+            self.blocked = str(reason)
+            raise
         finally:
             if self._moving:  # interrupted, or given up
                 self.stop()

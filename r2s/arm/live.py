@@ -112,6 +112,11 @@ class LiveArm:
         """Cycles of the arm since the episode began."""
         return self._look()[0]
 
+    @property
+    def stopped(self) -> bool:
+        """Whether the episode was stopped."""
+        return self._look()[3]
+
     def place(self, starts: np.ndarray, first: int) -> State:
         """Begin episode `first` at starts (1, n) rad, as `DrivenArm.place`; the operator is asked in this process."""
         self._over.write(np.zeros(1))
@@ -178,7 +183,13 @@ class LiveArm:
 
 
 def _serve(
-    line: Connection, open_arm: Callable[[], Any], task: Task, soft_start_s: float, target: Slot, state: Slot, over: Slot
+    line: Connection,
+    open_arm: Callable[[], Any],
+    task: Task,
+    soft_start_s: float,
+    target: Slot,
+    state: Slot,
+    over: Slot,
 ) -> None:
     """Open the arm, run episodes as they are asked for, and end with the process that asks."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that asks, which stops the arm first

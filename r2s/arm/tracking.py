@@ -18,7 +18,9 @@ BANDWIDTH = 20.0  # rad/s, of the tracking loop: a few ms of delay leave it a wi
 CUTOFF_HZ = 100.0  # of the driver's low-pass, as libfranka's
 TORQUE_SHARE = 0.8  # of tau_max, the most that a recording asks for
 LEARNING = 0.8  # of kp, in 1/s: with its three terms the loop keeps half its stability margin
-UNBALANCED = 0.1  # of tau_max, what gravity compensation may leave: 1 kg at a Panda's full reach that it knows nothing of
+UNBALANCED = (
+    0.1  # of tau_max, what gravity compensation may leave: 1 kg at a Panda's full reach that it knows nothing of
+)
 CORRECTION = 0.3  # of tau_max, what tracking may add to the planned torque, all in all
 ASTRAY = 0.2  # rad off the plan: something is in the way, or the arm is not the one that the plan was made for
 FRICTION_DQ = 0.03  # rad/s, over which the friction estimate changes sign
