@@ -1,4 +1,4 @@
-"""What becomes of an arm whose clock does not wait when its policy stalls, throws or is killed; times are the arm's."""
+"""What becomes of an arm whose clock does not wait when its policy stalls, throws or is killed, in the arm's time."""
 
 import os
 import signal

@@ -73,7 +73,7 @@ class DrivenArm:
 
     Attributes:
         stops: why episodes ended early, where they did. timing: see there.
-        done: episodes, as long as all are: those after the last one that the arm was brought to the start of are none.
+        done: episodes that the arm was brought to the start of, or tried to: all, unless it was `halted`.
         halted: why there are no further episodes, or None: the operator was asked after a stop, and did not agree.
 
     Args:
@@ -97,8 +97,8 @@ class DrivenArm:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
 
-        A stop on the way is the episode's stop. Beside an arm with an operator he is asked whether to try again; where
-        he does not agree, neither this nor any later episode begins.
+        A stop on the way is the episode's stop. Beside an arm with an operator he is asked whether to try again;
+        where he does not agree, neither this nor any later episode begins.
         """
         self._log.clear()
         self._episode, self._stopped, self._sent = first, False, 0.0

@@ -22,8 +22,12 @@ HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size 
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
 MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # deviations follow, unused
 COLLISION = np.dtype(  # thresholds of accelerating arms first, which are the same for our clients
-    [("torque_acceleration", "<f8", (2, 7)), ("lower_torque", "<f8", 7), ("upper_torque", "<f8", 7)]
-    + [("force", "<f8", (4, 6))]
+    [
+        ("torque_acceleration", "<f8", (2, 7)),
+        ("lower_torque", "<f8", 7),
+        ("upper_torque", "<f8", 7),
+        ("force", "<f8", (4, 6)),
+    ]
 )
 
 

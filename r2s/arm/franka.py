@@ -229,7 +229,7 @@ class Franka:
         self._state = ArmState(0.0, seen.q, seen.dq, seen.tau_J, np.zeros(self.robot.n))
 
     def _ready(self) -> None:
-        """Raise ArmStopped unless the arm can move: after a stop the operator has to agree, then a reflex is cleared."""
+        """Raise ArmStopped unless the arm can move; after a stop the operator has to agree before."""
         if self._closed:
             raise ArmStopped("the connection was closed")
         s = self._client.idle()

@@ -63,7 +63,7 @@ class LiveArm:
         robot: the arm's. stops, timing, done, halted: as of `DrivenArm`.
 
     Args:
-        open_arm: returns the arm, or a context manager that gives it; it runs in the process, so it must be picklable.
+        open_arm: returns the arm, or a context manager that gives it; runs in the process, so it must be picklable.
         robot: whose number of joints the arm has.
         task, soft_start_s: as of `DrivenArm`.
 

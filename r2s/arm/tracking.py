@@ -89,10 +89,10 @@ class Tracker:
     """PD control about the nominal model's torque, and an estimate of what the model lacks: targets for the driver.
 
     The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous
-    friction, adapted while moving as in Slotine and Li (IJRR 6(3), 1987), within what an arm can have of each. Without
-    it a light wrist, whose gains must be small, would be held back by friction as large as all its PD torque. Gains
-    are the nominal mass matrix times a bandwidth: they fit any arm, and joints with nearly parallel axes, which a gain
-    per joint drives unstable.
+    friction, adapted while moving as in Slotine and Li (IJRR 6(3), 1987), within what an arm can have of each.
+    Without it a light wrist, whose gains must be small, would be held back by friction as large as all its PD torque.
+    Gains are the nominal mass matrix times a bandwidth: they fit any arm, and joints with nearly parallel axes, which
+    a gain per joint drives unstable.
 
     Args:
         robot: the nominal model. excitation: the plan.

@@ -242,8 +242,8 @@ class Control:
 class Felt:
     """An estimate of the torque that the world exerts on a moving arm: what its motion needs beyond its commands.
 
-    Franka's arms have torque sensors behind their gears; this arm may have none that knows gravity, so friction and the
-    errors of the nominal model are felt too, which makes it stop rather sooner.
+    Franka's arms have torque sensors behind their gears; this arm may have none that knows gravity, so friction and
+    the errors of the nominal model are felt too, which makes it stop rather sooner.
 
     Attributes:
         torque: (n,) Nm, filtered.
