@@ -550,7 +550,7 @@ class Stopping(SimulatedArm):
 
     def __init__(self, robot, noise=0):
         self.operator, self.blocked, self._motions = (lambda reason: False), None, noise
-        dynamics = nominal_dynamics(robot, phi1=[1.0], phi2=[9.0], phi3=[0.0])
+        dynamics = nominal_dynamics(robot, phi1=[1.0] * 7, phi2=[9.0] * 7, phi3=[0.0] * 7)
         super().__init__(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
         self._motions = noise
 

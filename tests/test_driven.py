@@ -4,17 +4,20 @@ import ast
 import re
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import ROOT, conf
 
 from r2s.arm import driver as law
+from r2s.arm import fci
 from r2s.arm.clients import AGREED, operator_agrees
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
 from r2s.arm.emulator.control import HOLD
+from r2s.arm.franka import CAUTIOUS, Franka
 from r2s.arm.interface import ArmStopped, NotCleared
 from r2s.arm.ramp import BRAKE_SHARE, LARGEST, poses_about, ramp
 from r2s.arm.simulated import SimulatedArm
@@ -29,6 +32,7 @@ from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
 
 PANDA = load_robot(**conf("robot/panda"))
+TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 
 
 class Watched(SimulatedArm):
@@ -97,7 +101,7 @@ def test_every_command_comes_out_of_a_driver(monkeypatch):
         return out
 
     monkeypatch.setattr(law.Drivers, "__call__", noted)
-    task = ReachTask(episode_s=0.1)
+    task = replace(TASK, episode_s=0.1)
     episodes = fixed_episodes(PANDA, task, 1)
 
     def reach(arm):
@@ -202,10 +206,58 @@ class Guarded(Watched):
         super().command(tau)
 
 
+class Button:
+    """A client of an arm at home on which somebody presses the stop button in a motion, and releases it."""
+
+    def __init__(self):
+        self.sent, self.cycle = [], 0
+
+    def idle(self):
+        """An arm that would move."""
+        zeros, seconds = np.zeros(7), SIM_DT * self.cycle
+        time = SimpleNamespace(to_sec=lambda: seconds)
+        return SimpleNamespace(robot_mode=fci.IDLE, q=PANDA.q_home, dq=zeros, tau_J=zeros, tau_J_d=zeros, time=time)
+
+    start = idle
+
+    def exchange(self, tau):
+        """Take ten commands."""
+        self.cycle += 1
+        if len(self.sent) == 10:
+            raise ArmStopped("user stop")
+        self.sent.append(tau)
+        return self.idle()
+
+    def watch_for(self, collision):
+        """Take thresholds."""
+        self.collision = collision
+
+    def finish(self):
+        """End a motion."""
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_pressed_and_released_counts_as_pressed(there):
+    """The arm is idle and would move; without an operator, or without his word, it is asked nothing."""
+    client, asked = Button(), []
+    arm = Franka(PANDA, client, operator=(lambda reason: asked.append(reason) or len(asked) > 1) if there else None)
+    arm.move_to(PANDA.q_home)
+    assert client.collision == CAUTIOUS
+    with pytest.raises(ArmStopped, match="user stop"):
+        record(arm, turn(0.4, 0.05))
+    for _ in range(1 + (not there)):
+        with pytest.raises(NotCleared, match="no operator agreed that it may move: user stop"):
+            arm.move_to(PANDA.q_home)
+    if there:
+        arm.move_to(PANDA.q_home)
+    assert len(asked) == 2 * there
+    assert len(client.sent) == 10
+
+
 @pytest.mark.parametrize(("answers", "done"), [([False], 1), ([True, False], 2), ([True, True], 3)])
 def test_no_episode_begins_before_an_operator_said_so(answers, done):
     """Each stop is asked about once; where the answer is no, what was not tried is no episode."""
-    task, arm = ReachTask(episode_s=0.1), Guarded(answers)
+    task, arm = replace(TASK, episode_s=0.1), Guarded(answers)
     driven = DrivenArm(arm, task)
     rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 3))
     assert driven.done == done
@@ -254,7 +306,7 @@ def hostile(cycles, seed):
 
 def spoiled(arm, rng):
     """Let a policy act that says nothing, too much or nonsense for some of its time."""
-    driven = Driven(arm, Driver(PANDA, ReachTask().torque(PANDA)))
+    driven = Driven(arm, Driver(PANDA, TASK.torque(PANDA)))
     driven.place(PANDA.q_home)
     try:
         for k in range(1500):

@@ -28,12 +28,15 @@ from r2s.arm.emulator.control import Control, Fault
 from r2s.arm.emulator.process import Emulator, main
 from r2s.arm.emulator.server import listen
 from r2s.arm.fr3 import FR3
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.franka import CAUTIOUS, TORQUE_SHARE, Collision
+from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
 from r2s.arm.panda import Panda
+from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
+from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
@@ -254,6 +257,62 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
         with pytest.raises(ArmStopped, match="joint 2: position 3"):
             arm.move_to(np.array([0, 3, 0, -2, 0, 1, 0]))
         arm.close()
+
+
+@pytest.mark.slow  # without a wire: test_driven.py
+def test_pressed_and_released_counts_as_pressed(client, panda):
+    """An idle arm whose button was released does not move before the operator agreed; then it does."""
+    _, make, version = client
+    with Emulator(partial(Bare, panda), version=version, faults=[Fault("press", 10, cycles=40)]) as address:
+        answers, asked = iter((False, True)), []
+        arm = make(panda, address, operator=lambda reason: asked.append(reason) or next(answers))
+        arm.move_to(panda.q_home)
+        with pytest.raises(ArmStopped, match=r"User Stop|user stop|emergency"):
+            drive(arm, 60, BARE)
+        time.sleep(0.3)  # an idle emulator passes 20 ms of the arm in as many of the clock
+        assert int(arm._client.idle().robot_mode) == fci.IDLE  # it would move
+        with pytest.raises(NotCleared, match="no operator agreed"):
+            arm.move_to(panda.q_home)
+        arm.move_to(panda.q_home)
+        drive(arm, 20, BARE)
+        assert len(asked) == 2
+        arm.close()
+
+
+def held(robot):
+    """Return an arm of known truth whose links can be held."""
+    return SimulatedArm(robot, nominal_dynamics(robot, **conf("friction/paper")), position_noise=0, velocity_noise=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cautious", [True, False])
+def test_who_holds_a_link_on_the_way(cautious, client, panda):
+    """The arm stops itself at its threshold; without thresholds the way is given up, and presses no harder than its
+    share of the torque on the way.
+    """
+    _, make, version = client
+    collision = Collision([5.0] * 7, CAUTIOUS.force) if cautious else Collision([1e3] * 7, [1e3] * 6)
+    with Emulator(partial(held, panda), version=version, faults=[Fault("hold", 300, cycles=10_000)]) as address:
+        arm = make(panda, address, operator=lambda reason: False, collision=collision)
+        told, send = [], arm._client.exchange
+        arm._client.exchange = lambda tau: told.append(tau) or send(tau)
+        reason = "joint_reflex" if cautious else r"joint 1 is 0.10\d rad off its way"
+        with pytest.raises(ArmStopped, match=reason):
+            arm.move_to(arm.read().q + np.array([0.5, 0, 0, 0, 0, 0, 0]))
+        assert np.abs(told).max(0)[0] <= (5.0 + 2.5 if cautious else TORQUE_SHARE * 87) + 1e-6  # friction, and 15 Hz
+        with pytest.raises(NotCleared, match="no operator agreed"):
+            arm.move_to(arm.read().q)
+        arm.close()
+
+
+def test_what_cannot_be_held(panda):
+    """A fault that the arm behind the emulator cannot have is one line."""
+    with pytest.raises(UserError, match="fault 'hold': Bare has nothing that could push it"):
+        Control(Bare(panda), 5, [Fault("hold", 3)])
+    with pytest.raises(UserError, match="collision_torque: 3 numbers, allowed are 7"):
+        Collision([1.0] * 3, CAUTIOUS.force)
+    with pytest.raises(UserError, match=r"collision_force: 0.0 is not allowed"):
+        Collision(CAUTIOUS.torque, [0.0] * 6)
 
 
 @pytest.mark.slow  # on a loaded machine the clients give up, and say so

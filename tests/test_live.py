@@ -97,6 +97,7 @@ def test_a_policy_that_stalls(panda, tmp_path):
         assert np.abs(motion[-1, 8:15]).max() < 0.05  # it rests
 
 
+@pytest.mark.slow
 def test_a_policy_that_throws_leaves_an_arm_at_rest(panda, tmp_path):
     """The error reaches the caller, the arm's process is gone, and its last commands took the speed out."""
 
@@ -132,6 +133,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_killed(panda, tmp_path):
     """The arm's process damps it within 50 ms of the last target, brings it to rest and ends."""
     script, path = tmp_path / "killed.py", tmp_path / "commands"
