@@ -66,8 +66,9 @@ def panda_emulated(
     collision_force: Sequence[float] = CAUTIOUS.force,
 ) -> AbstractContextManager[Franka]:
     """Open a Panda that is emulated: libfranka's version 5, the twin `seed` behind it with the stream `noise`."""
-    settings = {"operator": _operator(operator), "collision": Collision(collision_torque, collision_force)}
-    return _emulated(partial(Panda, **settings), 5, partial(Twin, robot, seed, noise=noise), realtime)
+    collision = Collision(collision_torque, collision_force)
+    client = partial(Panda, operator=_operator(operator), collision=collision)
+    return _emulated(client, 5, partial(Twin, robot, seed, noise=noise), realtime)
 
 
 def fr3_emulated(
@@ -81,8 +82,9 @@ def fr3_emulated(
     collision_force: Sequence[float] = CAUTIOUS.force,
 ) -> AbstractContextManager[Franka]:
     """Open an FR3 that is emulated: libfranka's version 10, the twin `seed` behind it with the stream `noise`."""
-    settings = {"operator": _operator(operator), "collision": Collision(collision_torque, collision_force)}
-    return _emulated(partial(FR3, **settings), 10, partial(Twin, robot, seed, noise=noise), realtime)
+    collision = Collision(collision_torque, collision_force)
+    client = partial(FR3, operator=_operator(operator), collision=collision)
+    return _emulated(client, 10, partial(Twin, robot, seed, noise=noise), realtime)
 
 
 @contextmanager

@@ -36,12 +36,18 @@ class Driven:
         self.arm, self.driver = arm, driver
         self._log, self._over = log, False
         self._inverse = InverseInertia(arm.robot)
-        self.state, self.sent, self.clock = arm.read(), np.zeros(arm.robot.n), (0.0, 0.0)
+        self.state: ArmState
+        self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
         """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
-        self.begin()
-        self.state = self.arm.move_to(q)
+        self.driver.reset()
+        self._over = False
+        try:
+            self.state = self.arm.move_to(q)
+        except ArmStopped:
+            self.state = self.arm.read()
+            raise
         return self.state
 
     def begin(self) -> None:

@@ -200,8 +200,8 @@ def _serve(
 
     try:
         with ExitStack() as stack:
-            arm: Arm = open_arm()
-            arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
+            opened = open_arm()
+            arm: Arm = stack.enter_context(opened) if hasattr(opened, "__enter__") else opened
             stack.callback(arm.stop)
             operator = None
             if isinstance(arm, Operated):
