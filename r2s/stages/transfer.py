@@ -130,6 +130,6 @@ def transfer(cfg, overrides):
         reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
         if halted is not None:
             raise Stopped(
-                f"{driven.done} of {len(goals)} goals done on arm={cfg.arm.name}: {halted}; see {run.folder}"
+                f"{rows[cfg.arm.name]['episodes']} of {len(goals)} goals done on arm={cfg.arm.name}: {halted}; see {run.folder}"
             )
     print(f"written: {run.folder}")
