@@ -69,9 +69,8 @@ def main() -> None:
                 late = mine.recv()
                 child.join()
             ms = 1e3 * np.array(late)
-            print(
-                f"| {policy.__name__} | {where} | {np.median(ms):.2f} | {np.percentile(ms, 99):.1f} | {ms.max():.0f} |"
-            )
+            figures = f"{np.median(ms):.2f} | {np.percentile(ms, 99):.1f} | {ms.max():.0f}"
+            print(f"| {policy.__name__} | {where} | {figures} |")
 
 
 if __name__ == "__main__":

@@ -129,7 +129,6 @@ def transfer(cfg, overrides):
             pages.transfer(run, robot, episodes, rows, task.torque(robot), timing, stops, halted)
         reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
         if halted is not None:
-            raise Stopped(
-                f"{rows[cfg.arm.name]['episodes']} of {len(goals)} goals done on arm={cfg.arm.name}: {halted}; see {run.folder}"
-            )
+            count = rows[cfg.arm.name]["episodes"]
+            raise Stopped(f"{count} of {len(goals)} goals done on arm={cfg.arm.name}: {halted}; see {run.folder}")
     print(f"written: {run.folder}")
