@@ -27,6 +27,7 @@ SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3  # rad/s: to let go, of the joint to be
 STRAY = 0.05  # rad: a joint that goes so far in a ramp ends it, whichever it is; so far off, the arm is placed anew
 MARGIN = 0.15  # rad that a pose keeps from the position limits: no joint gets there in one ramp
 BRAKE_SHARE = 0.1  # of tau_max: so little that the rate limit never adds to the delay of the stop
+UNFILTERED_HZ = 1e6  # of the driver's low-pass: ramps have no steps, and joints at rest are to have no command at all
 LARGEST = 0.2  # of tau_max, at which a ramp gives up by default
 
 
@@ -78,7 +79,7 @@ def ramp(
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
     most = limit + BRAKE_SHARE * robot.tau_max  # an arm that slides is ramped from the command that held it
-    drive, recorded = _Drive(Driven(arm, Driver(robot, np.minimum(most, robot.tau_max)))), []
+    drive, recorded = _Drive(Driven(arm, Driver(robot, np.minimum(most, robot.tau_max), cutoff_hz=UNFILTERED_HZ))), []
     try:
         for place in places:
             drive.place(place)
