@@ -27,7 +27,7 @@ SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3  # rad/s: to let go, of the joint to be
 STRAY = 0.05  # rad: a joint that goes so far in a ramp ends it, whichever it is; so far off, the arm is placed anew
 MARGIN = 0.15  # rad that a pose keeps from the position limits: no joint gets there in one ramp
 BRAKE_SHARE = 0.1  # of tau_max: so little that the rate limit never adds to the delay of the stop
-UNFILTERED_HZ = 1e6  # of the driver's low-pass: ramps have no steps, and joints at rest are to have no command at all
+UNFILTERED_HZ = 1e30  # of the driver's low-pass: a ramp has no steps, and joints at rest are to have no command
 LARGEST = 0.2  # of tau_max, at which a ramp gives up by default
 
 
