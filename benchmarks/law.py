@@ -1,8 +1,8 @@
 """What the driver's law does to a trained policy, seen every millisecond: python benchmarks/law.py RUN
 
-RUN is a run folder of stage=train. Its policy reaches for the first goals that nothing was chosen on, on arms of known
-truth with delays of 0 to 8 ms and on development twins; what is asked for and what is sent are written down in every
-cycle. docs/law.md is made of it.
+RUN is a run folder of stage=train. Its policy reaches for the first goals that nothing was chosen on, on arms of
+known truth with delays of 0 to 8 ms and on development twins; what is asked for and what is sent are written down in
+every cycle. docs/law.md is made of it.
 
 The action of the law is what is sent less what is asked for. Its spectrum is judged by its largest line above 20 Hz,
 against the largest below: a loop that shakes has its line there.
@@ -52,7 +52,7 @@ class Watched:
 def judged(arm, policy, task, starts, goals) -> dict[str, float]:
     """Return one row: how the policy does on the arm, and what the law does to it."""
     driven = DrivenArm(arm, task)
-    watched = driven._driver = Watched(driven._driver)
+    watched = driven._driven.driver = Watched(driven._driven.driver)
     row = task.measures(rollout(policy, driven, task, starts, goals))
     asked, sent = np.array(watched.asked), np.array(watched.sent)
     cycles = task.steps * task.substeps

@@ -12,9 +12,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.stages.build import CONF, loaded, unread
 
+STOPPED = 3  # exit status of a run that a stopped arm has ended
 STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
@@ -196,7 +197,7 @@ def check_words(cfg):
 
 
 def run_job(cfg):
-    """Call the stage of one composed config; a mistake ends the job (`failed`)."""
+    """Call the stage of one composed config; a mistake ends the job (`failed`), a stopped arm the whole sweep."""
     from hydra.core.hydra_config import HydraConfig
 
     with said_in_one_line():
@@ -232,6 +233,9 @@ def said_in_one_line():
         failed(f"{error.strerror}{f': {error.filename}' if error.filename else ''}; what was whole before is still")
     except MemoryError as error:
         failed(f"not enough memory: {' '.join(str(error).split())}")
+    except Stopped as reason:
+        print(f"stopped: {' '.join(str(reason).split())}", file=sys.stderr)
+        sys.exit(STOPPED)
     except KeyboardInterrupt:
         print("\ninterrupted; what was written stays in the run folder", file=sys.stderr)
         sys.exit(130)

@@ -1,4 +1,4 @@
-"""The one exception that a user's mistake raises: `run.py` prints its message as one line and exits with 2."""
+"""How a run ends that cannot go on: a user's mistake is one line and exit status 2, a stopped arm one and 3."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -7,6 +7,10 @@ from numbers import Integral, Real
 
 class UserError(ValueError):
     """Says what was wrong, the value seen, what is allowed and the nearest match, in one line."""
+
+
+class Stopped(Exception):  # noqa: N818 (an arm that stops is not a bug)
+    """An arm was stopped, and nobody said that it may move again: the run keeps what it has, and ends as stopped."""
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:

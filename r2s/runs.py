@@ -26,7 +26,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from r2s.errors import UserError
+from r2s.errors import Stopped, UserError
 from r2s.files import whole
 
 PACKAGES = (
@@ -123,7 +123,7 @@ class Run:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
         self._meta["wall_clock_s"] = round(time.monotonic() - self._began, 3)
-        interrupted = kind is KeyboardInterrupt
+        interrupted = kind in (KeyboardInterrupt, Stopped)
         self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")

@@ -571,6 +571,73 @@ def test_a_policy_through_the_client_that_drives_hardware(trained, arm, package,
         np.testing.assert_array_equal(runs[1][key], values)
 
 
+STOPPING = """
+from r2s.arm.interface import ArmStopped, NotCleared
+from r2s.arm.simulated import SimulatedArm
+from r2s.physics.dynamics import nominal_dynamics
+
+
+class Stopping(SimulatedArm):
+    \"""An arm with an operator who is not there; in the second motion somebody presses a button, and releases it.\"""
+
+    def __init__(self, robot, noise=0):
+        self.operator, self.blocked, self._motions = (lambda reason: False), None, noise
+        dynamics = nominal_dynamics(robot, phi1=[1.0] * 7, phi2=[9.0] * 7, phi3=[0.0] * 7)
+        super().__init__(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
+        self._motions = noise
+
+    def move_to(self, q):
+        if self.blocked is not None:
+            raise NotCleared(self.blocked)
+        self._motions += 1
+        return super().move_to(q)
+
+    def command(self, tau):
+        if self._motions == 2 and self.read().t >= 0.15:
+            self.blocked = "user stop"
+            raise ArmStopped(self.blocked)
+        super().command(tau)
+"""
+
+
+@pytest.fixture
+def stopping(tmp_path):
+    """A folder with an arm that is stopped in its second motion: `--config-dir conf arm=stopping`."""
+    (tmp_path / "stopping.py").write_text(STOPPING)
+    (tmp_path / "conf" / "arm").mkdir(parents=True)
+    (tmp_path / "conf" / "arm" / "stopping.yaml").write_text("_target_: stopping.Stopping\nname: stopping\n")
+    return tmp_path
+
+
+def test_a_stopped_arm_ends_a_transfer_with_3(trained, stopping):
+    """Nobody is at the terminal: of 4 goals two are done, the tables say so, and no motor is asked again."""
+    words = ["stage=transfer", f"policy={trained.resolve()}", "arm=stopping", "simulator=none", "name=a"]
+    done = r2s("--config-dir", "conf", *words, *TOY, at=stopping)
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert re.search(r"^stopped: 2 of 4 goals done on arm=stopping: user stop; see ", done.stderr, flags=re.M)
+    assert "2 of 4 goals done" in done.stdout
+    folder = stopping / "runs" / "transfer" / "a"
+    assert json.loads((folder / "meta.json").read_text())["status"] == "stopped"
+    row = json.loads((folder / "summary.json").read_text())["stopping"]
+    assert (row["episodes"], row["asked"], row["stops"]) == (2, 4, 1)
+    with np.load(folder / "episodes_stopping.npz") as saved:
+        assert len(saved["q"]) == 2
+    assert (folder / "stops.txt").read_text() == "episode 2, 0.15 s: user stop\n"
+
+
+def test_a_stopped_arm_ends_an_identification_with_3(stopping):
+    """What was recorded before is kept, and what had been of the motion that was stopped."""
+    words = ["stage=identify", "data=arm", "arm=stopping", "name=a", *TOY, "data.seconds=2.0"]
+    done = r2s("--config-dir", "conf", *words, at=stopping)
+    assert done.returncode == 3, done.stdout + done.stderr
+    said = r"^stopped: while the arm was recorded: user stop; train motion is kept, resume=runs/identify/a goes on$"
+    assert re.search(said, done.stderr, flags=re.M), done.stderr
+    folder = stopping / "runs" / "identify" / "a"
+    assert json.loads((folder / "meta.json").read_text())["status"] == "stopped"
+    with np.load(folder / "train.npz") as whole, np.load(folder / "validation_until_stop.npz") as part:
+        assert (len(whole["t"]), len(part["t"])) == (2001, 150)
+
+
 def test_help_does_not_import_torch():
     """--help answers without the heavy libraries."""
     code = "import sys, runpy; sys.argv = ['run.py', '--help']\ntry: runpy.run_path('run.py', run_name='__main__')\n"

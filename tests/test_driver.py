@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.driver import DEADLINE_S, Driver, Drivers
-from r2s.arm.fci import FR3_Q_MAX, FR3_Q_MIN, FR3_VELOCITY_NOISE, fr3_velocity_bounds
+from r2s.arm.fci import FR3_Q_MAX, FR3_Q_MIN, fr3_velocity_bounds
 from r2s.arm.fr3 import within_fr3
 from r2s.arm.interface import ArmState, Reflexes
 from r2s.arm.simulated import SimulatedArm
@@ -57,7 +57,7 @@ class FR3Reflexes(Reflexes):
         low, high = fr3_velocity_bounds(q)
         over = np.maximum(low - dq, dq - high)
         at = np.maximum(FR3_Q_MIN - q, q - FR3_Q_MAX)
-        return super().inside(q, dq) & (at <= 0).all(-1) & (over <= FR3_VELOCITY_NOISE).all(-1)
+        return super().inside(q, dq) & (at <= 0).all(-1) & (over <= 0).all(-1)
 
 
 def hostile(cycles, seed, robot=PANDA, check=None, m=125):

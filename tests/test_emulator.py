@@ -28,12 +28,15 @@ from r2s.arm.emulator.control import Control, Fault
 from r2s.arm.emulator.process import Emulator, main
 from r2s.arm.emulator.server import listen
 from r2s.arm.fr3 import FR3
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.franka import CAUTIOUS, TORQUE_SHARE, Collision
+from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
 from r2s.arm.panda import Panda
+from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
+from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
@@ -151,7 +154,7 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
     """A few lost packets are borne; each fault ends the motion with libfranka's reason, and can be cleared."""
     _, make, _ = client
     asked = []
-    arm = make(panda, faulty, clear=lambda reason: asked.append(reason) is None)
+    arm = make(panda, faulty, operator=lambda reason: asked.append(reason) is None)
     here = arm.read().q
     arm.move_to(here)
     seen = drive(arm, 60)
@@ -177,7 +180,7 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
         drive(arm, 60)
     with pytest.raises(ArmStopped, match="user stopped"):
         arm.move_to(here)
-    assert len(asked) == len(reasons)
+    assert len(asked) == len(reasons) + 1
     arm.close()
 
 
@@ -197,7 +200,7 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[fault]) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         starts = np.stack([panda.q_home, panda.q_home])
         goals = fixed_episodes(panda, task, 2)[1]
         driven = DrivenArm(arm, task)
@@ -214,19 +217,20 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
 
 
 def test_a_stop_button_ends_a_deployment(client, panda):
-    """A reflex can be cleared, a pressed button cannot: the episode ends, and the next one does not begin."""
+    """A reflex can be cleared, a pressed button cannot: the episode ends, and no other one begins."""
     _, make, version = client
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
         driven = DrivenArm(arm, task)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
         stops = driven.stops
         arm.close()
-    assert [stop.episode for stop in stops] == [0, 1]
-    assert "on the way to its start: the arm is not ready to move: it is user stopped" in str(stops[1])
+    assert [stop.episode for stop in stops] == [0]
+    assert driven.done == 1
+    assert "the arm is not ready to move: it is user stopped" in driven.halted
     assert np.isinf(episodes.distance[:, -1]).all()
 
 
@@ -238,10 +242,10 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
         arm.move_to(panda.q_home)
         with pytest.raises(ArmStopped, match="joint_position_limits_violation"):
             drive(arm, 10, BARE)
-        with pytest.raises(ArmStopped, match=r"nobody cleared that: .*joint_position_limits_violation"):
+        with pytest.raises(ArmStopped, match=r"no operator agreed .*joint_position_limits_violation"):
             arm.move_to(panda.q_home)
         arm.close()
-        arm = make(panda, address, clear=lambda reason: True)  # the reflex outlives the connection
+        arm = make(panda, address, operator=lambda reason: True)  # the reflex outlives the connection
         target = panda.q_home + np.array([0, 0, 0, 0, 0, 0, 0.05])
         assert np.abs(arm.move_to(target).q - target).max() < 2e-3
         for bad, reason in ((np.full(7, np.nan), "nan, must be finite"), (np.full(7, 2.0), r"steps by \+2.000 Nm")):
@@ -255,12 +259,68 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
         arm.close()
 
 
+@pytest.mark.slow  # without a wire: test_driven.py
+def test_pressed_and_released_counts_as_pressed(client, panda):
+    """An idle arm whose button was released does not move before the operator agreed; then it does."""
+    _, make, version = client
+    with Emulator(partial(Bare, panda), version=version, faults=[Fault("press", 10, cycles=40)]) as address:
+        answers, asked = iter((False, True)), []
+        arm = make(panda, address, operator=lambda reason: asked.append(reason) or next(answers))
+        arm.move_to(panda.q_home)
+        with pytest.raises(ArmStopped, match=r"User Stop|user stop|emergency"):
+            drive(arm, 60, BARE)
+        time.sleep(0.3)  # an idle emulator passes 20 ms of the arm in as many of the clock
+        assert int(arm._client.idle().robot_mode) == fci.IDLE  # it would move
+        with pytest.raises(NotCleared, match="no operator agreed"):
+            arm.move_to(panda.q_home)
+        arm.move_to(panda.q_home)
+        drive(arm, 20, BARE)
+        assert len(asked) == 2
+        arm.close()
+
+
+def held(robot):
+    """Return an arm of known truth whose links can be held."""
+    return SimulatedArm(robot, nominal_dynamics(robot, **conf("friction/paper")), position_noise=0, velocity_noise=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cautious", [True, False])
+def test_who_holds_a_link_on_the_way(cautious, client, panda):
+    """The arm stops itself at its threshold; without thresholds the way is given up, and presses no harder than its
+    share of the torque on the way.
+    """
+    _, make, version = client
+    collision = Collision([5.0] * 7, CAUTIOUS.force) if cautious else Collision([1e3] * 7, [1e3] * 6)
+    with Emulator(partial(held, panda), version=version, faults=[Fault("hold", 300, cycles=10_000)]) as address:
+        arm = make(panda, address, operator=lambda reason: False, collision=collision)
+        told, send = [], arm._client.exchange
+        arm._client.exchange = lambda tau: told.append(tau) or send(tau)
+        reason = "joint_reflex" if cautious else r"joint 1 is 0.10\d rad off its way"
+        with pytest.raises(ArmStopped, match=reason):
+            arm.move_to(arm.read().q + np.array([0.5, 0, 0, 0, 0, 0, 0]))
+        assert np.abs(told).max(0)[0] <= (5.0 + 2.5 if cautious else TORQUE_SHARE * 87) + 1e-6  # friction, and 15 Hz
+        with pytest.raises(NotCleared, match="no operator agreed"):
+            arm.move_to(arm.read().q)
+        arm.close()
+
+
+def test_what_cannot_be_held(panda):
+    """A fault that the arm behind the emulator cannot have is one line."""
+    with pytest.raises(UserError, match="fault 'hold': Bare has nothing that could push it"):
+        Control(Bare(panda), 5, [Fault("hold", 3)])
+    with pytest.raises(UserError, match="collision_torque: 3 numbers, allowed are 7"):
+        Collision([1.0] * 3, CAUTIOUS.force)
+    with pytest.raises(UserError, match=r"collision_force: 0.0 is not allowed"):
+        Collision(CAUTIOUS.torque, [0.0] * 6)
+
+
 @pytest.mark.slow  # on a loaded machine the clients give up, and say so
 def test_real_time_does_not_wait(client, panda):
     """At 1 kHz a client that stalls loses its motion; a machine that stalls a little does not."""
     _, make, version = client
     with Emulator(partial(Bare, panda), version=version, realtime=True, patience=400) as address:
-        arm = make(panda, address, clear=lambda reason: True)
+        arm = make(panda, address, operator=lambda reason: True)
         arm.move_to(panda.q_home)
         drive(arm, 200, BARE)
         arm.stop()

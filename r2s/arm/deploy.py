@@ -1,6 +1,7 @@
-"""A policy on an arm: observe, ask the policy at its own rate, let the driver command at 1 kHz.
+"""A policy on an arm that waits for it: observe, ask the policy at its own rate, let the driver command at 1 kHz.
 
-The policy is asked within the cycle. One that hangs leaves the arm without commands, and the arm stops itself.
+Here time passes only while nobody thinks: right for twins and in lock-step, and the same bit for bit. An arm whose
+clock does not wait is driven from a process of its own, r2s/arm/live.py.
 """
 
 import time
@@ -9,13 +10,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmState, ArmStopped
+from r2s.arm.interface import Arm, ArmState, ArmStopped, NotCleared, Operated
 from r2s.physics.rigid_body import Kinematics
-from r2s.physics.robot import SIM_DT
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
 LOGGED_S = 1.0  # before a stop, of every cycle
+ATTEMPTS = 3  # to bring an arm to its start, each with the operator's consent
 
 
 @dataclass
@@ -59,14 +62,22 @@ class Stop:
         return f"episode {self.episode + 1}, {self.when}: {self.reason}"
 
 
+def episode_driver(robot: Robot, task: Task, soft_start_s: float) -> Driver:
+    """Return the driver of an episode of `task`."""
+    period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
+    return Driver(robot, task.torque(robot), **period, soft_start_s=soft_start_s)
+
+
 class DrivenArm:
     """An arm behind the driver, one control period at a time; the `Arms` of `r2s.tasks.episode.rollout`.
 
     Attributes:
         stops: why episodes ended early, where they did. timing: see there.
+        done: episodes that the arm was brought to the start of, or tried to: all, unless it was `halted`.
+        halted: why there are no further episodes, or None: the operator was asked after a stop, and did not agree.
 
     Args:
-        arm: at 1 kHz.
+        arm: at 1 kHz; one that waits for its commands.
         task: rates and torques.
         soft_start_s: s, over which the torque of an episode fades in; hardware deserves some, the twin needs none.
     """
@@ -76,54 +87,77 @@ class DrivenArm:
     def __init__(self, arm: Arm, task: Task, *, soft_start_s: float = 0.0):
         self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
         self._kinematics = Kinematics(arm.robot)
-        period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
-        self._driver = Driver(arm.robot, task.torque(arm.robot), **period, soft_start_s=soft_start_s)
+        self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
+        self._driven = Driven(arm, episode_driver(arm.robot, task, soft_start_s), self._log)
         self.stops: list[Stop] = []
         self.timing = Timing()
-        self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
+        self.done = 0
+        self.halted: str | None = None
 
     def place(self, starts: np.ndarray, first: int) -> State:
-        """Move to starts (1, n) rad and begin episode `first` there; a stop on the way is its stop."""
-        self._driver.reset()
+        """Move to starts (1, n) rad and begin episode `first` there.
+
+        A stop on the way is the episode's stop. Beside an arm with an operator he is asked whether to try again;
+        where he does not agree, neither this nor any later episode begins.
+        """
         self._log.clear()
-        self._episode, self._stopped, self._sent = first, False, 0.0
-        try:
-            self._state = self._arm.move_to(starts[0])
-        except ArmStopped as reason:
-            self._state = self._arm.read()
-            self._stop("on the way to its start", reason)
+        self._episode, self._stopped, self._sent, self._limited = first, False, 0.0, 0
+        if self.halted is None:
+            self._approach(starts[0])
+        self._stopped = self._stopped or self.halted is not None
+        self.done += self.halted is None
         return self._read()
+
+    def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
+        """Return the arm's state, what the low-pass let through (n,) Nm, whether the episode was stopped, and in how
+        many cycles of it the driver's law changed what was asked for.
+        """
+        driver = self._driven.driver
+        return self._driven.state, driver.effort, self._stopped, driver.limited
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torque (1, n) Nm, or until the arm stops."""
         self.timing.policy.append(time.perf_counter() - self._told)
-        try:
-            for ms in range(self._substeps):
-                self._cycle(target[0] if ms == 0 else None)
-        except ArmStopped as reason:
-            self._stop(f"{self._state.t:.2f} s", reason)
+        for ms in range(self._substeps):
+            if not self.cycle(target[0] if ms == 0 else None):
+                break
         return self._read()
 
     def end(self) -> np.ndarray:
         """Stop the arm; return (1,), whether it had stopped, or was being stopped, before."""
-        if not self._stopped and self._driver.stopping is not None:  # the end came before the arm was at rest
-            self._stop(f"{self._state.t:.2f} s", self._driver.stopping)
-        self._arm.stop()
+        reason = self._driven.end()
+        if not self._stopped and reason is not None:  # the end came before the arm was at rest
+            self._stop(f"{self._driven.state.t:.2f} s", reason)
         return np.array([self._stopped])
 
-    def _cycle(self, target: np.ndarray | None) -> None:
-        began = time.perf_counter()
-        wanted = self._driver(self._state, target)
-        now = time.perf_counter()
+    def cycle(self, target: np.ndarray | None) -> bool:
+        """Go on for 1 ms with the target (n,) Nm, None where nothing new was said; return whether the arm goes on."""
+        try:
+            self._driven(target)
+        except ArmStopped as reason:
+            self._stop(f"{self._driven.state.t:.2f} s", reason)
+        began, now = self._driven.clock
         self.timing.driver.append(now - began)
         if self._sent:
             self.timing.period.append(now - self._sent)
         self._sent = now
-        self._log.append((self._state, wanted))
-        self._arm.command(wanted)
-        self._state = self._arm.read()
-        if self._driver.done:
-            raise ArmStopped(self._driver.stopping)
+        return not self._stopped
+
+    def _approach(self, start: np.ndarray) -> None:
+        for left in reversed(range(ATTEMPTS if isinstance(self._arm, Operated) else 1)):
+            try:
+                self._driven.place(start)
+                return
+            except NotCleared as reason:
+                self.halted = str(reason)
+                return
+            except ArmStopped as reason:
+                if left:
+                    continue
+                if isinstance(self._arm, Operated):
+                    self.halted = str(reason)
+                    return
+                self._stop("on the way to its start", reason)
 
     def _stop(self, when: str, reason: object) -> None:
         rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in self._log]
@@ -132,11 +166,17 @@ class DrivenArm:
         self._stopped = True
 
     def _read(self) -> State:
-        s, (ee, jacobian) = self._state, self._kinematics(self._state.q)
-        state = State(
-            t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
-            tau=s.tau_J_d[None], effort=self._driver.effort[None], stopped=np.array([self._stopped]),
-            limited=np.array([self._driver.limited]),
-        )  # fmt: skip
+        s, effort, stopped, limited = self.read()
+        share = (limited - self._limited) / self._substeps
+        state, self._limited = as_state(self._kinematics, s, effort, stopped, share), limited
         self._told = time.perf_counter()
         return state
+
+
+def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
+    """Return what a task is told of one arm; effort (n,) Nm, stopped and limited as of `State`."""
+    ee, jacobian = kinematics(s.q)
+    return State(
+        t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
+        tau=s.tau_J_d[None], effort=effort[None], stopped=np.array([stopped]), limited=np.array([limited]),
+    )  # fmt: skip

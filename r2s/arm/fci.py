@@ -21,6 +21,14 @@ VERSIONS = (5, 10)
 HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
 CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
 MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # deviations follow, unused
+COLLISION = np.dtype(  # thresholds of accelerating arms first, which are the same for our clients
+    [
+        ("torque_acceleration", "<f8", (2, 7)),
+        ("lower_torque", "<f8", 7),
+        ("upper_torque", "<f8", 7),
+        ("force", "<f8", (4, 6)),
+    ]
+)
 
 
 _SHARED = ("Connect", "Move", "StopMove")
@@ -67,7 +75,6 @@ FR3_Q_MIN = np.array([-2.9007, -1.8361, -2.9007, -3.0770, -2.8763, 0.4398, -3.05
 FR3_Q_MAX = np.array([2.9007, 1.8361, 2.9007, -0.1169, 2.8763, 4.6216, 3.0508])
 FR3_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
 FR3_VELOCITY_OFFSET = np.array([0.6599, 0.2517, 0.2, 0.3533, 0.5757, 0.4878, 0.4628])
-FR3_VELOCITY_NOISE = 0.02  # rad/s, which that bound must forgive a joint at rest near its limit
 FR3_DECELERATION = np.array([6, 2.585, 3.5, 4, 17, 5.5, 17])
 
 
@@ -125,7 +132,7 @@ def outside_fr3(q: np.ndarray, dq: np.ndarray) -> tuple[int, str] | None:
     low, high = fr3_velocity_bounds(q)
     over = np.maximum(low - dq, dq - high)
     i = int(over.argmax())
-    if over[i] <= FR3_VELOCITY_NOISE:
+    if over[i] <= 0:
         return None
     allowed = f"{low[i]:.3f} to {high[i]:.3f}"
     return JOINT_VELOCITY, f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, at {q[i]:.4f} rad an FR3 allows {allowed}"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from r2s.arm import fci
-from r2s.arm.franka import Franka, connect, package, words
+from r2s.arm.franka import CAUTIOUS, Collision, Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
 from r2s.physics.robot import Robot
 
@@ -36,7 +36,7 @@ class FR3(Franka):
     Args:
         robot: the arm that the policy knows; what an FR3 allows less is cut off here (`within_fr3`).
         address: host name or IP of the arm, or of an emulator.
-        clear: asked before a reflex is cleared, see `Franka`.
+        operator: asked before the arm moves again after a stop, see `Franka`. collision: see there.
         realtime: demand a real-time kernel and priority, as hardware deserves; the emulator does not need them.
 
     Raises:
@@ -44,9 +44,15 @@ class FR3(Franka):
     """
 
     def __init__(
-        self, robot: Robot, address: str, *, clear: Callable[[str], bool] | None = None, realtime: bool = False
+        self,
+        robot: Robot,
+        address: str,
+        *,
+        operator: Callable[[str], bool] | None = None,
+        realtime: bool = False,
+        collision: Collision = CAUTIOUS,
     ):
-        super().__init__(within_fr3(robot), _FR3Client(address, realtime), clear)
+        super().__init__(within_fr3(robot), _FR3Client(address, realtime), operator, collision)
 
 
 class _FR3Client:
@@ -74,6 +80,10 @@ class _FR3Client:
 
     def recover(self) -> None:
         self._ask(self._robot.automatic_error_recovery)
+
+    def watch_for(self, collision: Collision) -> None:
+        torque, force = list(collision.torque), list(collision.force)
+        self._ask(lambda: self._robot.set_collision_behavior(torque, torque, force, force))
 
     def close(self) -> None:
         self._control = self._robot = None

@@ -6,34 +6,62 @@ needed, and what brings the arm to its place on hardware is what the emulator ha
 """
 
 import importlib
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
 
 from r2s.arm import fci
-from r2s.arm.interface import ArmState, ArmStopped, Reflexes
-from r2s.arm.tracking import Tracker
-from r2s.errors import UserError
+from r2s.arm.driven import STILL, Driven
+from r2s.arm.driver import Driver
+from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
+from r2s.arm.tracking import CUTOFF_HZ, Tracker
+from r2s.errors import UserError, check_number
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
-from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 
 SPEED = 0.2  # of dq_max, on the way to a place
 ACCELERATION = 0.2  # of ddq_max
 SETTLE_S = 3.0  # at most, at the end of the way
+TORQUE_SHARE = (
+    0.2  # of tau_max, the most that the way may take: what somebody who holds a link meets (docs/safety.md)
+)
+ASTRAY = 0.1  # rad off the way, at which it is given up
 PULL = 15.0  # of tau_max per rad and s, of the integral that then overcomes breakaway
-PULL_SHARE = 0.15  # of tau_max, at most; the tracking controller takes 0.8
+PULL_SHARE = 0.15  # of tau_max, at most
 NEAR = 2e-3  # rad: there
 ACCEPTED = 1e-2  # rad: near enough when the time is over; friction of a real wrist
-STILL = 0.02  # rad/s
-REST_S = 0.5  # at most, to damp a motion that ends
-REST_RATE = 15.0  # 1/s, of that damping
-REST_SHARE = 0.3  # of tau_max
-RATE_SHARE = 0.95  # of dtau_max
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
+
+
+@dataclass(frozen=True)
+class Collision:
+    """At which external force the arm stops itself, as libfranka's setCollisionBehavior; contact at the same.
+
+    Attributes:
+        torque: (7,) Nm of each joint. force: (6,) N and Nm at the hand.
+
+    Raises:
+        UserError: not so many numbers above 0.
+    """
+
+    torque: Sequence[float]
+    force: Sequence[float]
+
+    def __post_init__(self):
+        for name, values, count in (("torque", self.torque, 7), ("force", self.force, 6)):
+            if len(values) != count:
+                raise UserError(f"collision_{name}: {len(values)} numbers, allowed are {count}")
+            for value in values:
+                check_number(f"collision_{name}", value, "(0, inf)")
+
+
+# those of libfranka's own motion examples, its most cautious
+CAUTIOUS = Collision(torque=(20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0), force=(20.0, 20.0, 20.0, 25.0, 25.0, 25.0))
 
 
 class Client(Protocol):
@@ -62,39 +90,58 @@ class Client(Protocol):
         """Clear a reflex."""
         ...
 
+    def watch_for(self, collision: Collision) -> None:
+        """Set at which external force the arm stops itself."""
+        ...
+
     def close(self) -> None:
         """Drop the connection."""
         ...
 
 
 class Franka:
-    """An `Arm` (r2s/arm/interface.py) behind a `Client`.
+    """An `Arm` (r2s/arm/interface.py) behind a `Client`, with somebody beside it (`Operated`).
 
     The motion of a caller begins with its first `command`; from then on the arm wants one per millisecond.
+
+    Attributes:
+        operator, blocked: see `Operated`. Whatever ended a motion blocks the arm but `stop`: a reflex, a stop button,
+            also one that was released since, a command that was refused, a way that was given up.
 
     Args:
         robot: the arm's limits and nominal model.
         client: the connection.
-        clear: asked with the reason before a reflex is cleared; returns whether the operator agrees. By default
-            nobody does: `move_to` refuses until the arm was cleared by other means.
+        operator: asked with the reason before the arm moves again after a stop. By default nobody is there:
+            `move_to` refuses until another connection begins with an arm that is ready.
+        collision: at which external force the arm stops itself.
     """
 
-    def __init__(self, robot: Robot, client: Client, clear: Callable[[str], bool] | None = None):
+    def __init__(
+        self,
+        robot: Robot,
+        client: Client,
+        operator: Callable[[str], bool] | None = None,
+        collision: Collision = CAUTIOUS,
+    ):
         if robot.n != 7:
             raise UserError(f"a Franka arm has 7 joints; {robot.name} has {robot.n}")
-        self.robot = robot
-        self._client, self._clear = client, clear
-        self._reflexes, self._inverse = Reflexes(robot), InverseInertia(robot)
-        self._moving, self._closed = False, False
+        self.robot, self.operator = robot, operator
+        self.blocked: str | None = None
+        self._client, self._collision = client, collision
+        self._reflexes = Reflexes(robot)
+        self._moving, self._closed, self._watched = False, False, False
         self._stopped: str | None = "no motion was started; call move_to first"
         self._rest()
+        # a cycle of references would keep an arm that nobody has any more, and its connection
+        self._own = Driven(weakref.proxy(self), Driver(robot, TORQUE_SHARE * robot.tau_max, cutoff_hz=CUTOFF_HZ))
 
     def move_to(self, q: np.ndarray) -> ArmState:
         """Go to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
 
         Raises:
-            ArmStopped: q is outside the limits, the arm has stopped itself and nobody clears that, it stops on
-                the way, or it does not come within 10 mrad.
+            NotCleared: the arm has stopped before, and no operator agreed that it may move.
+            ArmStopped: q is outside the limits, the arm is not ready, it stops on the way, it is 0.1 rad off its
+                way, or it does not come within 10 mrad.
 
         """
         q = np.array(q, dtype=float)
@@ -127,18 +174,18 @@ class Franka:
             self._reflexes.command(tau, self._state.tau_J_d)
         except ArmStopped as refused:
             self.stop()
-            self._stopped = str(refused)
+            self._stopped = self.blocked = str(refused)
             raise
         self._send(tau)
 
     def stop(self) -> None:
         """Damp what still moves, for at most half a second, and end the motion."""
-        try:
-            if self._moving:
-                self._damp()
-                self._end()
-        except ArmStopped as reason:
-            self._stopped = str(reason)
+        for part in (self._damp, self._end):  # an arm whose driver gave up damping it is still to be stopped
+            try:
+                if self._moving:
+                    part()
+            except ArmStopped as reason:
+                self._stopped = self.blocked = str(reason)
         self._moving = False
         if self._stopped is None:
             self._stopped = "stop was called"
@@ -157,11 +204,17 @@ class Franka:
             self._state = self._sample(self._client.exchange(tau))
         except ArmStopped as reason:
             self._moving, self._stopped = False, str(reason)
+            self.blocked = self._stopped
             raise
 
     def _sample(self, s: Any) -> ArmState:
         t = (_ms(s) - self._begun) * SIM_DT
         return ArmState(t, np.array(s.q), np.array(s.dq), np.array(s.tau_J), np.array(s.tau_J_d))
+
+    def _damp(self) -> None:
+        if self._stopped is None:
+            self._own.begin()
+            self._own.rest()
 
     def _end(self) -> None:
         self._moving = False
@@ -176,59 +229,63 @@ class Franka:
         self._state = ArmState(0.0, seen.q, seen.dq, seen.tau_J, np.zeros(self.robot.n))
 
     def _ready(self) -> None:
-        """Raise ArmStopped unless the arm can move, after its reflex was cleared where there is one."""
+        """Raise ArmStopped unless the arm can move; after a stop the operator has to agree before."""
         if self._closed:
             raise ArmStopped("the connection was closed")
         s = self._client.idle()
         mode = int(s.robot_mode)
+        if self.blocked is None and mode == fci.REFLEX:
+            self.blocked = str(s.last_motion_errors) or "a reflex from before"
+        elif self.blocked is None and mode == fci.USER_STOPPED:
+            self.blocked = "it is user stopped"
+        if self.blocked is not None:
+            if self.operator is None or not self.operator(self.blocked):
+                raise NotCleared(f"the arm has stopped and no operator agreed that it may move: {self.blocked}")
+            mode = int(self._client.idle().robot_mode)  # a stop button may have been released while he was asked
         if mode == fci.REFLEX:
-            reason = str(s.last_motion_errors) or str(self._stopped)
-            if self._clear is None or not self._clear(reason):
-                raise ArmStopped(f"the arm has stopped itself and nobody cleared that: {reason}")
             self._client.recover()
         elif mode != fci.IDLE:
             raise ArmStopped(f"the arm is not ready to move: it is {MODES.get(mode, f'in mode {mode}')}")
+        self.blocked = None
+        if not self._watched:
+            self._client.watch_for(self._collision)
+            self._watched = True
         self._rest()
 
     def _go(self, q: np.ndarray) -> None:
         path, moving = _slow_path(self.robot, self._state.q, q)
-        follow = Tracker(self.robot, path)
-        step, most = RATE_SHARE * self.robot.dtau_max * SIM_DT, PULL_SHARE * self.robot.tau_max
+        follow, own = Tracker(self.robot, path, ASTRAY), self._own
+        most = PULL_SHARE * self.robot.tau_max
         pull, before = np.zeros(7), np.zeros(7)
+        own.begin()
         try:
             for k in range(len(path.t)):
-                s = self._state
+                s = own.state
                 left = q - s.q
                 if k >= moving and np.abs(left).max() < NEAR and np.abs(s.dq).max() < STILL:
                     break
-                tau = follow(k, s.q, s.dq, s.tau_J_d - pull)
+                if (reason := follow.astray(k, s)) is not None:
+                    own.halt(reason)
                 if k >= moving:
                     # Clegg (1958): an integral that restarts where the error changes sign, or what broke a joint
                     # loose would carry it past its place
                     pull = np.clip(pull + PULL * SIM_DT * self.robot.tau_max * left, -most, most)
                     pull = np.where(left * before < 0, 0, pull)
                     before = left
-                self._send(s.tau_J_d + np.clip(tau + pull - s.tau_J_d, -step, step))
+                own(follow(k, s) + pull)
             self._end()
+        except ArmStopped as reason:
+            self.blocked = str(reason)
+            raise
         finally:
-            if self._moving:  # interrupted
+            if self._moving:  # interrupted, or given up
                 self.stop()
         left = np.abs(self._state.q - q)
         if left.max() > ACCEPTED:
             i = int(left.argmax())
             self._stopped = f"joint {i + 1} stands at {self._state.q[i]:.4f} rad and was to go to {q[i]:.4f} rad"
+            self.blocked = self._stopped
             raise ArmStopped(self._stopped)
-
-    def _damp(self) -> None:
-        """Take speed out, and torque back, before the arm's own controller takes over."""
-        damping = REST_RATE / np.diag(self._inverse(self._state.q[None])[0])
-        most, step = REST_SHARE * self.robot.tau_max, RATE_SHARE * self.robot.dtau_max * SIM_DT
-        for _ in range(round(REST_S / SIM_DT)):
-            s = self._state
-            if np.abs(s.dq).max() < STILL and (np.abs(s.tau_J_d) <= step).all():
-                return
-            tau = np.clip(-damping * s.dq, -most, most)
-            self._send(s.tau_J_d + np.clip(tau - s.tau_J_d, -step, step))
 
 
 def package(name: str, extra: str) -> ModuleType:

@@ -5,18 +5,30 @@ panda_py `control(callback)` loop and pylibfranka's readOnce/writeOnce both fit:
 came with, `command` ends the cycle and waits for the next.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import Recording
 
 RATE_TOLERANCE = 1e-3  # Nm: a command that was limited to the allowed step in another precision still passes
 
 
 class ArmStopped(RuntimeError):  # noqa: N818 (an arm that stops is not a bug)
-    """The arm ended the motion, for the reason in the message; it moves again after the next `move_to`."""
+    """The arm ended the motion, for the reason in the message; it moves again after the next `move_to`.
+
+    Attributes:
+        recording: what was recorded until then, where a recording was made that is worth keeping.
+    """
+
+    recording: Recording | None = None
+
+
+class NotCleared(ArmStopped):
+    """The arm had stopped, and no operator has said that it may move again: what was to be done with it ends here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +77,19 @@ class Arm(Protocol):
     def stop(self) -> None:
         """End the motion; harmless when it has already ended."""
         ...
+
+
+@runtime_checkable
+class Operated(Protocol):
+    """An `Arm` beside which somebody stands: after any stop he is asked before it moves again.
+
+    Attributes:
+        operator: asked with the reason, returns whether he agrees; None: nobody is there, and nobody agrees.
+        blocked: why `move_to` has to ask him; None: it has not. Who stops the motion of an arm says so here.
+    """
+
+    operator: Callable[[str], bool] | None
+    blocked: str | None
 
 
 class Reflexes:

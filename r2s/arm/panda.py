@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.arm.franka import Franka, connect, package, words
+from r2s.arm.franka import CAUTIOUS, Collision, Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
 from r2s.physics.robot import Robot
 
@@ -26,7 +26,7 @@ class Panda(Franka):
     Args:
         robot: its limits and nominal model.
         address: host name or IP of the arm, or of an emulator.
-        clear: asked before a reflex is cleared, see `Franka`.
+        operator: asked before the arm moves again after a stop, see `Franka`. collision: see there.
         realtime: demand a real-time kernel and priority, as hardware deserves; the emulator does not need them.
 
     Raises:
@@ -34,9 +34,15 @@ class Panda(Franka):
     """
 
     def __init__(
-        self, robot: Robot, address: str, *, clear: Callable[[str], bool] | None = None, realtime: bool = False
+        self,
+        robot: Robot,
+        address: str,
+        *,
+        operator: Callable[[str], bool] | None = None,
+        realtime: bool = False,
+        collision: Collision = CAUTIOUS,
     ):
-        super().__init__(robot, _PandaClient(address, realtime), clear)
+        super().__init__(robot, _PandaClient(address, realtime), operator, collision)
 
 
 class _PandaClient:
@@ -71,6 +77,10 @@ class _PandaClient:
 
     def recover(self) -> None:
         _ask(self._robot.automatic_error_recovery)
+
+    def watch_for(self, collision: Collision) -> None:
+        torque, force = list(collision.torque), list(collision.force)
+        _ask(lambda: self._robot.set_collision_behavior(torque, torque, force, force))
 
     def close(self) -> None:
         self._motion = self._robot = None

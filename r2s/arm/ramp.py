@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from r2s.arm.driven import Driven
+from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState
 from r2s.errors import UserError
 from r2s.identification.breakaway import MOVED
@@ -24,8 +26,9 @@ BRAKE_S, STOPS = 1.0, 4  # after which the next ramp comes whatever the arm does
 SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3  # rad/s: to let go, of the joint to be ramped next, after letting go
 STRAY = 0.05  # rad: a joint that goes so far in a ramp ends it, whichever it is; so far off, the arm is placed anew
 MARGIN = 0.15  # rad that a pose keeps from the position limits: no joint gets there in one ramp
-RATE_SHARE = 0.9  # of dtau_max
 BRAKE_SHARE = 0.1  # of tau_max: so little that the rate limit never adds to the delay of the stop
+UNFILTERED_HZ = 1e30  # of the driver's low-pass: a ramp has no steps, and joints at rest are to have no command
+LARGEST = 0.2  # of tau_max, at which a ramp gives up by default
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
@@ -62,20 +65,21 @@ def ramp(
         progress: called after every ramp with (ramps done, ramps in all).
 
     Raises:
-        ArmStopped: the arm ended the motion; nothing is returned of it.
+        ArmStopped: the arm ended the motion, or the driver did; nothing is returned of it.
         UserError: an argument out of range.
     """
     robot = arm.robot
     places = _poses(robot, poses)
     small = np.minimum(1.0, robot.tau_max / 12)
     rising = _positive("rate", rate, np.where(robot.tau_max >= BIG, 2.2, 4.0 * small), 0.1 * robot.dtau_max)
-    limit = _positive("largest", largest, 0.2 * robot.tau_max, robot.tau_max)
+    limit = _positive("largest", largest, LARGEST * robot.tau_max, robot.tau_max)
     if not 1e-4 <= moved <= 0.02:
         raise UserError(f"ramp.moved={moved} rad, allowed 0.0001 to 0.02")
     # a joint rests while the others are ramped one way, before its turn comes the other way
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    drive, recorded = _Drive(arm), []
+    most = limit + BRAKE_SHARE * robot.tau_max  # an arm that slides is ramped from the command that held it
+    drive, recorded = _Drive(Driven(arm, Driver(robot, np.minimum(most, robot.tau_max), cutoff_hz=UNFILTERED_HZ))), []
     try:
         for place in places:
             drive.place(place)
@@ -83,13 +87,13 @@ def ramp(
                 recorded.append(drive.push(j, sign * rising[j], limit[j], moved))
                 drive.stop(coming=each[(i + 1) % len(each)][0])
                 if np.abs(drive.state.q - place).max() > STRAY:
-                    arm.stop()
+                    drive.end()
                     drive.place(place)
                 if progress is not None:
                     progress(len(recorded), len(which))
-            arm.stop()
+            drive.end()
     finally:
-        arm.stop()
+        drive.end()
     t, q, dq, tau = (np.concatenate([np.array([row[i] for row in rows]) for rows in recorded]) for i in range(4))
     trajectory = np.repeat(np.arange(len(which)), [len(rows) for rows in recorded])
     motion = Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=trajectory, name=robot.name)
@@ -104,12 +108,21 @@ class _Drive:
     `held` (n,) Nm what kept the arm from sliding in the last stop.
     """
 
-    def __init__(self, arm: Arm):
-        self.arm = arm
+    def __init__(self, driven: Driven):
+        robot = driven.arm.robot
+        self._driven, self._tau_max = driven, robot.tau_max
         self.rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
-        self._step = RATE_SHARE * arm.robot.dtau_max * SIM_DT
-        self._model = arm.robot.model(gravity=False)
-        self._mass = np.zeros((arm.robot.n, arm.robot.n))
+        self._model = robot.model(gravity=False)
+        self._mass = np.zeros((robot.n, robot.n))
+
+    @property
+    def state(self) -> ArmState:
+        """What was read last."""
+        return self._driven.state
+
+    def end(self) -> None:
+        """Stop the arm."""
+        self._driven.end()
 
     def place(self, q: np.ndarray) -> None:
         """Bring the arm to q (n,) rad and let it go there."""
@@ -117,19 +130,17 @@ class _Drive:
         data.qpos[:] = q
         mujoco.mj_forward(self._model, data)
         mujoco.mj_fullM(self._model, data, self._mass)
-        self.state = self.arm.move_to(q)
+        self._driven.place(q)
         self.held, self.base = np.zeros(len(q)), np.zeros(len(q))
         if not self.rest().all():
             self.stop(coming=0)
 
     def send(self, tau: np.ndarray) -> ArmState:
-        """Command tau (n,) Nm, or as near to it as limits allow, and return the state after it."""
-        last, limit = self.state.tau_J_d, self.arm.robot.tau_max
-        command = last + np.clip(np.clip(tau, -limit, limit) - last, -self._step, self._step)
-        self.rows.append((self.state.t, self.state.q, self.state.dq, command))
-        self.arm.command(command)
-        self.state = self.arm.read()
-        return self.state
+        """Ask for tau (n,) Nm in this cycle, and return the state after it; `rows` has what the driver made of it."""
+        s = self.state
+        after = self._driven(tau)
+        self.rows.append((s.t, s.q, s.dq, self._driven.sent))
+        return after
 
     def push(self, joint: int, rate: float, largest: float, moved: float) -> list:
         """Ramp one joint at `rate` Nm/s (signed); return all rows since the arm was let go."""
@@ -169,8 +180,8 @@ class _Drive:
     def _brake(self, coming: int) -> None:
         """Bring all joints to rest where they are."""
         self.rows = []
-        q, total, w = self.state.q, np.zeros(self.arm.robot.n), BANDWIDTH
-        most = BRAKE_SHARE * self.arm.robot.tau_max
+        q, total, w = self.state.q, np.zeros(len(self._tau_max)), BANDWIDTH
+        most = BRAKE_SHARE * self._tau_max
         for k in range(round(BRAKE_S / SIM_DT)):
             if k <= DAMPED:
                 q = self.state.q

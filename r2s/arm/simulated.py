@@ -12,6 +12,9 @@ from r2s.physics.simulator import Simulator
 class SimulatedArm:
     """MuJoCo with the friction law of r2s/physics/friction.py, for identification against a known truth.
 
+    Attributes:
+        external: (n,) Nm, with which the world pushes the joints in the next cycle; zero by default.
+
     Args:
         robot, dynamics: the arm and its truth.
         position_noise, velocity_noise: standard deviation of q, rad, and dq, rad/s, white.
@@ -28,6 +31,7 @@ class SimulatedArm:
         self._rng = np.random.default_rng(seed)
         self._reflexes = Reflexes(robot)
         self._cycle, self._last = 0, np.zeros(robot.n)
+        self.external = np.zeros(robot.n)
         self._state = self.move_to(robot.q_home)
 
     def move_to(self, q: np.ndarray) -> ArmState:
@@ -45,7 +49,7 @@ class SimulatedArm:
         """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as the real arm's reflexes would."""
         self._reflexes.command(tau, self._last)
         self._last = np.array(tau, dtype=float)
-        self._sim.rollout(self._motors(self._last[None, None]))
+        self._sim.rollout(self._motors(self._last[None, None]) + self.external)
         self._reflexes.state(self._sim.q[0], self._sim.dq[0])
         self._cycle += 1
         self._sense()

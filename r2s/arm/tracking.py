@@ -5,20 +5,27 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from r2s.arm.interface import Arm
+from r2s.arm.driven import Driven
+from r2s.arm.driver import Driver
+from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.errors import UserError
 from r2s.excitation.motion import Excitation
-from r2s.excitation.safety import check_limits
+from r2s.excitation.safety import FRICTION_ROOT, FRICTION_SHARE, check_limits
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
 BANDWIDTH = 20.0  # rad/s, of the tracking loop: a few ms of delay leave it a wide margin
-CUTOFF_HZ = 100.0  # of the low-pass on the command, as libfranka's
-TORQUE_SHARE = 0.8  # of tau_max
-RATE_SHARE = 0.95  # of dtau_max
+CUTOFF_HZ = 100.0  # of the driver's low-pass, as libfranka's
+TORQUE_SHARE = 0.8  # of tau_max, the most that a recording asks for
 LEARNING = 0.8  # of kp, in 1/s: with its three terms the loop keeps half its stability margin
+UNBALANCED = (
+    0.1  # of tau_max, what gravity compensation may leave: 1 kg at a Panda's full reach that it knows nothing of
+)
+CORRECTION = 0.3  # of tau_max, what tracking may add to the planned torque, all in all
+ASTRAY = 0.2  # rad off the plan: something is in the way, or the arm is not the one that the plan was made for
 FRICTION_DQ = 0.03  # rad/s, over which the friction estimate changes sign
 PROGRESS_EVERY = 500  # cycles
+LEAST = 100  # cycles that are worth keeping of a recording that was stopped
 MASS_EVERY = 10  # cycles
 
 
@@ -42,7 +49,8 @@ def record(
         progress: called now and then with (cycles done, cycles in all).
 
     Raises:
-        ArmStopped: the arm ended the motion; nothing is returned of it.
+        ArmStopped: the arm ended the motion, or the driver did, or the arm went astray; what was recorded until then
+            is the exception's `recording`.
 
     """
     declared_torque(torque)
@@ -51,56 +59,80 @@ def record(
     rows = len(excitation.t)
     t = np.empty(rows)
     q, dq, tau = (np.empty((rows, arm.robot.n)) for _ in range(3))
-    arm.move_to(excitation.q[0])
+    driven = Driven(arm, Driver(arm.robot, TORQUE_SHARE * arm.robot.tau_max, cutoff_hz=CUTOFF_HZ))
+    driven.place(excitation.q[0])
+
+    def seen(rows: int) -> Recording:
+        return Recording(t=t[:rows], q=q[:rows], dq=dq[:rows], tau=tau[:rows], torque=torque, name=arm.robot.name)
+
+    k = 0
     try:
         for k in range(rows):
-            state = arm.read()
-            command = controller(k, state.q, state.dq, state.tau_J_d)
+            state = driven.state
             t[k], q[k], dq[k] = state.t, state.q, state.dq
-            tau[k] = command if torque == "commanded" else state.tau_J
-            arm.command(command)
+            if (reason := controller.astray(k, state)) is not None:
+                driven.halt(reason)
+            driven(controller(k, state))
+            tau[k] = driven.sent if torque == "commanded" else state.tau_J
             if progress is not None and (k % PROGRESS_EVERY == 0 or k == rows - 1):
                 progress(k + 1, rows)
+    except ArmStopped as stop:
+        if k >= LEAST:
+            stop.recording = seen(k)
+        raise
     finally:
-        arm.stop()
-    return Recording(t=t, q=q, dq=dq, tau=tau, torque=torque, name=arm.robot.name)
+        driven.end()
+    return seen(rows)
 
 
 class Tracker:
-    """PD control about the nominal model's torque, an estimate of what the model lacks, a safe command.
+    """PD control about the nominal model's torque, and an estimate of what the model lacks: targets for the driver.
 
     The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous
-    friction, adapted while moving as in Slotine and Li (IJRR 6(3), 1987). Without it a light wrist, whose
-    gains must be small, would be held back by friction as large as all its PD torque. Gains are the nominal
-    mass matrix times a bandwidth: they fit any arm, and joints with nearly parallel axes, which a gain per
-    joint drives unstable.
+    friction, adapted while moving as in Slotine and Li (IJRR 6(3), 1987), within what an arm can have of each.
+    Without it a light wrist, whose gains must be small, would be held back by friction as large as all its PD torque.
+    Gains are the nominal mass matrix times a bandwidth: they fit any arm, and joints with nearly parallel axes, which
+    a gain per joint drives unstable.
+
+    Args:
+        robot: the nominal model. excitation: the plan.
+        astray: rad, how far off the plan a joint may be.
     """
 
-    def __init__(self, robot: Robot, excitation: Excitation):
-        self._e = excitation
+    def __init__(self, robot: Robot, excitation: Excitation, astray: float = ASTRAY):
+        self._e, self._far = excitation, astray
         self._feedforward, self._mass = _nominal(robot, excitation)
         dq = excitation.dq
         drive = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
         self._regressor = drive.transpose(1, 0, 2)  # (T, 3, n)
         self._theta = np.zeros((3, robot.n))
+        friction = np.minimum(FRICTION_SHARE * robot.tau_max, FRICTION_ROOT * np.sqrt(robot.tau_max))
+        self._most = np.array([UNBALANCED * robot.tau_max, friction, friction])
         # what a joint feels with the others free; Nm/s per (rad/s + BANDWIDTH rad) of error
         alone = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
         self._learn = LEARNING * SIM_DT * BANDWIDTH**2 * alone  # of each posture: a light one has to learn slowly
-        self._limit, self._step = TORQUE_SHARE * robot.tau_max, RATE_SHARE * robot.dtau_max * SIM_DT
-        self._smooth = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)
-        self._filtered = np.zeros(robot.n)
+        self._correction = CORRECTION * robot.tau_max
 
-    def __call__(self, k: int, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-        """Return the command (n,) Nm of cycle k, from the state read in it and the command before."""
+    def __call__(self, k: int, state: ArmState) -> np.ndarray:
+        """Return the target (n,) Nm of cycle k, from the state read in it."""
         e = self._e
-        lag, slow = e.q[k] - q, e.dq[k] - dq
+        lag, slow = e.q[k] - state.q, e.dq[k] - state.dq
         self._theta += self._learn[k // MASS_EVERY] * (slow + 0.5 * BANDWIDTH * lag) * self._regressor[k]
+        self._theta = np.minimum(np.maximum(self._theta, -self._most), self._most)
         pull = self._mass[k // MASS_EVERY] @ (BANDWIDTH**2 * lag + 2 * BANDWIDTH * slow)
-        tau = self._feedforward[k] + pull + (self._theta * self._regressor[k]).sum(0)
-        self._filtered += self._smooth * (tau - self._filtered)
-        tau = np.minimum(np.maximum(self._filtered, -self._limit), self._limit)
-        change = np.minimum(np.maximum(tau - tau_J_d, -self._step), self._step)
-        return tau_J_d + change  # the rate limit is last
+        added = pull + (self._theta * self._regressor[k]).sum(0)
+        return self._feedforward[k] + np.minimum(np.maximum(added, -self._correction), self._correction)
+
+    def astray(self, k: int, state: ArmState) -> str | None:
+        """Return which joint is too far off the plan in cycle k, in words; None: none is."""
+        off = np.abs(self._e.q[k] - state.q)
+        if (off <= self._far).all():
+            return None
+        i = int(off.argmax())
+        return (
+            f"joint {i + 1} is {off[i]:.3f} rad off its way, allowed are {self._far:g} rad: something is in the way, "
+            "or it cannot follow"
+        )
 
 
 def _nominal(robot: Robot, e: Excitation) -> tuple[np.ndarray, np.ndarray]:

@@ -107,6 +107,7 @@ def transfer(
     torque: np.ndarray,
     timing: Timing | None = None,
     stops: Sequence[Stop] = (),
+    halted: str | None = None,
 ) -> None:
     """Save all episodes and what came before a stop, show four goals in figures and recording, say it on one page.
 
@@ -114,6 +115,7 @@ def transfer(
         run, robot: whose. episodes: per simulator and arm.
         rows: the same with what was measured. torque: (n,) Nm, the most that a policy may ask for.
         timing: of the arm's cycle, None where there was no arm. stops: why the arm stopped.
+        halted: why not all goals were done, or None.
     """
     shown = {label: first(e) for label, e in episodes.items()}
     for label, e in episodes.items():
@@ -132,6 +134,8 @@ def transfer(
         cycle = pd.DataFrame(timing.table()).set_index("what").map(lambda x: f"{x:.3g}")
         sections["On the clock of this computer"] = [cycle]
         sections["Why the arm stopped"] = [list(map(str, stops)) or "It did not."]
+        if halted is not None:
+            sections["Why not all goals were done"] = [halted]
     write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures=pictures, torque=torque)
     report_markdown(run.folder / "report.md", sections | {"Figures": [reach, *pictures.values()]})
 

@@ -58,8 +58,14 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
         cells["return"] = number(row.get("return_paper"), "{:.1f}")
         cells["at rest, %"] = number(None if row.get("rest") is None else 100 * row["rest"], "{:.1f}")
-        table[label] = cells
+        table[_counted(label, row)] = cells
     return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
+
+
+def _counted(label: str, row: Mapping) -> str:
+    """Return the label, with how many of the goals it is about where an arm was stopped before all were done."""
+    done, asked = row.get("episodes"), row.get("asked")
+    return label if done == asked else f"{label}, {done} of {asked} goals done"
 
 
 def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
@@ -74,7 +80,7 @@ def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         "stops": ("stops", 1, "{:.0f}"),
     }
     table = {
-        label: {
+        _counted(label, row): {
             title: number(None if row.get(key) is None else scale * row[key], form)
             for title, (key, scale, form) in columns.items()
         }

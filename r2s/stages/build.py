@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -13,6 +14,7 @@ from r2s.errors import UserError, check_number, choices, nearest
 
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
+BESIDE = ("soft_start_s", "live")  # of conf/arm, how it is driven
 COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads")
 
 
@@ -178,11 +180,44 @@ def opened_arm(cfg, robot, noise=0):
     with ExitStack() as stack:
         try:
             stream = {"noise": noise} if "noise" in inspect.signature(target(cfg.arm, "arm")).parameters else {}
-            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=["soft_start_s"])
+            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=BESIDE)
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         yield arm
+
+
+def arm_maker(cfg, robot):
+    """Return what opens the arm of conf/arm in another process: with `part`, which names mistakes as typed."""
+    if "_target_" not in cfg.arm:
+        raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(_arms())}")
+    target(cfg.arm, "arm")  # what cannot be loaded is said here
+    return partial(part, plain(cfg.arm), "arm", robot, beside=list(BESIDE))
+
+
+@contextmanager
+def opened_arms(cfg, robot, task):
+    """Give the arm of conf/arm behind its driver, for episodes of `task`: a `DrivenArm`, or a `LiveArm` where
+    `live` says that the arm's clock does not wait. It is stopped at the end whatever happens.
+    """
+    from r2s.arm.deploy import DrivenArm
+    from r2s.arm.interface import ArmStopped
+    from r2s.arm.live import LiveArm
+
+    fade = cfg.arm.get("soft_start_s", 0.0)
+    if not cfg.arm.get("live", False):
+        with opened_arm(cfg, robot) as arm:
+            try:
+                yield DrivenArm(arm, task, soft_start_s=fade)
+            finally:
+                arm.stop()
+        return
+    with ExitStack() as stack:
+        try:
+            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, soft_start_s=fade))
+        except ArmStopped as stop:
+            raise UserError(f"arm={cfg.arm.name}: {stop}") from None
+        yield arms
 
 
 def _arms():

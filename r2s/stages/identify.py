@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass, fields
 from typing import Any
 
-from r2s.errors import UserError, check_number
+from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
 from r2s.stages.build import (
     called,
@@ -211,7 +211,7 @@ def recorded(cfg, robot, run, motion):
         run: the run folder, which gets them. motion: the excitation to follow; None: one is made.
 
     Raises:
-        UserError: the arm stopped.
+        Stopped: the arm was stopped. What it had recorded of that motion is <motion>_until_stop.npz.
     """
     from r2s.arm.interface import ArmStopped
     from r2s.recordings.ramps import read_ramps
@@ -220,7 +220,12 @@ def recorded(cfg, robot, run, motion):
     def one(name, motion, k):
         path = run.folder / f"{name}.npz"
         if not path.is_file():
-            motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
+            try:
+                motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
+            except ArmStopped as stop:
+                if stop.recording is not None:
+                    stop.recording.save(run.folder / f"{name}_until_stop.npz")
+                raise
             motion.save(run.folder / f"excitation_{name}.csv")
             out.save(path)
         return read(path, torque=cfg.data.torque)
@@ -233,7 +238,9 @@ def recorded(cfg, robot, run, motion):
         if ramps is not None and not path.is_file():
             ramps.save(path)
     except ArmStopped as stop:
-        raise UserError(f"the arm stopped while it was recorded: {stop}") from None
+        there = [name for name in ("train", "validation") if (run.folder / f"{name}.npz").is_file()]
+        kept = f"{' and '.join(there)} motion is kept, " if there else ""
+        raise Stopped(f"while the arm was recorded: {stop}; {kept}resume={run.folder} goes on") from None
     return train, validation, ramps
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from r2s.errors import UserError
+from r2s.errors import Stopped, UserError
 from r2s.stages import identify, train, transfer
 from r2s.stages.build import CONF, PACKAGE, console, make_robot, open_run, unread
 
@@ -17,6 +17,7 @@ STEPS = (
     "2/3 train on both models, side by side",
     "3/3 take both policies to the arm",
 )
+STOPPED = 3  # exit status of a step that a stopped arm has ended, as of r2s/cli.py
 MODELS = ("identified", "nominal")
 WHY = {
     "calibration": "it identifies for itself",
@@ -43,6 +44,7 @@ def run_step(words: dict[str, list[str]]) -> None:
 
     Raises:
         UserError: one of them failed; the others are stopped.
+        Stopped: an arm was stopped in one of them; so are the others.
     """
     running: dict[str, subprocess.Popen] = {}
     last: dict[str, str] = {}
@@ -67,6 +69,8 @@ def run_step(words: dict[str, list[str]]) -> None:
         for label, process in running.items():
             if process.wait() != 0:
                 threads[list(running).index(label)].join()
+                if process.returncode == STOPPED:
+                    raise Stopped(f"{label}: {last.get(label, 'no output').removeprefix('stopped: ')}")
                 raise UserError(
                     f"{label} failed with exit status {process.returncode}: {last.get(label, 'no output')}"
                 )

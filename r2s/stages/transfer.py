@@ -1,9 +1,10 @@
 """stage=transfer: the same policy and goals in simulators and on an arm."""
 
 from contextlib import nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
 
-from r2s.errors import UserError, check_number, nearest
+from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.stages.build import (
     console,
     is_learner,
@@ -14,7 +15,7 @@ from r2s.stages.build import (
     make_robot,
     make_task,
     open_run,
-    opened_arm,
+    opened_arms,
     part,
     set_threads,
 )
@@ -22,6 +23,12 @@ from r2s.stages.build import (
 FROM_POLICY = "it comes from the policy's run"
 WHY = {k: FROM_POLICY for k in ("robot", "friction", "inertia", "calibration", "dr", "task", "algo", "reward")}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
+
+
+def first(episodes, count):
+    """Return the first `count` of these episodes."""
+    of_each = {f.name for f in fields(episodes)} - {"t"}
+    return replace(episodes, **{name: getattr(episodes, name)[:count] for name in of_each})
 
 
 def reads(cfg):
@@ -54,7 +61,6 @@ def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
     import numpy as np
 
-    from r2s.arm.deploy import DrivenArm
     from r2s.engines.episodes import EngineArms
     from r2s.excitation.paths import check_path
     from r2s.excitation.safety import Space
@@ -92,8 +98,8 @@ def transfer(cfg, overrides):
         progress = Progress(what)
         return progress, lambda k, n: progress(k / n, f"{k} goals")
 
-    opened = nullcontext() if cfg.arm.name == "none" else opened_arm(cfg, robot)
-    with opened as arm, open_run(cfg, overrides, parents=[str(source)]) as run:
+    opened = nullcontext() if cfg.arm.name == "none" else opened_arms(cfg, robot, task)
+    with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = task.measures(done), done
@@ -104,23 +110,32 @@ def transfer(cfg, overrides):
                 progress.close()
                 rows[cfg.simulator.name] = task.measures(done) | gap(done, episodes["mujoco"])
                 episodes[cfg.simulator.name] = done
-        if arm is not None:
+        halted = None
+        if driven is not None:
             if dynamics is not None:  # what the model says of this arm
-                model = ArmBatch(arm.robot, task, dynamics, len(goals), cfg.threads, fade)
+                model = ArmBatch(driven.robot, task, dynamics, len(goals), cfg.threads, fade)
                 done = rollout(policy, model, task, starts, goals)
                 rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(model.stops)}, done
             progress, shown = counted(f"reach on {cfg.arm.name}")
-            driven = DrivenArm(arm, task, soft_start_s=fade)
             done = rollout(policy, driven, task, starts, goals, shown)
-            stops, timing = driven.stops, driven.timing
+            stops, timing, halted = driven.stops, driven.timing, driven.halted
             progress.close()
-            rows[cfg.arm.name], episodes[cfg.arm.name] = task.measures(done) | {"stops": len(stops)}, done
-            if "predicted" in rows:
-                rows[cfg.arm.name] |= gap(done, episodes["predicted"])
+            count, row = driven.done, {"stops": len(stops), "episodes": driven.done, "asked": len(goals)}
+            if count:  # what was not done is no failure
+                done = first(done, count)
+                row = task.measures(done) | row
+                episodes[cfg.arm.name] = done
+                if "predicted" in rows:
+                    row |= gap(done, first(episodes["predicted"], count))
+            rows[cfg.arm.name] = row
             for row in timing.table():
                 run.log("timing", row)
             (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in stops) or "none\n")
         run.summary(rows)
-        pages.transfer(run, robot, episodes, rows, task.torque(robot), timing, stops)
+        if episodes:
+            pages.transfer(run, robot, episodes, rows, task.torque(robot), timing, stops, halted)
         reach_table(console(), rows, f"{source.name} on {len(goals)} goals")
+        if halted is not None:
+            count = rows[cfg.arm.name]["episodes"]
+            raise Stopped(f"{count} of {len(goals)} goals done on arm={cfg.arm.name}: {halted}; see {run.folder}")
     print(f"written: {run.folder}")

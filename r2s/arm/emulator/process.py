@@ -1,7 +1,7 @@
 """A Franka arm for libfranka's clients that is not there: our own FCI server, in a process of its own, on loopback.
 
     with Emulator(partial(Twin, robot, 3), version=5) as address:
-        arm = Panda(robot, address, clear=lambda reason: True)
+        arm = Panda(robot, address, operator=lambda reason: True)
 
 Behind it stands any `Arm` of ours. In lock-step, the default, the arm's clock advances only when the command came:
 however slow either side is, the same commands give the same motion, bit for bit. In real time it runs at 1 kHz and

@@ -119,7 +119,9 @@ class Server:
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
             self._reply(name, number, fci.NOT_POSSIBLE)  # the library would be machine code; ask the URDF
         else:
-            self._reply(name, number, fci.DONE)  # impedances, loads, thresholds: nothing here depends on them
+            if name == "SetCollisionBehavior":
+                self._control.watch_for(np.frombuffer(payload, fci.COLLISION, 1)[0]["upper_torque"].copy())
+            self._reply(name, number, fci.DONE)  # impedances, loads: nothing here depends on them
 
     def _connect(self, number: int, payload: bytes) -> None:
         assert self._tcp is not None
@@ -216,7 +218,10 @@ class Server:
     def _send(self) -> None:
         assert self._udp is not None
         assert self._client is not None
-        self._message_id += 1 if self._realtime or self._move is not None else IDLE_MS
+        passed = 1 if self._realtime or self._move is not None else IDLE_MS
+        self._message_id += passed
+        if self._move is None:
+            self._control.idle(passed)
         if self._control.lost:
             return
         if self._started and not self._realtime:

@@ -1,0 +1,113 @@
+"""An arm behind its driver: the only place in r2s from which an arm is commanded.
+
+Episodes, recordings, ramps and the clients' own ways to a place all pass their targets through here; what the driver
+makes of them is sent, and nothing else. tests/test_driven.py holds that there is no other call.
+"""
+
+import time
+from collections import deque
+
+import numpy as np
+
+from r2s.arm.driver import Driver
+from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
+from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.robot import SIM_DT
+
+REST_S = 0.5  # at most, to bring an arm to rest that is told to
+REST_RATE = 15.0  # 1/s, of that damping
+REST_SHARE = 0.2  # of tau_max
+STILL = 0.02  # rad/s
+
+
+class Driven:
+    """One motion after the other of one arm.
+
+    Attributes:
+        arm, driver: which. state: of the current cycle. sent: (n,) Nm, the last command.
+        clock: s, perf_counter before and after the driver's last decision.
+
+    Args:
+        arm: at 1 kHz. driver: whose settings say what the targets of these motions may ask for.
+        log: gets (state, command) of every cycle before it is sent.
+    """
+
+    def __init__(self, arm: Arm, driver: Driver, log: deque[tuple[ArmState, np.ndarray]] | None = None):
+        self.arm, self.driver = arm, driver
+        self._log, self._over = log, False
+        self._inverse = InverseInertia(arm.robot)
+        self.state: ArmState
+        self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0)
+
+    def place(self, q: np.ndarray) -> ArmState:
+        """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
+        self.driver.reset()
+        self._over = False
+        try:
+            self.state = self.arm.move_to(q)
+        except ArmStopped:
+            self.state = self.arm.read()
+            raise
+        return self.state
+
+    def begin(self) -> None:
+        """Begin a motion where the arm is."""
+        self.driver.reset()
+        self._over = False
+        self.state = self.arm.read()
+
+    def __call__(self, target: np.ndarray | None) -> ArmState:
+        """Go on for one cycle with the target (n,) Nm, None where nothing was said; return the state after it.
+
+        Raises:
+            ArmStopped: the arm has stopped itself, or the driver has brought it to rest; then there is no next cycle.
+        """
+        if self._over:
+            raise ArmStopped("the motion is over")
+        began = time.perf_counter()
+        self.sent = self.driver(self.state, target)
+        self.clock = began, time.perf_counter()
+        if self._log is not None:
+            self._log.append((self.state, self.sent))
+        try:
+            self.arm.command(self.sent)
+        except ArmStopped:
+            self._over = True
+            raise
+        self.state = self.arm.read()
+        if self.driver.done:
+            self._stopped(str(self.driver.stopping))
+        return self.state
+
+    def rest(self) -> None:
+        """Take speed out of the arm and torque out of the command, for at most half a second."""
+        damping = REST_RATE / np.diag(self._inverse(self.state.q[None])[0])
+        most, step = REST_SHARE * self.arm.robot.tau_max, self.arm.robot.dtau_max * SIM_DT
+        for _ in range(round(REST_S / SIM_DT)):
+            s = self.state
+            if np.abs(s.dq).max() < STILL and (np.abs(s.tau_J_d) <= step).all():
+                return
+            self(np.clip(-damping * s.dq, -most, most))
+
+    def halt(self, reason: str) -> None:
+        """Bring the arm to rest because of `reason`, and raise ArmStopped with it."""
+        self.rest()
+        self._stopped(reason)
+
+    def end(self) -> str | None:
+        """Stop the arm; return why it was being brought to rest when the end came, or None."""
+        reason = None if self._over else self.driver.stopping
+        if reason is not None:
+            self._block(reason)
+        self._over = True
+        self.arm.stop()
+        return reason
+
+    def _stopped(self, reason: str) -> None:
+        self._over = True
+        self._block(reason)
+        raise ArmStopped(reason)
+
+    def _block(self, reason: str) -> None:
+        if isinstance(self.arm, Operated):
+            self.arm.blocked = reason

@@ -1,0 +1,327 @@
+"""Nothing reaches an arm around a driver; who holds a link meets a bounded force; a stop needs an operator."""
+
+import ast
+import re
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from conftest import ROOT, conf
+
+from r2s.arm import driver as law
+from r2s.arm import fci
+from r2s.arm.clients import AGREED, operator_agrees
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.driven import Driven
+from r2s.arm.driver import Driver
+from r2s.arm.emulator.control import HOLD
+from r2s.arm.franka import CAUTIOUS, Franka
+from r2s.arm.interface import ArmStopped, NotCleared
+from r2s.arm.ramp import BRAKE_SHARE, LARGEST, poses_about, ramp
+from r2s.arm.simulated import SimulatedArm
+from r2s.arm.tracking import ASTRAY, CORRECTION, Tracker, record
+from r2s.excitation.minimum_jerk import minimum_jerk
+from r2s.excitation.motion import Excitation
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import make_policy
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
+
+PANDA = load_robot(**conf("robot/panda"))
+TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+
+
+class Watched(SimulatedArm):
+    """An arm that keeps what it was told, and in the first joint of which something may hold it from a cycle on."""
+
+    def __init__(self, hold_from=None):
+        friction = nominal_dynamics(PANDA, **conf("friction/paper"))
+        self.commands, self.pushes, self._hold_from = [], [], hold_from
+        super().__init__(PANDA, replace(friction, delay=4e-3, lag=1e-3), position_noise=2e-5, velocity_noise=3e-3)
+
+    def move_to(self, q):
+        """Begin a motion."""
+        self._at, self.over, self.external = None, False, np.zeros(7)
+        return super().move_to(q)
+
+    def stop(self):
+        """End it."""
+        self.over = True
+        super().stop()
+
+    def command(self, tau):
+        """Take a command, against what holds the link."""
+        assert not self.over, "a command after a stop"
+        q, dq = self._sim.q[0, 0], self._sim.dq[0, 0]
+        if self._hold_from is not None and self.read().t >= self._hold_from:
+            self._at = q if self._at is None else self._at
+            self.external = (HOLD[0] * (self._at - q) - HOLD[1] * dq) * np.eye(7)[0]
+        self.commands.append(np.array(tau))
+        self.pushes.append(self.external[0])
+        super().command(tau)
+
+
+def turn(seconds=2.0, angle=0.5):
+    """Return a motion of the first joint and, less, of the others."""
+    t = SIM_DT * np.arange(round(seconds / SIM_DT) + 1)
+    end = PANDA.q_home + angle * np.array([1.0, 0.3, 0.2, 0.3, 0.2, 0.3, 0.4])
+    return Excitation(t, *minimum_jerk(PANDA.q_home, end, seconds, t[:, None]))
+
+
+def calls(name):
+    """Return where in r2s a method of this name is called, as file:receiver."""
+    for path in sorted((ROOT / "r2s").rglob("*.py")):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text)) if f".{name}(" in text else ():
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == name:
+                yield f"{path.relative_to(ROOT / 'r2s')}:{ast.unparse(node.func.value)}"
+
+
+def test_one_place_commands_an_arm():
+    """Beside it only the emulator, which is the robot, commands its own arm; the rest are reflexes that check."""
+    beyond = {c for c in calls("command") if not c.endswith("reflexes") and not c.startswith("arm/emulator/")}
+    assert beyond == {"arm/driven.py:self.arm"}
+    assert set(calls("exchange")) == {"arm/franka.py:self._client"}  # what sends, which is called ...
+    # ... in `Franka.command`
+    assert (ROOT / "r2s/arm/franka.py").read_text().count("self._send(") == 1
+
+
+def test_every_command_comes_out_of_a_driver(monkeypatch):
+    """In recording, ramps and episodes the arm gets exactly what drivers have decided, in that order."""
+    decided = []
+    decide = law.Drivers.__call__
+
+    def noted(self, q, dq, tau_J_d, target):
+        out = decide(self, q, dq, tau_J_d, target)
+        decided.append(out[0].copy())
+        return out
+
+    monkeypatch.setattr(law.Drivers, "__call__", noted)
+    task = replace(TASK, episode_s=0.1)
+    episodes = fixed_episodes(PANDA, task, 1)
+
+    def reach(arm):
+        rollout(make_policy(PANDA, task, (8,)), DrivenArm(arm, task), task, *episodes)
+
+    for move in (
+        lambda arm: record(arm, turn(0.4, 0.05)),
+        lambda arm: ramp(arm, poses_about(PANDA, 1), rate=60.0, largest=0.5),
+        reach,
+    ):
+        arm = Watched()
+        decided.clear()
+        move(arm)
+        mine = [tau for tau in decided if tau.any()]  # a new driver decides once to be compiled
+        assert len(mine) > 50
+        np.testing.assert_array_equal([tau for tau in arm.commands if tau.any()], mine)
+
+
+def test_who_holds_a_link_meets_a_bounded_force():
+    """A recording presses with no more than its plan and CORRECTION, plus what brakes the link; then it gives up."""
+    plan, arm = turn(2.0, 0.8), Watched(hold_from=0.7)
+    with pytest.raises(ArmStopped, match=r"joint 1 is 0.20\d rad off its way, allowed are 0.2 rad") as stopped:
+        record(arm, plan)
+    feedforward = Tracker(PANDA, plan)._feedforward[:, 0]
+    most = np.abs(feedforward).max() + CORRECTION * PANDA.tau_max[0]
+    assert np.abs(arm.commands).max(0)[0] <= most
+    caught = round(0.7 / SIM_DT)
+    settled = np.abs(arm.pushes[caught + 150 :])  # after the moving link has been caught
+    assert settled.max() <= most
+    assert np.abs(arm.commands[-1]).max() < 1.0
+    assert len(stopped.value.recording.t) > caught  # what was measured is kept
+    assert np.abs(plan.q[len(stopped.value.recording.t), 0] - arm.read().q[0]) >= ASTRAY - 1e-3
+
+
+def test_what_is_learned_is_bounded():
+    """Held off its plan for good, a joint's estimate goes no further than friction and offset of an arm can."""
+    plan, arm = turn(4.0, 0.8), Watched()
+    tracker, state = Tracker(PANDA, plan, astray=np.inf), arm.read()
+    for k in range(len(plan.t)):
+        target = tracker(k, state)
+    assert (np.abs(tracker._theta) <= tracker._most).all()
+    assert tracker._theta[0, 0] == pytest.approx(8.7)
+    assert (np.abs(target - tracker._feedforward[-1]) <= CORRECTION * PANDA.tau_max + 1e-9).all()
+
+
+def test_a_held_ramp_is_bounded():
+    """A ramp gives up at its largest command; the stop takes no more than its share."""
+    arm = Watched(hold_from=0.0)
+    ramps = ramp(arm, poses_about(PANDA, 1), rate=60.0)
+    assert len(ramps.joint) == 14
+    most = (LARGEST + BRAKE_SHARE) * PANDA.tau_max + 1e-6
+    assert (np.abs(arm.commands).max(0) <= most).all()
+
+
+def test_after_a_stop_there_is_no_command():
+    """Whatever is asked of a motion that was ended, nothing more is sent before the next one begins."""
+    arm = Watched()
+    driven = Driven(arm, Driver(PANDA, PANDA.tau_max))
+    driven.place(PANDA.q_home)
+    with pytest.raises(ArmStopped, match="no finite action"):
+        silent(driven)
+    count = len(arm.commands)
+    for _ in range(3):
+        with pytest.raises(ArmStopped, match="the motion is over"):
+            driven(np.zeros(7))
+    assert len(arm.commands) == count
+    driven.begin()
+    driven(np.zeros(7))
+    assert len(arm.commands) == count + 1
+
+
+def silent(driven):
+    """Say nothing for a second."""
+    for _ in range(1000):
+        driven(np.full(7, np.nan))
+
+
+class Guarded(Watched):
+    """An arm beside which somebody stands, and which stops itself in the fifth cycle of a motion."""
+
+    def __init__(self, answers):
+        self.blocked, self.asked, self._answers = None, [], iter(answers)
+        super().__init__()
+
+    def operator(self, reason):
+        """Answer as the test says."""
+        self.asked.append(reason)
+        return next(self._answers)
+
+    def move_to(self, q):
+        """Ask before it moves again."""
+        if self.blocked is not None and not self.operator(self.blocked):
+            raise NotCleared(self.blocked)
+        self.blocked, self._begun = None, len(self.commands)
+        return super().move_to(q)
+
+    def command(self, tau):
+        """Stop in the fifth cycle."""
+        if len(self.commands) == self._begun + 5:
+            self.blocked = "somebody pressed the button"
+            raise ArmStopped(self.blocked)
+        super().command(tau)
+
+
+class Button:
+    """A client of an arm at home on which somebody presses the stop button in a motion, and releases it."""
+
+    def __init__(self):
+        self.sent, self.cycle = [], 0
+
+    def idle(self):
+        """An arm that would move."""
+        zeros, seconds = np.zeros(7), SIM_DT * self.cycle
+        time = SimpleNamespace(to_sec=lambda: seconds)
+        return SimpleNamespace(robot_mode=fci.IDLE, q=PANDA.q_home, dq=zeros, tau_J=zeros, tau_J_d=zeros, time=time)
+
+    start = idle
+
+    def exchange(self, tau):
+        """Take ten commands."""
+        self.cycle += 1
+        if len(self.sent) == 10:
+            raise ArmStopped("user stop")
+        self.sent.append(tau)
+        return self.idle()
+
+    def watch_for(self, collision):
+        """Take thresholds."""
+        self.collision = collision
+
+    def finish(self):
+        """End a motion."""
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_pressed_and_released_counts_as_pressed(there):
+    """The arm is idle and would move; without an operator, or without his word, it is asked nothing."""
+    client, asked = Button(), []
+    arm = Franka(PANDA, client, operator=(lambda reason: asked.append(reason) or len(asked) > 1) if there else None)
+    arm.move_to(PANDA.q_home)
+    assert client.collision == CAUTIOUS
+    with pytest.raises(ArmStopped, match="user stop"):
+        record(arm, turn(0.4, 0.05))
+    for _ in range(1 + (not there)):
+        with pytest.raises(NotCleared, match="no operator agreed that it may move: user stop"):
+            arm.move_to(PANDA.q_home)
+    if there:
+        arm.move_to(PANDA.q_home)
+    assert len(asked) == 2 * there
+    assert len(client.sent) == 10
+
+
+@pytest.mark.parametrize(("answers", "done"), [([False], 1), ([True, False], 2), ([True, True], 3)])
+def test_no_episode_begins_before_an_operator_said_so(answers, done):
+    """Each stop is asked about once; where the answer is no, what was not tried is no episode."""
+    task, arm = replace(TASK, episode_s=0.1), Guarded(answers)
+    driven = DrivenArm(arm, task)
+    rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 3))
+    assert driven.done == done
+    assert len(driven.stops) == done
+    assert len(arm.asked) == len(answers)
+    assert len(arm.commands) == 5 * done
+    assert (driven.halted is None) == answers[-1]
+
+
+def test_nobody_at_the_terminal_is_a_no(monkeypatch):
+    """Only the words count, typed after the question at a terminal; never by default."""
+    assert not operator_agrees("a test")
+
+    class Terminal:
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    monkeypatch.setattr("r2s.arm.clients.termios.tcflush", lambda *_: None)
+    for typed, agrees in (("", False), ("y", False), ("yes", False), (AGREED, True), (f" {AGREED} ", True)):
+        monkeypatch.setattr("builtins.input", lambda *_, typed=typed: typed)
+        assert operator_agrees("a test") == agrees
+
+
+def hostile(cycles, seed):
+    """Drive recordings, ramps and episodes while something holds a link; return counts, and why motions ended."""
+    rng, reasons = np.random.default_rng(seed), []
+    counted = {"cycles": 0, "motions": 0, "push": 0.0}
+    while counted["cycles"] < cycles:
+        arm = Watched(hold_from=rng.choice([None, rng.uniform(0, 1.5)], p=[0.4, 0.6]))
+        kind = rng.integers(3)
+        try:
+            if kind == 0:
+                record(arm, turn(rng.uniform(0.6, 2.0), rng.uniform(-0.5, 0.5)))
+            elif kind == 1:
+                ramp(arm, poses_about(PANDA, 1), rate=rng.uniform(2, 60))
+            else:
+                spoiled(arm, rng)
+        except ArmStopped as stop:
+            reasons.append(str(stop))
+        counted["cycles"] += len(arm.commands)
+        counted["motions"] += 1
+        counted["push"] = max(counted["push"], np.abs(arm.pushes).max())
+    return counted, reasons
+
+
+def spoiled(arm, rng):
+    """Let a policy act that says nothing, too much or nonsense for some of its time."""
+    driven = Driven(arm, Driver(PANDA, TASK.torque(PANDA)))
+    driven.place(PANDA.q_home)
+    try:
+        for k in range(1500):
+            said = rng.choice(5) if k % 40 == 0 else said  # noqa: F821 (k is 0 first)
+            noise = rng.normal(size=7) * PANDA.tau_max
+            driven([None, noise, np.full(7, np.nan), 1e9 * noise, 0.1 * noise][said] if k % 20 == 0 else None)
+    finally:
+        driven.end()
+
+
+@pytest.mark.slow
+def test_the_whole_cycle_is_never_outside():
+    """200,000 cycles: no rule of the arm broken, no command after a stop."""
+    counted, reasons = hostile(200_000, seed=1)
+    print(counted, len(reasons), "stops")
+    assert counted["cycles"] >= 200_000
+    assert len(reasons) > 10
+    assert [r for r in reasons if re.search(r"commanded torque|: position|: velocity|after a stop", r)] == []
