@@ -19,7 +19,7 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
+from r2s.identification.problem import NONE, Problem, Report, Search, believed, optional_friction, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
@@ -101,15 +101,17 @@ def identify(
     nominal = of_family(nominal, family)
     commanded = recording.torque == "commanded"
     level = how | {"slowest": STANDSTILL if commanded else 0.0}
-    if settings.extra:
+    # a term of friction that the family does not have
+    absent = {*optional_friction()} - {*nominal.family.optional}
+    if extra := [name for name in settings.extra if name not in absent]:
         base = searched(robot, nominal, bounds, terms, recording)
 
         def choose() -> dict[str, Any]:
-            more = demanded(base, recording, bounds, prior, settings.extra, folds, level, told)
-            return {"entered": [name in more for name in settings.extra]}
+            more = demanded(base, recording, bounds, prior, extra, folds, level, told)
+            return {"entered": [name in more for name in extra]}
 
         entered = np.asarray(step("terms", choose)["entered"], dtype=bool)
-        terms = with_terms(terms, [name for name, enters in zip(settings.extra, entered, strict=True) if enters])
+        terms = with_terms(terms, [name for name, enters in zip(extra, entered, strict=True) if enters])
     if spare := [name for name in settings.spare if name in terms]:
 
         def chosen_terms() -> dict[str, Any]:
