@@ -51,17 +51,15 @@ class TorqueResidual:
         m: SmoothMotion | SlidingMotion
         if slowest:
             bends = BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
-            self.motion = m = SlidingMotion.of(recording, rate_hz, slowest, bends)
-            self.seen = m.seen
-            carried = np.einsum("tjk,k->tj", m.rows(mass_matrix(robot, m.q) ** 2), m.encoder**2)
-            self._noise = m.noise * np.sqrt(carried)
+            m = sliding = SlidingMotion.of(recording, rate_hz, slowest, bends)
+            carried = m.rows(mass_matrix(robot, m.q) ** 2) @ sliding.encoder**2
+            self.seen, self._noise = sliding.seen, sliding.noise * np.sqrt(carried)
         else:
-            self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+            m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
             self.seen, self._noise = np.ones_like(m.q, dtype=bool), np.zeros_like(m.q)
-        self.commanded = recording.torque == "commanded"
-        self._rotors = (
-            0.0 if recording.torque == "measured" else m.rows(m.ddq)
-        )  # a link-side sensor does not feel them
+        self.motion, self.commanded = m, recording.torque == "commanded"
+        # a link-side sensor does not feel rotors
+        self._rotors = 0.0 if recording.torque == "measured" else m.rows(m.ddq)
         self.at_motor = recording.torque == "motor"
         gravity = None if self.commanded else robot.gravity
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
