@@ -19,7 +19,7 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import NONE, Problem, Report, Search, believed, optional_friction, searched
+from r2s.identification.problem import Problem, Report, Search, believed, optional_friction, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
@@ -154,14 +154,14 @@ def identify(
     for k, search in enumerate(searches):
         on_level = getattr(search, "level", "") == "torque"
         if lag is not None and (on_level or data is quick):
-            problem.believe(lag, NONE)  # filtered torque feels a lag as it feels a delay
+            problem.fix(lag)  # filtered torque feels a lag as it feels a delay
         elif lag is not None:
             problem = problem_of(data)
         v = ended(f"search {k + 1}", search, u)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
             refused, problem, data = True, problem_of(quick), quick
             if lag is not None:
-                problem.believe(lag, NONE)
+                problem.fix(lag)
             break
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
@@ -178,7 +178,7 @@ def identify(
             u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
             problem.adapt(u, fitted=True)
         if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):
-            problem.believe(lag, NONE)
+            problem.fix(lag)
     dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
@@ -221,7 +221,7 @@ def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Rep
     """
     lag = problem.space.where("lag")
     before, free = problem.sigma[lag], problem.cost(start)
-    problem.believe(lag, NONE)
+    problem.fix(lag)
     u = start.copy()
     u[lag] = problem.start[lag]
     u = search(problem, u, report)

@@ -22,7 +22,7 @@ from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-NONE = 1e-4  # standard deviation of the belief in a value that is not searched
+NONE = 1e-4  # of its bounds' width, standard deviation of the belief in a value that is not searched
 TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
 TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
@@ -149,7 +149,7 @@ class Problem:
         uniform = space.spread / np.sqrt(12)
         self.sigma = np.minimum(space.spread_out(prior, np.inf), uniform)
         if kept is not None:
-            self.believe(space.of_joints(kept), NONE)
+            self.fix(space.of_joints(kept))
         self.clusters = data.clusters
 
     @property
@@ -160,6 +160,10 @@ class Problem:
     def believe(self, at: np.ndarray, sigma: np.ndarray | float) -> None:
         """Set the standard deviation of the belief in the nominal values `at`."""
         self.sigma[at] = sigma
+
+    def fix(self, at: np.ndarray) -> None:
+        """Let the values `at` stay nominal."""
+        self.sigma[at] = NONE * self.space.spread[at]
 
     def cost(self, u: np.ndarray) -> float:
         """Return the sum of squares at u (P,)."""

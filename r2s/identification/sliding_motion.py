@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.signal import savgol_filter
 from scipy.sparse import csr_array
 
 from r2s.errors import UserError
@@ -24,7 +25,8 @@ NORMAL = 0.6745  # median of the magnitude of a normal variable, in standard dev
 SHORTEST, LONGEST = 0.025, 0.1  # s, half a window
 GUARD = 4e-3  # s, within which the low-pass feels a stop
 EDGE = 0.05  # s, within which it feels the end of a trajectory
-LATEST = 0.018  # s, of a command before it is felt
+LATEST = 0.04  # s, of a command before it is felt
+PARTS = 8, 32  # of a step in which a command is held, and of a lag
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,8 @@ class SlidingMotion:
         """
         grid = recording.resample(SIM_DT)
         smooth = grid.smooth(CUTOFF_HZ)
-        dq = smooth.derivative(smooth.q)
-        ddq = smooth.derivative(dq)
+        # at such rates central differences lose half a percent of an acceleration
+        dq, ddq = (_derivative(smooth, order) for order in (1, 2))
         left = 1.0 - 2.0 * CUTOFF_HZ * SIM_DT  # of white noise is above the cutoff
         encoder = np.median(np.abs(grid.q - smooth.q), axis=0) / NORMAL / np.sqrt(left)
         every, step = round(1 / (RATE_HZ * SIM_DT)), round(RATE_HZ / rate_hz)
@@ -110,11 +112,39 @@ class SlidingMotion:
 
     rows = filtered  # of what is evaluated at q, dq, ddq
 
-    def tau_at(self, delay: float) -> np.ndarray:
-        """Return (T, n) Nm: the mean of the torque `delay` s before."""
-        at = min(max(delay / SIM_DT, 0.0), self.late.shape[1] - 2)
-        k = int(at)
-        return self.late[:, k] + (at - k) * (self.late[:, k + 1] - self.late[:, k])
+    def felt(self, delay: float, lag: float) -> np.ndarray:
+        """Return (T, n) Nm: the mean of the command as it is felt, held for a step, `delay` s later, behind a lag.
+
+        That is u(t - delay - held - lagged), its mean over held, uniform in a step, and lagged, exponential.
+        """
+        held, lagged = ((np.arange(count) + 0.5) / count for count in PARTS)
+        late = delay / SIM_DT + held[:, None] - lag / SIM_DT * np.log(lagged)
+        most = self.late.shape[1] - 3
+        late = np.clip(late, 0.0, most)
+        at = np.minimum(late.astype(int), most - 1)
+        weights = np.zeros(self.late.shape[1])
+        for k, weight in enumerate(_cubic(late - at), start=-1):
+            np.add.at(weights, np.abs(at + k), weight / late.size)
+        return np.einsum("tkn,k->tn", self.late, weights)
+
+
+def _cubic(x: np.ndarray) -> list[np.ndarray]:
+    """Return the weights of samples at -1, 0, 1 and 2 of what passes through them at x in [0, 1] (Lagrange)."""
+    return [
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    ]
+
+
+def _derivative(recording: Recording, order: int) -> np.ndarray:
+    """Return (T, n), the first or second derivative of the angles, by polynomials through five rows."""
+    out = np.empty_like(recording.q)
+    for s in recording.stretches:
+        rows = min(5, s.stop - s.start - (s.stop - s.start + 1) % 2)
+        out[s] = savgol_filter(recording.q[s], rows, rows - 1, deriv=order, delta=SIM_DT, axis=0) if rows > 2 else 0.0
+    return out
 
 
 def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:

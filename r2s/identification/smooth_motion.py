@@ -12,6 +12,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # friction is evaluated this often, then filtered as the torque is
+HELD = 0.5  # steps: a command that is held for a step is that late on average
 FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over that of the torque
 
 
@@ -82,6 +83,10 @@ class SmoothMotion:
     def rows(self, x: np.ndarray) -> np.ndarray:
         """Return (T, n, ...), what is evaluated at q, dq, ddq: those are low-passed."""
         return x
+
+    def felt(self, delay: float, lag: float) -> np.ndarray:
+        """Return (T, n) Nm: the command as it is felt, held for a step and then late; so slow, a lag is a delay."""
+        return self.tau_at(delay + lag + HELD * SIM_DT)
 
     def tau_at(self, delay: float) -> np.ndarray:
         """Return (T, n) Nm: the torque `delay` s before each moment."""

@@ -16,12 +16,11 @@ from r2s.identification.smooth_motion import SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia, mass_matrix, regressor, rigid_body
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's curvature
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
-HELD = 0.5  # steps: a command that is held for a step is that late on average
 LEAST = 1e-9  # Nm, of a deviation
 BENT = 4.0  # presliding distances, after which bristles are as bent as they get: all but 2 %
 BLOCK_S = 0.5  # s, stretches that the bootstrap draws
@@ -110,8 +109,9 @@ class TorqueResidual:
 
     def off(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded, of one arm."""
-        late = float(dynamics.delay) + float(dynamics.lag) + HELD * SIM_DT if self.commanded else 0.0
-        return self.predict(dynamics) - self.motion.tau_at(late)
+        if not self.commanded:
+            return self.predict(dynamics) - self.motion.tau
+        return self.predict(dynamics) - self.motion.felt(float(dynamics.delay), float(dynamics.lag))
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
