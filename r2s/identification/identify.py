@@ -19,7 +19,7 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import Problem, Report, Search, believed, optional_friction, searched
+from r2s.identification.problem import Problem, Report, Search, answers_early, believed, optional_friction, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
@@ -27,9 +27,10 @@ from r2s.identification.static_friction import StaticFriction
 from r2s.identification.term_selection import demanded
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
+from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import HOLDS, Dynamics, of_family
 from r2s.physics.friction import FAMILIES
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
@@ -153,15 +154,12 @@ def identify(
 
     for k, search in enumerate(searches):
         on_level = getattr(search, "level", "") == "torque"
-        if lag is not None and (on_level or data is quick):
-            problem.fix(lag)  # filtered torque feels a lag as it feels a delay
-        elif lag is not None:
-            problem = problem_of(data)
         v = ended(f"search {k + 1}", search, u)
+        if commanded and on_level and not k and answers_early(problem, v):
+            quick.ahead = EARLY * SIM_DT
+            v = ended("search 1, early", search, v)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
             refused, problem, data = True, problem_of(quick), quick
-            if lag is not None:
-                problem.fix(lag)
             break
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
@@ -173,11 +171,11 @@ def identify(
             told(row | {"search": f"{row['search']}, reweighed"})
 
         for k in range(REWEIGH):
-            alone = data is quick or lag is None or k < REWEIGH - 1
+            alone = lag is None or k < REWEIGH - 1
             local = last if alone else partial(without_lag, last)
             u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
             problem.adapt(u, fitted=True)
-        if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):
+        if lag is not None and np.array_equal(u[lag], problem.start[lag]):
             problem.fix(lag)
     dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:

@@ -16,13 +16,15 @@ from r2s.identification.parameters import ParameterSpace, check_parameters, loga
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.static_friction import StaticFriction
 from r2s.identification.torque_residual import STEP, TorqueResidual
+from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
 from r2s.physics.friction import known_families
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 NONE = 1e-4  # of its bounds' width, standard deviation of the belief in a value that is not searched
+CLEAR = 3.0  # standard deviations, by which friction must be early
 TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
 TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
@@ -208,6 +210,21 @@ class Problem:
         h = np.where(u > 0.5, -STEP, STEP)  # always into the cube
         r = self.residual(np.concatenate([u[None], u + np.diag(h)]))
         return r[0], ((r[1:] - r[0]) / h[:, None]).T
+
+
+def answers_early(problem: Problem, u: np.ndarray) -> bool:
+    """Say whether friction is that of the velocity half a step ahead, at u (P,), a fit to the level of torque.
+
+    It is in a simulator that solves for friction at the end of a step, on no arm whose time is continuous.
+    """
+    data = problem.quick_data
+    r, j = problem.quick(u[None])[0], problem.quick_jacobian(u)
+    data.ahead = EARLY * SIM_DT
+    moved = problem.quick(u[None])[0] - r
+    data.ahead = 0.0
+    own = moved - j @ np.linalg.lstsq(j, moved, rcond=None)[0]  # what the parameters cannot stand in for
+    share = -(own @ r) / (own @ own)
+    return bool(share > 0.5 and share * np.linalg.norm(own) > CLEAR)
 
 
 class Search(Protocol):

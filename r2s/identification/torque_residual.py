@@ -73,6 +73,7 @@ class TorqueResidual:
         self._sign = {False: m.filtered(np.tanh(m.fast / WIDTH_DQ)), True: m.filtered(m.bristle)}  # by has_memory
         block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
+        self.ahead = 0.0  # s, by which friction is that of motion to come: `answers_early`
         self.candidates = 0
         self._scale = np.ones_like(self._rest)
         self.adapt(space.start, fitted=False)
@@ -91,7 +92,8 @@ class TorqueResidual:
         out = self._rest + self._y @ standard + d.armature * self._rotors
         if not self.commanded and not self.at_motor:  # the sensor sits before what is added below
             out = out * (1.0 + d.gain)
-        out += m.filtered(d.friction(m.fast, m.bristle if d.family.has_memory else None)) - d.offset
+        speed = m.fast + self.ahead * m.ddq if self.ahead else m.fast
+        out += m.filtered(d.friction(speed, m.bristle if d.family.has_memory else None)) - d.offset
         if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
