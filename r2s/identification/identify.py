@@ -36,6 +36,7 @@ from r2s.recordings.recording import Recording
 
 STANDSTILL = 0.02  # rad/s: what friction is of a joint that is slower, or stands, its velocity does not tell
 REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
+ALIKE = 0.2  # share by which what counts as an independent row may be wrong
 CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -205,10 +206,12 @@ def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
 def worse_on_level(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Say whether v (P,) explains torque clearly worse than u (P,), the fit to it.
 
-    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P.
+    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P. It is in
+    units that are no better than how many rows in a row say the same, of which there are a few: ALIKE.
     """
-    rise = (problem.quick(v[None])[0] ** 2).sum() - (problem.quick(u[None])[0] ** 2).sum()
-    return bool(rise > len(u))
+    fitted = (problem.quick(u[None])[0] ** 2).sum()
+    rise = (problem.quick(v[None])[0] ** 2).sum() - fitted
+    return bool(rise > max(len(u), ALIKE * fitted))
 
 
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
