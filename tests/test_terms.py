@@ -15,7 +15,7 @@ from r2s.identification.static_friction import SURE
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, STRIBECK
 
-EXTRA = ["link", "load", "drag"]
+EXTRA = ["viscous_asymmetry", "link", "load", "drag"]
 PHI = np.array([[1.2, 0.05, 0.3], [0.9, -0.05, 0.2], [0.5, 0.1, 0.1]])
 
 
@@ -48,7 +48,7 @@ def test_hard_stiction_does_not_spoil_friction_or_delay(hard):
 
 
 def test_no_term_enters_that_is_not_there(hard):
-    assert not {"load", "drag_sin", "link_d1"} & set(hard[0].space.blocks)
+    assert not {"viscous_asymmetry", "load", "drag_sin", "link_d1"} & set(hard[0].space.blocks)
 
 
 def test_stiction_is_found_to_be_of_the_net_torque(hard):
@@ -60,11 +60,13 @@ def test_stiction_is_found_to_be_of_the_net_torque(hard):
 
 
 def test_a_term_that_is_there_enters(arm):  # noqa: F811
-    """Cable drag of a fifth of the friction is asked for by motion left out."""
+    """Cable drag of a fifth of the friction is asked for by motion left out, and viscous friction per direction."""
     truth = replace(coulomb_arm(arm), drag=np.array([[0.25, 0.1], [0.2, -0.2], [0.1, 0.1]]))
+    truth = replace(truth, phi=np.concatenate([PHI, [[0.3], [-0.2], [0.1]]], 1))
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
     found = run(arm, start, recorded(arm, truth, 12.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
     assert "drag_sin" in found.space.blocks
+    np.testing.assert_allclose(found.dynamics.phi[:, 3], truth.phi[:, 3], rtol=0, atol=0.1)
 
 
 def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811

@@ -20,13 +20,14 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 RATE_HZ = 250  # torques are evaluated this often, then averaged
-CUTOFF_HZ = 80.0  # of the angles before they are differentiated
+CUTOFF_HZ = 40.0  # of the angles before they are differentiated; a law that bends turns noise of velocity into a bias
 NORMAL = 0.6745  # median of the magnitude of a normal variable, in standard deviations
-SHORTEST, LONGEST = 0.025, 0.1  # s, half a window
-GUARD = 4e-3  # s, within which the low-pass feels a stop
+SHORTEST, LONGEST = 0.024, 0.1  # s, half a window
+GUARD = 8e-3  # s, within which the low-pass feels a stop
 EDGE = 0.05  # s, within which it feels the end of a trajectory
 LATEST = 0.04  # s, of a command before it is felt
-PARTS = 8, 32  # of a step in which a command is held, and of a lag
+HELD = (np.arange(8) + 0.5) / 8  # steps, for which a command is held
+LAGGED, SHARE = np.polynomial.laguerre.laggauss(16)  # quadrature over exp(-x)
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class SlidingMotion:
         seen: (T, n) bool, moments with a window in which the joint slides in one direction.
         noise: (T, n), by which a window multiplies the standard deviation of angles, rad, to that of accelerations.
         encoder: (n,) rad, standard deviation of the angles' noise.
-        late: (T, L, n) Nm, the mean of the command, and of that of each ms before.
+        late: (T, L, n) Nm, the mean of the command of 1 ms later, of the moment, and of each ms before.
     """
 
     t: np.ndarray
@@ -89,9 +90,9 @@ class SlidingMotion:
         found = [_windows(q[:, j], slides[:, j], at, slid) for j in range(q.shape[1])]
         means, half = tuple(m for m, _ in found), np.stack([w for _, w in found], 1)
         gain = np.array([0.0, *(_noise(w) for w in range(1, round(LONGEST * RATE_HZ) + 1))])
-        began = np.concatenate([np.full(len(part), part[0]) for part in instants])
-        ago = [smooth.tau[np.maximum(own - k, began)] for k in range(round(LATEST / SIM_DT))]
-        late = np.stack([_averaged(means, tau) for tau in ago], 1)
+        began, ended = (np.concatenate([np.full(len(p), p[end]) for p in instants]) for end in (0, -1))
+        ago = [np.clip(own - k, began, ended) for k in range(-1, round(LATEST / SIM_DT))]
+        late = np.stack([_averaged(means, smooth.tau[rows]) for rows in ago], 1)
         return SlidingMotion(
             smooth.t[kept], q, dq[own], ddq[own], np.concatenate(bristle), means, half > 0, gain[half], encoder, late
         )
@@ -104,7 +105,7 @@ class SlidingMotion:
     @property
     def tau(self) -> np.ndarray:
         """(T, n) Nm, the mean of the command."""
-        return self.late[:, 0]
+        return self.late[:, 1]
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         """Return (T, n, ...): the means of x (F, n, ...) over the windows of each joint."""
@@ -117,14 +118,12 @@ class SlidingMotion:
 
         That is u(t - delay - held - lagged), its mean over held, uniform in a step, and lagged, exponential.
         """
-        held, lagged = ((np.arange(count) + 0.5) / count for count in PARTS)
-        late = delay / SIM_DT + held[:, None] - lag / SIM_DT * np.log(lagged)
-        most = self.late.shape[1] - 3
-        late = np.clip(late, 0.0, most)
-        at = np.minimum(late.astype(int), most - 1)
+        late = (delay + HELD[:, None] * SIM_DT + lag * LAGGED) / SIM_DT + 1.0
+        late = np.clip(late, 1.0, self.late.shape[1] - 3)
+        at = late.astype(int)
         weights = np.zeros(self.late.shape[1])
         for k, weight in enumerate(_cubic(late - at), start=-1):
-            np.add.at(weights, np.abs(at + k), weight / late.size)
+            np.add.at(weights, at + k, weight * SHARE / len(HELD))
         return np.einsum("tkn,k->tn", self.late, weights)
 
 
