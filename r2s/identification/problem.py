@@ -198,6 +198,11 @@ class Problem:
         r = self._belief(np.concatenate([u[None], u + np.diag(h)]))
         return ((r[1:] - r[0]) / h[:, None]).T
 
+    def known(self, u: np.ndarray) -> np.ndarray:
+        """Return (P, P), half the Hessian at u (P,) of what is believed without the motion."""
+        j = self._belief_jacobian(u)
+        return j.T @ j
+
     def adapt(self, u: np.ndarray, fitted: bool) -> None:
         """Let the residuals find their weights about u (P,)."""
         for data in {id(d): d for d in (self.data, self.quick_data)}.values():

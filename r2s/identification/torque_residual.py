@@ -73,7 +73,7 @@ class TorqueResidual:
         self._sign = {False: m.filtered(np.tanh(m.fast / WIDTH_DQ)), True: m.filtered(m.bristle)}  # by has_memory
         block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
-        self.ahead = 0.0  # s, by which friction is that of motion to come: `answers_early`
+        self.ahead = 0.0  # s, half a step of a simulator that made the recording: `answers_early`
         self.candidates = 0
         self._scale = np.ones_like(self._rest)
         self.adapt(space.start, fitted=False)
@@ -92,13 +92,26 @@ class TorqueResidual:
         out = self._rest + self._y @ standard + d.armature * self._rotors
         if not self.commanded and not self.at_motor:  # the sensor sits before what is added below
             out = out * (1.0 + d.gain)
-        speed = m.fast + self.ahead * m.ddq if self.ahead else m.fast
-        out += m.filtered(d.friction(speed, m.bristle if d.family.has_memory else None)) - d.offset
+        out += m.filtered(self._friction(d)) - d.offset
         if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
         out += d.load * self._load * self._sign[d.family.has_memory]
         return out * (1.0 + d.gain) if self.at_motor else out
+
+    def _friction(self, d: Dynamics) -> np.ndarray:
+        """Return (F, n) Nm: friction at the fast velocities.
+
+        A simulator's step knows the velocity of the step before, `ahead` s too old, and makes up for it where
+        friction rises: it solves for that at the step's end.
+        """
+        m, bristle = self.motion, self.motion.bristle if d.family.has_memory else None
+        if not self.ahead:
+            return d.friction(m.fast, bristle)
+        old, coming = (m.fast + s * self.ahead * m.ddq for s in (-1.0, 1.0))
+        way = np.sign(m.fast)
+        rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(m.ddq)
+        return d.friction(old, bristle) + np.maximum(rises, 0.0) * np.sign(m.ddq)
 
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
