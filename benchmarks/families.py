@@ -1,8 +1,8 @@
 """Does friction.family=auto pick the family that data were made with?
 
-`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous, Stribeck and bristle friction about
-the paper's level, records 15 s of each (sensor noise, delay and breakaway as in benchmarks/known_truth.py), and compares
-the families as stage=identify does. Writes docs/families.md.
+`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous, Stribeck and bristle friction
+about the paper's level, records 15 s of each (sensor noise, delay and breakaway as in benchmarks/known_truth.py), and
+compares the families as stage=identify does. Writes docs/families.md.
 """
 
 import sys
@@ -13,7 +13,7 @@ from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
 
 from r2s.arm.simulated import SimulatedArm
 from r2s.identification.family_selection import compare_families
-from r2s.physics.friction import BRISTLE, COULOMB, FAMILIES, SIGMOID, STRIBECK
+from r2s.physics.friction import BRISTLE, FAMILIES, SIGMOID, STRIBECK
 
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
 
