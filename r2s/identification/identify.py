@@ -226,6 +226,7 @@ def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Rep
     u = start.copy()
     u[lag] = problem.start[lag]
     u = search(problem, u, report)
+    u[lag] = problem.start[lag]  # to the bit: by that it is known to be fixed
     needed = problem.cost(u) - free > np.log(len(problem.clusters))
     problem.believe(lag, before)
     return search(problem, start, report) if needed else u
