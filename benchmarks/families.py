@@ -1,8 +1,8 @@
 """Does friction.family=auto pick the family that data were made with?
 
-`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous and Stribeck friction about the
-paper's level, records 15 s of each (sensor noise, delay and breakaway as in benchmarks/known_truth.py), and compares
-the families as stage=identify does. Writes docs/families.md.
+`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous, Stribeck and bristle friction
+about the paper's level, records 15 s of each (sensor noise, delay and breakaway as in benchmarks/known_truth.py), and
+compares the families as stage=identify does. Writes docs/families.md.
 """
 
 import sys
@@ -13,7 +13,7 @@ from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
 
 from r2s.arm.simulated import SimulatedArm
 from r2s.identification.family_selection import compare_families
-from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK
+from r2s.physics.friction import BRISTLE, FAMILIES, SIGMOID, STRIBECK
 
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
 
@@ -27,8 +27,10 @@ def draw(family, rng):
     else:
         viscous = level * rng.uniform(0.2, 0.6, n)
         phi = np.stack([level - 0.5 * viscous, rng.uniform(-0.1, 0.1, n), viscous], -1)
-    if family == STRIBECK:
+    if family in (STRIBECK, BRISTLE):
         phi = np.concatenate([phi, rng.uniform(0.2, 0.6, (n, 1)), rng.uniform(0.05, 0.15, (n, 1))], -1)
+    if family == BRISTLE:
+        phi = np.concatenate([phi, rng.uniform(5e-4, 2e-3, (n, 1))], -1)
     return replace(NEW, family=family, phi=phi, delay=3e-3)
 
 
@@ -40,7 +42,7 @@ def main() -> None:
     names = [f.name for f in FAMILIES]
     picks = {}
     began = time.perf_counter()
-    for family in (SIGMOID, COULOMB, STRIBECK):
+    for family in FAMILIES:
         picks[family.name] = []
         for seed in range(seeds):
             truth = draw(family, np.random.default_rng([FAMILIES.index(family), seed]))
@@ -50,7 +52,7 @@ def main() -> None:
             picks[family.name].append(names[chosen["best"]])
             told = ", ".join(f"{n} {e:.3f}" for n, e in zip(names, chosen["error"], strict=True))
             print(f"{family.name}, seed {seed}: {picks[family.name][-1]} ({told})", flush=True)
-    seconds = (time.perf_counter() - began) / (3 * seeds)
+    seconds = (time.perf_counter() - began) / (len(FAMILIES) * seeds)
     lines = [
         "# Right family: what friction.family=auto picks",
         "",

@@ -132,7 +132,7 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
     late, true_late = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
     between = np.quantile(np.atleast_1d(late), (0.025, 0.975))
     validation = read(arm / "validation.npz", torque="commanded")
-    true = true_dynamics(truth, read(arm / "train.npz", torque="commanded"))
+    true = true_dynamics(truth)
     ahead = [_open_loop_ee(ROBOT, d, validation, threads)["0.5"] for d in (found, true)]
     return against(None, None) | {
         "true family": truth["family"],

@@ -12,39 +12,34 @@ from pathlib import Path
 import numpy as np
 from bench import duel
 from common import NEW, ROBOT
-from scipy.optimize import least_squares
-from scipy.signal import savgol_filter
 
 from r2s.identification.prediction import _open_loop_ee
 from r2s.physics.dynamics import HOLDS, Dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
-from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.recordings.readers import read
-from r2s.recordings.recording import Recording
 
 HORIZON = "0.5"  # s
 NAMES = ("train", "validation")
-SLOWEST = 5e-3  # rad/s; slower, the direction of a measured velocity is not known
 START = 2e-3  # rad/s: what a window's measured start velocity may be of a joint at rest
 
 
-def true_dynamics(truth: dict, recording: Recording | None) -> Dynamics:
-    """Return an arm's truth.json as far as the families express it.
-
-    Theirs have one viscous term for both directions, where the arms have two: the law is the one that is closest to
-    the arm's over the velocities of `recording`, by least squares; eq. (5) needs none.
-    """
+def true_dynamics(truth: dict) -> Dynamics:
+    """Return an arm's truth.json as far as the families express it: all but the damping of LuGre's bristles."""
     f = {name: np.array(values) for name, values in truth["friction"].items()}
     if "phi1" in f:
         family, phi = SIGMOID, np.stack([f["phi1"], f["phi2"], f["phi3"]], -1)
     else:
-        family = STRIBECK if "vs" in f else COULOMB
-        joints = [{name: values[j] for name, values in f.items()} for j in range(ROBOT.n)]
-        phi = np.stack([_closest(family, one, dq) for one, dq in zip(joints, _speeds(recording), strict=True)])
-    if "sigma0" in f:  # bristles: as far as they bend under the Coulomb level
-        family, bend = BRISTLE, 0.5 * (f["fc_pos"] + f["fc_neg"]) / f["sigma0"]
-        phi = np.concatenate([phi[:, :5], bend[:, None], phi[:, 5:]], 1)
+        family, (level, apart), (viscous, own) = COULOMB, _sides(f, "fc"), _sides(f, "fv")
+        columns = [level, apart, viscous]
+        if "vs" in f:
+            rises = [f[f"fs_{side}"] / f[f"fc_{side}"] - 1 for side in ("pos", "neg")]
+            rise, other = _sides({"rise_pos": rises[0], "rise_neg": rises[1]}, "rise")
+            family, columns = STRIBECK, [*columns, rise, f["vs"], other]
+        if "sigma0" in f:  # bristles: as far as they bend under the Coulomb level
+            family = BRISTLE
+            columns.insert(5, level / f["sigma0"])
+        phi = np.stack([*columns, own], -1)
     return replace(
         Dynamics.of(ROBOT, phi, family, dq_min=START),
         offset=np.array(truth["offset"]),
@@ -58,21 +53,10 @@ def true_dynamics(truth: dict, recording: Recording | None) -> Dynamics:
     )
 
 
-def _speeds(recording: Recording) -> np.ndarray:
-    """Return (n, T) rad/s."""
-    return savgol_filter(recording.q, 31, 3, deriv=1, delta=SIM_DT, axis=0).T
-
-
-def _closest(family, f: dict, dq: np.ndarray) -> np.ndarray:
-    """Return the parameters (K,) of one joint's law that is closest to f at the velocities dq (T,)."""
-    v = dq[np.abs(dq) > SLOWEST][::7]
-    up, level = v > 0, np.where(v > 0, f["fc_pos"], f["fc_neg"])
-    if "vs" in f:
-        level = level + (np.where(up, f["fs_pos"], f["fs_neg"]) - level) * np.exp(-((v / f["vs"]) ** 2))
-    true = level * np.sign(v) + np.where(up, f["fv_pos"], f["fv_neg"]) * v
-    mean = 0.5 * (f["fc_pos"] + f["fc_neg"])
-    start = [mean, 0.0, f["fv_pos"], 0.2, f.get("vs", 0.0), 0.0][: len(family.names)]
-    return least_squares(lambda p: family.law(v, list(p), np.sign(v)) - true, start, x_scale=0.1).x
+def _sides(f: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of a value of both directions, and by what share of it they differ from it."""
+    mean = 0.5 * (f[f"{name}_pos"] + f[f"{name}_neg"])
+    return mean, f[f"{name}_pos"] / mean - 1
 
 
 def speed(dynamics: Dynamics, tau: np.ndarray) -> tuple[float, float]:
@@ -96,7 +80,7 @@ def main() -> None:
         if truth.get("family", "lugre") == "lugre":
             continue  # no family here has the bristle damping of a LuGre arm
         seen = {n: read(folder / f"{n}.npz", torque="commanded") for n in NAMES}
-        true = true_dynamics(truth, seen["train"])
+        true = true_dynamics(truth)
         line = f"{folder.name:12}"
         for recording in seen.values():
             for hold in HOLDS:

@@ -87,7 +87,7 @@ def test_the_truth_itself_is_judged_right():
     from independent_judge import SPEEDS, Pull, drags, edges, speeds, true_dynamics
 
     truth = draw(0)
-    found, v = true_dynamics(truth, None), speeds(np.ones((2, 7)), SPEEDS)
+    found, v = true_dynamics(truth), speeds(np.ones((2, 7)), SPEEDS)
     told = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
     for at in (None, Pull(CENTRE[None])):  # the truth has nothing beside friction and offset
         np.testing.assert_allclose(drags(found, v, at), friction(truth, v) - truth["offset"], atol=1e-12)

@@ -67,7 +67,7 @@ def hanging(panda):
 RANGES = {
     "phi1": (0.3, 4.0), "phi2": (2.0, 30.0), "phi3": (-0.06, 0.06), "viscous": (0.0, 1.0), "coulomb": (0.2, 3.0),
     "asymmetry": (-0.5, 0.5), "rise": (0.0, 1.0), "stribeck_velocity": (0.02, 0.3), "presliding": (2e-4, 5e-3),
-    "rise_asymmetry": (-0.9, 0.9),
+    "rise_asymmetry": (-0.9, 0.9), "viscous_asymmetry": (-0.6, 0.6),
 }  # fmt: skip
 THREE = (SIGMOID, COULOMB, STRIBECK)
 

@@ -19,7 +19,7 @@ from r2s.identification.breakaway import Breakaway, breakaway
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import NONE, Problem, Report, Search, believed, searched
+from r2s.identification.problem import Problem, Report, Search, answers_early, believed, optional_friction, searched
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
@@ -27,14 +27,16 @@ from r2s.identification.static_friction import StaticFriction
 from r2s.identification.term_selection import demanded
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.identification.uncertainty import Identified, conclude, posterior
+from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import HOLDS, Dynamics, of_family
 from r2s.physics.friction import FAMILIES
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 STANDSTILL = 0.02  # rad/s: what friction is of a joint that is slower, or stands, its velocity does not tell
 REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
+ALIKE = 0.2  # share by which what counts as an independent row may be wrong
 CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -101,15 +103,17 @@ def identify(
     nominal = of_family(nominal, family)
     commanded = recording.torque == "commanded"
     level = how | {"slowest": STANDSTILL if commanded else 0.0}
-    if settings.extra:
+    # a term of friction that the family does not have
+    absent = {*optional_friction()} - {*nominal.family.optional}
+    if extra := [name for name in settings.extra if name not in absent]:
         base = searched(robot, nominal, bounds, terms, recording)
 
         def choose() -> dict[str, Any]:
-            more = demanded(base, recording, bounds, prior, settings.extra, folds, level, told)
-            return {"entered": [name in more for name in settings.extra]}
+            more = demanded(base, recording, bounds, prior, extra, folds, level, told)
+            return {"entered": [name in more for name in extra]}
 
         entered = np.asarray(step("terms", choose)["entered"], dtype=bool)
-        terms = with_terms(terms, [name for name, enters in zip(settings.extra, entered, strict=True) if enters])
+        terms = with_terms(terms, [name for name, enters in zip(extra, entered, strict=True) if enters])
     if spare := [name for name in settings.spare if name in terms]:
 
         def chosen_terms() -> dict[str, Any]:
@@ -151,15 +155,12 @@ def identify(
 
     for k, search in enumerate(searches):
         on_level = getattr(search, "level", "") == "torque"
-        if lag is not None and (on_level or data is quick):
-            problem.believe(lag, NONE)  # filtered torque feels a lag as it feels a delay
-        elif lag is not None:
-            problem = problem_of(data)
         v = ended(f"search {k + 1}", search, u)
+        if commanded and on_level and not k and answers_early(problem, v):
+            quick.ahead = EARLY * SIM_DT
+            v = ended("search 1, early", search, v)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
             refused, problem, data = True, problem_of(quick), quick
-            if lag is not None:
-                problem.believe(lag, NONE)
             break
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
@@ -171,12 +172,12 @@ def identify(
             told(row | {"search": f"{row['search']}, reweighed"})
 
         for k in range(REWEIGH):
-            alone = data is quick or lag is None or k < REWEIGH - 1
+            alone = lag is None or k < REWEIGH - 1
             local = last if alone else partial(without_lag, last)
             u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
             problem.adapt(u, fitted=True)
-        if data is not quick and lag is not None and np.array_equal(u[lag], problem.start[lag]):
-            problem.believe(lag, NONE)
+        if lag is not None and np.array_equal(u[lag], problem.start[lag]):
+            problem.fix(lag)
     dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:
         edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
@@ -205,10 +206,12 @@ def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
 def worse_on_level(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Say whether v (P,) explains torque clearly worse than u (P,), the fit to it.
 
-    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P.
+    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P. It is in
+    units that are no better than how many rows in a row say the same, of which there are a few: ALIKE.
     """
-    rise = (problem.quick(v[None])[0] ** 2).sum() - (problem.quick(u[None])[0] ** 2).sum()
-    return bool(rise > len(u))
+    fitted = (problem.quick(u[None])[0] ** 2).sum()
+    rise = (problem.quick(v[None])[0] ** 2).sum() - fitted
+    return bool(rise > max(len(u), ALIKE * fitted))
 
 
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
@@ -219,10 +222,11 @@ def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Rep
     """
     lag = problem.space.where("lag")
     before, free = problem.sigma[lag], problem.cost(start)
-    problem.believe(lag, NONE)
+    problem.fix(lag)
     u = start.copy()
     u[lag] = problem.start[lag]
     u = search(problem, u, report)
+    u[lag] = problem.start[lag]  # to the bit: by that it is known to be fixed
     needed = problem.cost(u) - free > np.log(len(problem.clusters))
     problem.believe(lag, before)
     return search(problem, start, report) if needed else u

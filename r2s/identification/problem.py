@@ -16,13 +16,15 @@ from r2s.identification.parameters import ParameterSpace, check_parameters, loga
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.static_friction import StaticFriction
 from r2s.identification.torque_residual import STEP, TorqueResidual
+from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
 from r2s.physics.friction import known_families
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-NONE = 1e-4  # standard deviation of the belief in a value that is not searched
+NONE = 1e-4  # of its bounds' width, standard deviation of the belief in a value that is not searched
+CLEAR = 3.0  # standard deviations, by which friction must be early
 TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
 TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
@@ -149,7 +151,7 @@ class Problem:
         uniform = space.spread / np.sqrt(12)
         self.sigma = np.minimum(space.spread_out(prior, np.inf), uniform)
         if kept is not None:
-            self.believe(space.of_joints(kept), NONE)
+            self.fix(space.of_joints(kept))
         self.clusters = data.clusters
 
     @property
@@ -160,6 +162,10 @@ class Problem:
     def believe(self, at: np.ndarray, sigma: np.ndarray | float) -> None:
         """Set the standard deviation of the belief in the nominal values `at`."""
         self.sigma[at] = sigma
+
+    def fix(self, at: np.ndarray) -> None:
+        """Let the values `at` stay nominal."""
+        self.sigma[at] = NONE * self.space.spread[at]
 
     def cost(self, u: np.ndarray) -> float:
         """Return the sum of squares at u (P,)."""
@@ -192,6 +198,11 @@ class Problem:
         r = self._belief(np.concatenate([u[None], u + np.diag(h)]))
         return ((r[1:] - r[0]) / h[:, None]).T
 
+    def known(self, u: np.ndarray) -> np.ndarray:
+        """Return (P, P), half the Hessian at u (P,) of what is believed without the motion."""
+        j = self._belief_jacobian(u)
+        return j.T @ j
+
     def adapt(self, u: np.ndarray, fitted: bool) -> None:
         """Let the residuals find their weights about u (P,)."""
         for data in {id(d): d for d in (self.data, self.quick_data)}.values():
@@ -204,6 +215,21 @@ class Problem:
         h = np.where(u > 0.5, -STEP, STEP)  # always into the cube
         r = self.residual(np.concatenate([u[None], u + np.diag(h)]))
         return r[0], ((r[1:] - r[0]) / h[:, None]).T
+
+
+def answers_early(problem: Problem, u: np.ndarray) -> bool:
+    """Say whether friction is that of the velocity half a step ahead, at u (P,), a fit to the level of torque.
+
+    It is in a simulator that solves for friction at the end of a step, on no arm whose time is continuous.
+    """
+    data = problem.quick_data
+    r, j = problem.quick(u[None])[0], problem.quick_jacobian(u)
+    data.ahead = EARLY * SIM_DT
+    moved = problem.quick(u[None])[0] - r
+    data.ahead = 0.0
+    own = moved - j @ np.linalg.lstsq(j, moved, rcond=None)[0]  # what the parameters cannot stand in for
+    share = -(own @ r) / (own @ own)
+    return bool(share > 0.5 and share * np.linalg.norm(own) > CLEAR)
 
 
 class Search(Protocol):

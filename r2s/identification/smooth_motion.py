@@ -12,7 +12,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # friction is evaluated this often, then filtered as the torque is
-MIXED = 0.01  # of the low-pass's weights
+HELD = 0.5  # steps: a command that is held for a step is that late on average
 FRICTION_CUTOFF = 4.0  # of the velocity that friction is evaluated at, over that of the torque
 
 
@@ -50,8 +50,9 @@ class SmoothMotion:
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
         kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
         every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
-        # of the angles: logged velocities are late by a filter on an arm, by half a step in a simulator
-        dq, fastest = smooth.derivative(smooth.q), quick.derivative(quick.q)
+        dq, fastest = smooth.dq, quick.dq
+        if recording.torque == "commanded":  # timing counts, and logged velocities are late, by a filter or a step
+            dq, fastest = smooth.derivative(smooth.q), quick.derivative(quick.q)
         ddq, keep, rows, fast, bristle = smooth.derivative(dq), [], [], [], []
         step, edge, base = round(1 / (rate_hz * SIM_DT)), round(0.05 / SIM_DT), 0
         for s in smooth.stretches:
@@ -79,9 +80,13 @@ class SmoothMotion:
         """Return (T, n): the low-pass of x (F, n) at the moments."""
         return self.low_pass @ x
 
-    def unmixed(self, true: np.ndarray) -> np.ndarray:
-        """Return (T, n) bool: moments whose low-pass takes next to nothing from where `true` (F, n) does not hold."""
-        return abs(self.low_pass) @ (~true).astype(float) < MIXED
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        """Return (T, n, ...), what is evaluated at q, dq, ddq: those are low-passed."""
+        return x
+
+    def felt(self, delay: float, lag: float) -> np.ndarray:
+        """Return (T, n) Nm: the command as it is felt, held for a step and then late; so slow, a lag is a delay."""
+        return self.tau_at(delay + lag + HELD * SIM_DT)
 
     def tau_at(self, delay: float) -> np.ndarray:
         """Return (T, n) Nm: the torque `delay` s before each moment."""

@@ -11,16 +11,18 @@ from copy import copy
 import numpy as np
 
 from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
+from r2s.identification.sliding_motion import SlidingMotion
 from r2s.identification.smooth_motion import SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
-from r2s.physics.rigid_body import LinkInertia, regressor, rigid_body
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.rigid_body import LinkInertia, mass_matrix, regressor, rigid_body
+from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's curvature
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
-HELD = 0.5  # steps: a command that is held for a step is that late on average
+LEAST = 1e-9  # Nm, of a deviation
+BENT = 4.0  # presliding distances, after which bristles are as bent as they get: all but 2 %
 BLOCK_S = 0.5  # s, stretches that the bootstrap draws
 
 
@@ -28,7 +30,8 @@ class TorqueResidual:
     """Residual of any recording: predicted minus recorded torque, zero-phase filtered, at `rate_hz`.
 
     The rigid part is a product with a regressor made once. Friction is evaluated at less smoothed velocities and then
-    filtered as the torque was, because a filter rounds the step of friction at a reversal.
+    filtered as the torque was, because a filter rounds the step of friction at a reversal. With `slowest`, rad/s,
+    rows are means over windows in which a joint is faster and does not turn, and count by how noisy they are.
     """
 
     def __init__(
@@ -44,26 +47,35 @@ class TorqueResidual:
         slowest: float = 0.0,
     ):
         self.space = space
-        self.motion = m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
-        self.seen = m.unmixed(np.abs(m.fast) >= slowest) if slowest else np.ones_like(m.q, dtype=bool)
-        self.commanded = recording.torque == "commanded"
-        self._rotors = 0.0 if recording.torque == "measured" else m.ddq  # a link-side sensor does not feel them
+        m: SmoothMotion | SlidingMotion
+        if slowest:
+            bends = BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
+            m = sliding = SlidingMotion.of(recording, rate_hz, slowest, bends)
+            carried = m.rows(mass_matrix(robot, m.q) ** 2) @ sliding.encoder**2
+            self.seen, self._noise = sliding.seen, sliding.noise * np.sqrt(carried)
+        else:
+            m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
+            self.seen, self._noise = np.ones_like(m.q, dtype=bool), np.zeros_like(m.q)
+        self.motion, self.commanded = m, recording.torque == "commanded"
+        # a link-side sensor does not feel rotors
+        self._rotors = 0.0 if recording.torque == "measured" else m.rows(m.ddq)
         self.at_motor = recording.torque == "motor"
         gravity = None if self.commanded else robot.gravity
         rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
-        self._rest = rest - robot.armature * m.ddq  # rotors are the candidate's
-        self._y = y.reshape(*m.q.shape, -1)
+        self._rest = m.rows(rest - robot.armature * m.ddq)  # rotors are the candidate's
+        self._y = m.rows(y.reshape(*m.q.shape, -1))
         still = np.zeros_like(m.q)
         y = regressor(robot, m.q, still, still, robot.gravity)
-        self._gravity = y.reshape(*m.q.shape, -1)
+        self._gravity = m.rows(y.reshape(*m.q.shape, -1))
         self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(self._gravity @ self._nominal)
-        self._sin, self._cos = np.sin(m.q), np.cos(m.q)
+        self._sin, self._cos = m.rows(np.sin(m.q)), m.rows(np.cos(m.q))
         self._sign = {False: m.filtered(np.tanh(m.fast / WIDTH_DQ)), True: m.filtered(m.bristle)}  # by has_memory
         block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
+        self.ahead = 0.0  # s, half a step of a simulator that made the recording: `answers_early`
         self.candidates = 0
-        self._scale = np.ones(robot.n)
+        self._scale = np.ones_like(self._rest)
         self.adapt(space.start, fitted=False)
 
     def on(self, space: ParameterSpace) -> "TorqueResidual":
@@ -80,17 +92,31 @@ class TorqueResidual:
         out = self._rest + self._y @ standard + d.armature * self._rotors
         if not self.commanded and not self.at_motor:  # the sensor sits before what is added below
             out = out * (1.0 + d.gain)
-        out += m.filtered(d.friction(m.fast, m.bristle if d.family.has_memory else None)) - d.offset
+        out += m.filtered(self._friction(d)) - d.offset
         if self.commanded:  # what the compensation leaves
             out += self._gravity @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
         out += d.load * self._load * self._sign[d.family.has_memory]
         return out * (1.0 + d.gain) if self.at_motor else out
 
+    def _friction(self, d: Dynamics) -> np.ndarray:
+        """Return (F, n) Nm: friction at the fast velocities.
+
+        A simulator's step knows the velocity of the step before, `ahead` s too old, and makes up for it where
+        friction rises: it solves for that at the step's end.
+        """
+        m, bristle = self.motion, self.motion.bristle if d.family.has_memory else None
+        if not self.ahead:
+            return d.friction(m.fast, bristle)
+        old, coming = (m.fast + s * self.ahead * m.ddq for s in (-1.0, 1.0))
+        way = np.sign(m.fast)
+        rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(m.ddq)
+        return d.friction(old, bristle) + np.maximum(rises, 0.0) * np.sign(m.ddq)
+
     def error(self, x: np.ndarray) -> np.ndarray:
         """Return (C, T, n) Nm, predicted minus recorded, the recorded one as late as the joints feel it."""
         self.candidates += len(x)
-        out = np.empty((len(x), *self.motion.q.shape))
+        out = np.empty((len(x), *self._rest.shape))
         d = self.space.dynamics(x)
         for i in range(len(x)):
             out[i] = self.off(d.one(i))
@@ -98,8 +124,9 @@ class TorqueResidual:
 
     def off(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded, of one arm."""
-        late = float(dynamics.delay) + float(dynamics.lag) + HELD * SIM_DT if self.commanded else 0.0
-        return self.predict(dynamics) - self.motion.tau_at(late)
+        if not self.commanded:
+            return self.predict(dynamics) - self.motion.tau
+        return self.predict(dynamics) - self.motion.felt(float(dynamics.delay), float(dynamics.lag))
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
@@ -118,7 +145,7 @@ class TorqueResidual:
         """
         space, n = self.space, self.space.n
         d = space.dynamics(x)
-        base, out = self.off(d), np.zeros((*self.motion.q.shape, len(x)))
+        base, out = self.off(d), np.zeros((*self._rest.shape, len(x)))
         reach = self._y + self._gravity if self.commanded else self._y * (1.0 + d.gain)[:, None]
         before = self._standard(d).ravel()
         for block in space.blocks:
@@ -145,15 +172,33 @@ class TorqueResidual:
     def adapt(self, x: np.ndarray, fitted: bool) -> None:
         """Set what counts as one standard deviation of an independent row, per joint.
 
-        It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing.
+        It is the RMS at a `fitted` x (P,), else half of it, times how many rows in a row say the same thing. Where
+        the encoder's noise is known the RMS is what it makes of the rows, short ones more, and one constant beside.
         """
         r = self.error(x[None])[0] * self.seen
-        square = (r**2).sum(0) / np.maximum(self.seen.sum(0), 1)
-        self._scale = (1.0 if fitted else 0.5) * np.sqrt(square * np.minimum(_correlation_length(r), LONGEST))
+        beside = _beside(r, self._noise, self.seen)
+        alike = np.minimum(_correlation_length(r / np.sqrt(beside**2 + self._noise**2)), LONGEST)
+        self._weigh((1.0 if fitted else 0.5) * np.sqrt(alike), beside)
 
     def weigh_like(self, other: "TorqueResidual") -> None:
         """Take the standard deviations that `other` found."""
-        self._scale = other._scale
+        self._weigh(*other._weighed)
+
+    def _weigh(self, factor: np.ndarray, beside: np.ndarray) -> None:
+        self._weighed = factor, beside
+        self._scale = factor * np.sqrt(beside**2 + self._noise**2)
+
+
+def _beside(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return (n,) Nm: the deviation that beside noise (T, n) gives the residual r (T, n) an RMS of 1."""
+    count = np.maximum(seen.sum(0), 1)
+    high = np.maximum((r**2).sum(0) / count, LEAST**2)
+    low = np.full_like(high, LEAST**2)
+    for _ in range(40 if noise.any() else 0):
+        middle = np.sqrt(low * high)
+        more = (r**2 / (noise**2 + middle)).sum(0) > count
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return np.sqrt(high)
 
 
 def _correlation_length(r: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from r2s.physics.dynamics import Dynamics
 
 MOST_EDGE = 10.0  # Nm, bound of an edge of the dead zone
 DRAWS = 512  # of the joint distribution
+LEAST_LEFT = 0.1  # of what is known of a direction, by all other windows
 UNSEEN = 0.9  # of its prior's deviation: a value with so much left is hardly seen
 SHARPER = 4.0  # a parameter is identifiable when the half width of its interval is this much below its prior's sigma
 
@@ -108,8 +109,10 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
 
     Errors within a window are correlated, so windows are drawn with replacement (Kuensch 1989), and the belief is
     drawn from its prior each time; each draw is one Gauss-Newton step from u. Where the data say nothing a draw is
-    one of the prior's. A bootstrap of few windows is too narrow where single windows decide, so the spread is not
-    let below what the residual's own variance gives. Draws are centred on their median: a few of them may go far.
+    one of the prior's. A fit follows each of few windows, so what it leaves of one is less than the error, by its
+    share in what is known (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). A bootstrap of few windows is
+    too narrow where single windows decide, so the spread is not let below what the residual's own variance gives.
+    Draws are centred on their median: a few of them may go far.
     """
     rng = np.random.default_rng(seed)
     residual, jacobian = problem.jacobian(u)
@@ -125,14 +128,19 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     belief, pull = rest.T @ rest, rest.T @ known
     told = j.any(1)  # rows that fill a window up have neither a residual nor a slope
     factor = max(1.0, float(np.sqrt(np.mean(r[told] ** 2)))) if told.any() else 1.0
+    information = gram.sum(0)
+    covariance = np.linalg.inv(information + belief)
+    root = np.linalg.cholesky(covariance)
+    share, axes = np.linalg.eigh(root.T @ gram @ root)  # of what is known of each direction, a window's
+    left = np.maximum(1.0 - share, LEAST_LEFT)[..., None]
+    within = axes @ ((axes.swapaxes(1, 2) @ (root.T @ score[..., None])) / np.sqrt(left))
+    score = np.linalg.solve(root.T, within[..., 0].T).T
     steps = np.empty((DRAWS, p))
     for k in range(DRAWS):
         times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
         believed = pull - rest.T @ rng.standard_normal(len(rest))
         h = np.tensordot(times, gram, 1) + belief
         steps[k] = -np.linalg.solve(h, times @ score + believed)
-    information = gram.sum(0)
-    covariance = np.linalg.inv(information + belief)
     own = np.sqrt(np.diag(covariance @ (factor**2 * information + belief) @ covariance))
     seen = steps.std(0)
     steps = (steps - np.median(steps, axis=0)) * np.maximum(1.0, own / np.maximum(seen, 1e-12))
@@ -156,7 +164,7 @@ def conclude(
     steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
     prior = problem.sigma / space.spread  # on the unit cube
     share = steps.std(0) / prior
-    u, unseen = _settled(u, problem.start, information + np.diag(problem.weight**2), share)
+    u, unseen = _settled(u, problem.start, information + problem.known(u), share)
     samples = space.from_unit(u + steps)
     low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
     half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))

@@ -168,24 +168,26 @@ SIGMOID = Family(
 
 
 def _coulomb_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    return p[0] * (1 + np.sign(sign) * p[1]) * sign + p[2] * dq
+    return p[0] * (1 + np.sign(sign) * p[1]) * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
 
 
 def _coulomb_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    return p[0] * (1 + np.sign(dq) * p[1]) * (1 - sign**2) / WIDTH_DQ + p[2]
+    side = np.sign(dq)
+    return p[0] * (1 + side * p[1]) * (1 - sign**2) / WIDTH_DQ + p[2] * (1 + side * p[-1])
 
 
 @njit(cache=True)
 def _coulomb_native(p, v, h, memory):
-    sign = np.tanh(v / WIDTH_DQ)
-    level = p[0] * (1.0 + np.sign(v) * p[1])
-    return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + p[2]
+    sign, side = np.tanh(v / WIDTH_DQ), np.sign(v)
+    level, viscous = p[0] * (1.0 + side * p[1]), p[2] * (1.0 + side * p[3])
+    return level * sign + viscous * v, level * (1.0 - sign * sign) / WIDTH_DQ + viscous
 
 
 @njit(cache=True)
 def _coulomb_sharp(p, v, h, memory):
     sign = np.sign(v)
-    return p[0] * (1.0 + sign * p[1]) * sign + p[2] * v, p[2]
+    viscous = p[2] * (1.0 + sign * p[3])
+    return p[0] * (1.0 + sign * p[1]) * sign + viscous * v, viscous
 
 
 def _coulomb_start(level: np.ndarray) -> list[np.ndarray]:
@@ -194,10 +196,11 @@ def _coulomb_start(level: np.ndarray) -> list[np.ndarray]:
 
 COULOMB = Family(
     name="coulomb",
-    names=("coulomb", "asymmetry", "viscous"),
-    units=("Nm", "1", "Nm s/rad"),
+    names=("coulomb", "asymmetry", "viscous", "viscous_asymmetry"),
+    units=("Nm", "1", "Nm s/rad", "1"),
     logarithmic=("coulomb",),
-    formula="coulomb (1 ± asymmetry) sign(v) + viscous v",
+    optional=("viscous_asymmetry",),
+    formula="coulomb (1 ± asymmetry) sign(v) + viscous (1 ± viscous_asymmetry) v",
     law=_coulomb_law,
     law_slope=_coulomb_slope,
     native=_coulomb_native,
@@ -208,15 +211,15 @@ COULOMB = Family(
 
 def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
     side = np.sign(sign)
-    level = p[0] * (1 + side * p[1]) * (1 + p[3] * (1 + side * p[-1]) * np.exp(-((dq / p[4]) ** 2)))
-    return level * sign + p[2] * dq
+    level = p[0] * (1 + side * p[1]) * (1 + p[3] * (1 + side * p[-2]) * np.exp(-((dq / p[4]) ** 2)))
+    return level * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
 
 
 def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
     side = np.sign(dq)
-    level, bump = p[0] * (1 + side * p[1]), p[3] * (1 + side * p[-1]) * np.exp(-((dq / p[4]) ** 2))
+    level, bump = p[0] * (1 + side * p[1]), p[3] * (1 + side * p[-2]) * np.exp(-((dq / p[4]) ** 2))
     fall = level * bump * -2 * dq / p[4] ** 2
-    return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2]
+    return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2] * (1 + side * p[-1])
 
 
 @njit(cache=True)
@@ -224,16 +227,17 @@ def _stribeck_native(p, v, h, memory):
     sign = np.tanh(v / WIDTH_DQ)
     side = np.sign(v)
     level, bump = p[0] * (1.0 + side * p[1]), p[3] * (1.0 + side * p[5]) * np.exp(-((v / p[4]) ** 2))
-    fall = level * bump * -2.0 * v / p[4] ** 2
+    fall, viscous = level * bump * -2.0 * v / p[4] ** 2, p[2] * (1.0 + side * p[6])
     level *= 1.0 + bump
-    return level * sign + p[2] * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + p[2]
+    return level * sign + viscous * v, level * (1.0 - sign * sign) / WIDTH_DQ + fall * sign + viscous
 
 
 @njit(cache=True)
 def _stribeck_sharp(p, v, h, memory):
     sign = np.sign(v)
     level, bump = p[0] * (1.0 + sign * p[1]), p[3] * (1.0 + sign * p[5]) * np.exp(-((v / p[4]) ** 2))
-    return level * (1.0 + bump) * sign + p[2] * v, p[2] - level * bump * 2.0 * abs(v) / p[4] ** 2
+    viscous = p[2] * (1.0 + sign * p[6])
+    return level * (1.0 + bump) * sign + viscous * v, viscous - level * bump * 2.0 * abs(v) / p[4] ** 2
 
 
 def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
@@ -242,12 +246,13 @@ def _stribeck_start(level: np.ndarray) -> list[np.ndarray]:
 
 STRIBECK = Family(
     name="stribeck",
-    names=(*COULOMB.names, "rise", "stribeck_velocity", "rise_asymmetry"),
-    units=(*COULOMB.units, "1", "rad/s", "1"),
+    names=(*COULOMB.names[:3], "rise", "stribeck_velocity", "rise_asymmetry", "viscous_asymmetry"),
+    units=(*COULOMB.units[:3], "1", "rad/s", "1", "1"),
     logarithmic=("coulomb", "stribeck_velocity"),
-    optional=("rise_asymmetry",),
+    optional=("rise_asymmetry", "viscous_asymmetry"),
     formula=(
-        "coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v / stribeck_velocity)²)) sign(v) + viscous v"
+        "coulomb (1 ± asymmetry) (1 + rise (1 ± rise_asymmetry) exp(-(v / stribeck_velocity)²)) sign(v) "
+        "+ viscous (1 ± viscous_asymmetry) v"
     ),
     law=_stribeck_law,
     law_slope=_stribeck_slope,
@@ -268,7 +273,8 @@ def _bristle_native(p, v, h, memory):
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
     # what the coming step will do to it, at the present velocity
-    return level * z + stiff * rate * (v - abs(v) * z) + p[2] * v, stiff * rate * (1.0 - s * z) + p[2]
+    viscous = p[2] * (1.0 + s * p[7])
+    return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
 
 
 def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
@@ -283,10 +289,10 @@ def _bristle_held(phi: np.ndarray) -> np.ndarray:
 
 BRISTLE = Family(
     name="bristle",
-    names=(*STRIBECK.names[:-1], "presliding", "rise_asymmetry"),
-    units=(*STRIBECK.units[:-1], "rad", "1"),
+    names=(*STRIBECK.names[:5], "presliding", *STRIBECK.optional),
+    units=(*STRIBECK.units[:5], "rad", "1", "1"),
     logarithmic=(*STRIBECK.logarithmic, "presliding"),
-    optional=("rise_asymmetry",),
+    optional=STRIBECK.optional,
     formula="Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
     law=_stribeck_law,
     law_slope=_stribeck_slope,

@@ -125,6 +125,17 @@ def rigid_body(
     return whole - np.einsum("tjkc,kc->tj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard()), y
 
 
+def mass_matrix(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return (T, n, n) kg m^2 of the robot's own links and rotors at q (T, n) rad."""
+    model = robot.model(gravity=False)
+    data, out = mujoco.MjData(model), np.empty((*q.shape, robot.n))
+    for t in range(len(q)):
+        data.qpos = q[t]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fullM(model, data, out[t])
+    return out
+
+
 def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return moments (..., 3) kg m^2 and their axes as a quaternion (..., 4) w x y z of tensors (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
