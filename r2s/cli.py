@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.stages.build import CONF, unread
+from r2s.stages.build import CONF, GROUP, unread
 
 STAGES = ("train", "identify", "transfer", "compare", "pipeline")
 
@@ -111,10 +111,11 @@ def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]],
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}")
     key, value = word.split("=", 1)
     bare = key.lstrip("+~")
-    if bare in groups and value not in groups[bare]:
-        return UserError(
-            f"{bare}: no option '{value}'; allowed: {choices(groups[bare])}{nearest(value, groups[bare])}"
-        )
+    for option in [v.strip() for v in value.strip("[]").split(",")] if value.startswith("[") else [value]:
+        if bare in groups and option not in groups[bare]:
+            return UserError(
+                f"{bare}: no option '{option}'; allowed: {choices(groups[bare])}{nearest(option, groups[bare])}"
+            )
     if bare not in known:
         return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
     return UserError(f"{word}: {' '.join(str(error).split())}")
@@ -154,7 +155,8 @@ def is_there(cfg, overrides):
         return False
 
     def typed(words):
-        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
+        # these are no part of what is computed
+        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.", "tracker")
         return {w for w in words if not w.startswith(beside)}
 
     before = typed(OmegaConf.to_container(OmegaConf.load(folder / "overrides.yaml")))
@@ -197,6 +199,8 @@ def main():
     import hydra
     from hydra._internal.utils import get_args_parser
 
+    from r2s.runs import default_name
+
     sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
     typed = get_args_parser().parse_args()
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
@@ -206,6 +210,7 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
+                os.environ.setdefault(GROUP, default_name(typed.overrides))
             try:
                 job()
             finally:

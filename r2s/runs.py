@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -37,8 +37,21 @@ PACKAGES = (
 )
 
 
+class Watcher(Protocol):
+    """Who is told what a run writes, such as r2s/reporting/trackers; it neither raises nor waits for long."""
+
+    def log(self, table: str, row: Mapping[str, Any]) -> None:
+        """Take a row of a table."""
+
+    def summary(self, document: Mapping[str, Any]) -> None:
+        """Take the last word."""
+
+    def finish(self, status: str) -> None:
+        """Take the end: done, stopped or failed."""
+
+
 class Run:
-    """One run folder, open while its stage runs: `with Run(...) as run`.
+    """One run folder, open while its stage runs: `with Run(...) as run`. Its `watcher`, if any, hears what it writes.
 
     Args:
         root: where run folders live. stage, name: runs/<stage>/<name>; the name gets a number where it is taken.
@@ -66,6 +79,7 @@ class Run:
         self.folder = Path(resume) if resume else _make_folder(root / stage, name or default_name(overrides))
         self._began = time.time()
         self._tables: dict[str, Any] = {}
+        self.watcher: Watcher | None = None
         self._meta: dict[str, Any] = {
             "status": "running",
             "stage": stage,
@@ -98,6 +112,8 @@ class Run:
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
         self._write_meta()
+        if self.watcher:
+            self.watcher.finish(self._meta["status"])
 
     def _check_inputs(self, before: Mapping[str, str]) -> None:
         for path, digest in self._meta["inputs"].items():
@@ -125,6 +141,15 @@ class Run:
 
     def log(self, table: str, row: Mapping[str, Any]) -> None:
         """Append a row to <table>.csv; the first row sets the columns."""
+        self._append(table, row)
+        self.told(table, row)
+
+    def told(self, table: str, row: Mapping[str, Any]) -> None:
+        """Tell the watcher a row of a table that is written otherwise."""
+        if self.watcher:
+            self.watcher.log(table, row)
+
+    def _append(self, table: str, row: Mapping[str, Any]) -> None:
         if table not in self._tables:
             file = open(self.folder / f"{table}.csv", "w", newline="")  # noqa: SIM115 (closed in __exit__)
             writer = csv.DictWriter(file, list(row))
@@ -144,12 +169,19 @@ class Run:
         path.unlink()
         kept = [row for row in rows if row[column] <= most]
         for row in kept:
-            self.log(table, {k: int(v) if v.is_integer() else v for k, v in row.items()})
+            self._append(table, {k: int(v) if v.is_integer() else v for k, v in row.items()})
         return kept
 
     def summary(self, document: Mapping[str, Any]) -> None:
         """Write summary.json, the last word."""
         write_json(self.folder / "summary.json", document)
+        if self.watcher:
+            self.watcher.summary(document)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """What meta.json says."""
+        return self._meta
 
     def _write_meta(self) -> None:
         write_json(self.folder / "meta.json", self._meta)

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -13,7 +13,8 @@ from r2s.errors import UserError, check_number, choices, nearest
 
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
-COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads")
+COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads", "tracker")
+GROUP = "R2S_GROUP"  # in the environment of the jobs of a sweep: what they are called together
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,6 @@ def opened_source(cfg, robot, noise):
         with opened_arm(cfg, robot, noise) as arm:
             yield arm
         return
-    from dataclasses import replace
-
     from r2s.arm.simulated import SimulatedArm
 
     dynamics = replace(make_truth(cfg, robot), delay=cfg.data.delay, lag=cfg.data.lag)
@@ -242,7 +241,8 @@ def open_run(cfg, overrides, inputs=(), parents=()):
 
     from r2s.runs import Run
 
-    return Run(
+    trackers = {k: part(node, f"tracker.{k}") for k, node in (cfg.get("tracker") or {}).items() if node}
+    run = Run(
         Path(cfg.root),
         cfg.stage,
         cfg.name,
@@ -254,6 +254,22 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         parents=parents,
         resume=cfg.resume,
     )
+    if trackers:
+        run.watcher = watched(cfg, run, trackers)
+    return run
+
+
+def watched(cfg, run, trackers):
+    """Return the trackers of a run, started; a resumed run stays in the group that it was in."""
+    from r2s.reporting.trackers.behind import Trackers
+    from r2s.reporting.trackers.tracker import Tracked
+
+    tracked = Tracked(run.folder, cfg.stage, os.environ.get(GROUP), plain(cfg), run.meta, bool(cfg.resume))
+    if tracked.resumed:
+        tracked = replace(tracked, group=tracked.kept("group"))
+    else:
+        tracked.keep("group", tracked.group)
+    return Trackers(trackers, tracked)
 
 
 def plain(node):
