@@ -226,7 +226,7 @@ def is_done(folder: Path) -> bool:
 
 def default_name(overrides: Iterable[str]) -> str:
     """Return a name made of the time and the overrides, fit for a folder."""
-    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=")))
+    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=", "tracker")))
     readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # also a value that Hydra takes unquoted
     return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
 
