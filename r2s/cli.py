@@ -14,6 +14,7 @@ from typing import Any
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.stages.build import CONF, GROUP, unread
 
+COMMANDS = ("look", "list")
 STAGES = ("train", "identify", "transfer", "compare", "pipeline")
 
 
@@ -201,6 +202,8 @@ def main():
 
     from r2s.runs import default_name
 
+    if sys.argv[1:2] and sys.argv[1] in COMMANDS:
+        sys.exit(command(sys.argv[1:]))
     sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
     typed = get_args_parser().parse_args()
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
@@ -223,6 +226,19 @@ def main():
         sys.exit(stop(error))
     finally:
         end_workers()
+
+
+def command(words: Sequence[str]) -> int:
+    """Do `look` or `list`, which read run folders and compose no config; return the exit status."""
+    from r2s.commands import run_command
+
+    try:
+        run_command(words)
+    except UserError as error:
+        return stop(error)
+    except KeyboardInterrupt:
+        return 130
+    return 0
 
 
 def end_workers():

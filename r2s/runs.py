@@ -213,15 +213,27 @@ def is_done(folder: Path) -> bool:
     """Return whether a run is finished; raises UserError if a process of this computer still writes into it."""
     meta = json.loads((folder / "meta.json").read_text())
     process = meta.get("process", {})
-    if meta["status"] != "running" or process.get("host") != platform.node() or process["pid"] == os.getpid():
-        return meta["status"] == "done"
+    own = process.get("host") == platform.node()
+    if status_of(meta) == "running" and own and process["pid"] != os.getpid():
+        raise UserError(f"{folder}: process {process['pid']} is still at it; wait for it, or stop it")
+    return meta["status"] == "done"
+
+
+def status_of(meta: Mapping[str, Any]) -> str:
+    """Return done, stopped, failed, running, or killed: meta.json says running, and its process is gone.
+
+    Of a process on another computer only meta.json is known.
+    """
+    process = meta.get("process", {})
+    if meta["status"] != "running" or process.get("host") != platform.node():
+        return str(meta["status"])
     try:
         os.kill(process["pid"], 0)
     except ProcessLookupError:
-        return False
+        return "killed"
     except PermissionError:
         pass  # another user's
-    raise UserError(f"{folder}: process {process['pid']} is still at it; wait for it, or stop it")
+    return "running"
 
 
 def default_name(overrides: Iterable[str]) -> str:

@@ -13,9 +13,9 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     *("errors", "files", "progress", "runs"),
     *("physics", "recordings", "excitation", "identification", "tasks", "learning", "engines", "arm", "reporting"),
-    *("stages", "cli", "__main__"),
+    *("stages", "commands", "cli", "__main__"),
 ]
-SEES_A_CONFIG = ("stages", "cli", "__main__")
+SEES_A_CONFIG = ("stages", "commands", "cli", "__main__")
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))
 MOST_LINES = 400
 FRONT_DOOR_LINES = 120
