@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 
 from r2s.errors import UserError
@@ -52,4 +53,16 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
     if missing := [str(path) for path in paths if not path.is_file()]:
         raise UserError(f"look: no figure {missing[0]}")
     for path in paths:
-        display(Image(path, width=width))
+        display(Image(_small(path, width)))
+
+
+def _small(path: Path, width: int) -> bytes:
+    """Return a figure as PNG of so many pixels and few colours: a notebook keeps what it shows."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        size = (width, round(picture.height * width / picture.width))
+        drawn = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+    out = BytesIO()
+    drawn.quantize(64).save(out, "PNG", optimize=True)
+    return out.getvalue()
