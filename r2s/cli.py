@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.stages.build import CONF, GROUP, unread
+from r2s.stages.build import CONF, GROUP, STAGES, unread
 
 COMMANDS = ("look", "list")
-STAGES = ("train", "identify", "transfer", "compare", "pipeline")
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None) -> None:

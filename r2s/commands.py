@@ -36,10 +36,9 @@ def run_command(words: Sequence[str]) -> None:
 
 def list_runs(typed: Namespace) -> None:
     """Print a table of run folders."""
-    from r2s.cli import STAGES
     from r2s.reporting.run_list import run_rows
     from r2s.reporting.tables import print_table
-    from r2s.stages.build import console
+    from r2s.stages.build import STAGES, console
 
     if typed.stage not in (None, *STAGES):
         raise UserError(

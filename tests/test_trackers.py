@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 from hydra import compose, initialize_config_dir
-from hydra.errors import MissingConfigException
 from PIL import Image
 
+from r2s.cli import check_overrides
 from r2s.errors import UserError
 from r2s.reporting.trackers import behind
 from r2s.reporting.trackers.behind import Trackers, finite
@@ -179,8 +179,8 @@ def test_several_are_a_list():
     assert cfg.tracker.wandb.offline is False
     assert cfg.tracker.trackio.folder == "here/trackio"
     assert set(composed("tracker=tensorboard").tracker) == {"tensorboard"}
-    with pytest.raises(MissingConfigException):
-        composed("tracker=[csv,mlfow]")
+    with pytest.raises(UserError, match=r"no option 'mlfow'; allowed: csv, mlflow, .* did you mean 'mlflow'"):
+        check_overrides(["tracker=[csv,mlfow]"], None)
 
 
 class Broken:
