@@ -28,8 +28,9 @@ def r2s(*words: str) -> Path:
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise UserError(lines[-1].removeprefix("error: ") if lines else f"exit status {done.returncode}")
-    print("\n".join(line.rstrip() for line in done.stdout.splitlines()))
-    return Path(re.findall(r"^written: (\S+)", done.stdout, flags=re.M)[-1])
+    out = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # bold and dim, which some pages show as they are
+    print("\n".join(line.rstrip() for line in out.splitlines()))
+    return Path(re.findall(r"^written: (\S+)", out, flags=re.M)[-1])
 
 
 def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520) -> None:
