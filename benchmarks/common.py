@@ -22,7 +22,7 @@ from r2s.excitation.fourier import fourier  # noqa: E402
 from r2s.identification.settings import Settings  # noqa: E402
 from r2s.physics.dynamics import nominal_dynamics  # noqa: E402
 from r2s.physics.robot import load_robot  # noqa: E402
-from r2s.runs import _cpu  # noqa: E402
+from r2s.provenance import cpu  # noqa: E402
 
 
 def conf(path: str) -> dict:
@@ -35,7 +35,7 @@ def conf(path: str) -> dict:
     return {k: v for k, v in document.items() if k not in beside}
 
 
-MACHINE = f"{_cpu()}, {os.cpu_count()} cores"
+MACHINE = f"{cpu()}, {os.cpu_count()} cores"
 ROBOT = load_robot(**conf("robot/panda"))
 OLD = nominal_dynamics(ROBOT, **conf("friction/gaz2019"))
 NEW = nominal_dynamics(ROBOT, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])

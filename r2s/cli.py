@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, choices, nearest
-from r2s.stages.build import CONF, loaded, unread
+from r2s.stages.build import CONF, GROUP, STAGES, loaded, unread
 
 STOPPED = 3  # exit status of a run that a stopped arm has ended
-STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
+COMMANDS = ("look", "list")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
@@ -122,10 +122,11 @@ def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]],
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}")
     key, value = word.split("=", 1)
     bare = key.lstrip("+~")
-    if bare in groups and value not in groups[bare]:
-        return UserError(
-            f"{bare}: no option '{value}'; allowed: {choices(groups[bare])}{nearest(value, groups[bare])}"
-        )
+    for option in [v.strip() for v in value.strip("[]").split(",")] if value.startswith("[") else [value]:
+        if bare in groups and option not in groups[bare]:
+            return UserError(
+                f"{bare}: no option '{option}'; allowed: {choices(groups[bare])}{nearest(option, groups[bare])}"
+            )
     if bare not in known:
         return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
     return UserError(f"{word}: {' '.join(str(error).split())}")
@@ -169,7 +170,8 @@ def is_there(cfg, overrides):
         return False
 
     def typed(words):
-        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.")  # no part of what is computed
+        # these are no part of what is computed
+        beside = ("stage=", "name=", "root=", "threads=", "only_missing=", "grid.", "tracker")
         return {w for w in words if not w.startswith(beside)}
 
     before = typed(typed_in(folder))
@@ -246,6 +248,10 @@ def main():
     import hydra
     from hydra._internal.utils import get_args_parser
 
+    from r2s.runs import default_name
+
+    if sys.argv[1:2] and sys.argv[1] in COMMANDS:
+        sys.exit(command(sys.argv[1:]))
     sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
     typed = get_args_parser().parse_args()
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
@@ -256,6 +262,7 @@ def main():
             if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")
                 os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra prints what a launcher raises, and exits
+                os.environ.setdefault(GROUP, default_name(typed.overrides))
             try:
                 job()
             except Exception as error:
@@ -274,6 +281,19 @@ def main():
         sys.exit(stop(f"{error.strerror}{f': {error.filename}' if error.filename else ''}"))
     finally:
         end_workers()
+
+
+def command(words: Sequence[str]) -> int:
+    """Do `look` or `list`, which read run folders and compose no config; return the exit status."""
+    from r2s.commands import run_command
+
+    try:
+        run_command(words)
+    except UserError as error:
+        return stop(error)
+    except KeyboardInterrupt:
+        return 130
+    return 0
 
 
 def end_workers():

@@ -7,44 +7,42 @@ belongs to one process at a time: the lock on its overrides.yaml ends with the p
 import csv
 import errno
 import fcntl
-import hashlib
 import json
 import math
 import os
 import platform
 import re
 import shutil
-import subprocess
 import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 from zipfile import BadZipFile
 
 import numpy as np
 
 from r2s.errors import Stopped, UserError
 from r2s.files import whole
+from r2s.provenance import git, machine, packages, sha256
 
-PACKAGES = (
-    "mujoco",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "hydra-core",
-    "pymoo",
-    "dartpy",
-    "numba",
-    "numpy",
-    "scipy",
-)
+
+class Watcher(Protocol):
+    """Who is told what a run writes, such as r2s/reporting/trackers; it neither raises nor waits for long."""
+
+    def log(self, table: str, row: Mapping[str, Any]) -> None:
+        """Take a row of a table."""
+
+    def summary(self, document: Mapping[str, Any]) -> None:
+        """Take the last word."""
+
+    def finish(self, status: str) -> None:
+        """Take the end: done, stopped or failed."""
 
 
 class Run:
-    """One run folder, open while its stage runs: `with Run(...) as run`.
+    """One run folder, open while its stage runs: `with Run(...) as run`. Its `watcher`, if any, hears what it writes.
 
     Args:
         root: where run folders live. stage, name: runs/<stage>/<name>; the name gets a number where it is taken.
@@ -76,6 +74,7 @@ class Run:
         overrides = list(overrides)
         self._began = time.monotonic()  # the clock of the wall may jump
         self._tables: dict[str, Any] = {}
+        self.watcher: Watcher | None = None
         self._meta: dict[str, Any] = {
             "status": "running",
             "stage": stage,
@@ -84,9 +83,9 @@ class Run:
             "seed": seed,
             "threads": threads or os.cpu_count(),
             "process": {"host": platform.node(), "pid": os.getpid()},
-            "git": _git(),
-            "packages": {p: _version(p) for p in PACKAGES} | {"python": platform.python_version()},
-            "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "system": platform.platform(terse=True)},
+            "git": git(),
+            "packages": packages(),
+            "machine": machine(),
             "inputs": {str(p): sha256(p) for p in inputs},
             "parents": [str(p) for p in parents],
         }
@@ -136,6 +135,8 @@ class Run:
                 raise
         finally:
             os.close(self._lock)
+        if self.watcher:
+            self.watcher.finish(self._meta["status"])
 
     def _check_inputs(self, before: Mapping[str, str]) -> None:
         for path, digest in self._meta["inputs"].items():
@@ -165,6 +166,15 @@ class Run:
 
     def log(self, table: str, row: Mapping[str, Any]) -> None:
         """Append a row to <table>.csv; the first row sets the columns."""
+        self._append(table, row)
+        self.told(table, row)
+
+    def told(self, table: str, row: Mapping[str, Any]) -> None:
+        """Tell the watcher a row of a table that is written otherwise."""
+        if self.watcher:
+            self.watcher.log(table, row)
+
+    def _append(self, table: str, row: Mapping[str, Any]) -> None:
         if table not in self._tables:
             file = open(self.folder / f"{table}.csv", "w", newline="")  # noqa: SIM115 (closed in __exit__)
             writer = csv.DictWriter(file, list(row))
@@ -206,6 +216,13 @@ class Run:
     def summary(self, document: Mapping[str, Any]) -> None:
         """Write summary.json, the last word."""
         write_json(self.folder / "summary.json", document)
+        if self.watcher:
+            self.watcher.summary(document)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """What meta.json says."""
+        return self._meta
 
     def _write_meta(self) -> None:
         write_json(self.folder / "meta.json", self._meta)
@@ -310,17 +327,28 @@ def _lock(folder: Path) -> int:
     return lock
 
 
+def status_of(meta: Mapping[str, Any]) -> str:
+    """Return done, stopped, failed, running, or killed: meta.json says running, and its process is gone.
+
+    Of a process on another computer only meta.json is known.
+    """
+    process = meta.get("process", {})
+    if meta["status"] != "running" or process.get("host") != platform.node():
+        return str(meta["status"])
+    try:
+        os.kill(process["pid"], 0)
+    except ProcessLookupError:
+        return "killed"
+    except PermissionError:
+        pass  # another user's
+    return "running"
+
+
 def default_name(overrides: Iterable[str]) -> str:
     """Return a name made of the time and the overrides, fit for a folder."""
-    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=")))
+    typed = ",".join(o for o in overrides if not o.startswith(("stage=", "name=", "root=", "tracker")))
     readable = re.sub(r"[^A-Za-z0-9.-]+", "_", typed)[:60].strip("_")  # also a value that Hydra takes unquoted
     return "_".join(p for p in (datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), readable) if p)
-
-
-def sha256(path: str | Path) -> str:
-    """Return the hex digest of a file."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _begin(parent: Path) -> Path:
@@ -346,36 +374,3 @@ def _take_name(folder: Path, parent: Path, name: str, only: bool) -> Path:
         return final
     taken = "is" if only else "and its numbered followers are all"
     raise UserError(f"name: {parent / name} {taken} taken")
-
-
-def _git() -> dict[str, Any]:
-    root = Path(__file__).parent.parent
-    if not (root / ".git").exists():  # installed, perhaps within somebody else's repository
-        return {"commit": None, "dirty": None}
-
-    def ask(*words: str) -> str | None:
-        try:
-            done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10)
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
-
-    changes = ask("status", "--porcelain")
-    return {"commit": ask("rev-parse", "HEAD"), "dirty": None if changes is None else bool(changes)}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _cpu() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -15,7 +15,9 @@ from r2s.errors import UserError, check_number, choices, nearest
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
 BESIDE = ("soft_start_s", "live")  # of conf/arm, how it is driven
-COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads")
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
+COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads", "tracker")
+GROUP = "R2S_GROUP"  # in the environment of the jobs of a sweep: what they are called together
 
 
 @dataclass(frozen=True)
@@ -234,8 +236,6 @@ def opened_source(cfg, robot, noise):
         with opened_arm(cfg, robot, noise) as arm:
             yield arm
         return
-    from dataclasses import replace
-
     from r2s.arm.simulated import SimulatedArm
 
     dynamics = replace(make_truth(cfg, robot), delay=cfg.data.delay, lag=cfg.data.lag)
@@ -283,7 +283,8 @@ def open_run(cfg, overrides, inputs=(), parents=()):
 
     from r2s.runs import Run
 
-    return Run(
+    trackers = {k: part(node, f"tracker.{k}") for k, node in (cfg.get("tracker") or {}).items() if node}
+    run = Run(
         Path(cfg.root),
         cfg.stage,
         cfg.name,
@@ -296,6 +297,22 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         resume=cfg.resume,
         only=cfg.only_missing,
     )
+    if trackers:
+        run.watcher = watched(cfg, run, trackers)
+    return run
+
+
+def watched(cfg, run, trackers):
+    """Return the trackers of a run, started; a resumed run stays in the group that it was in."""
+    from r2s.reporting.trackers.behind import Trackers
+    from r2s.reporting.trackers.tracker import Tracked
+
+    tracked = Tracked(run.folder, cfg.stage, os.environ.get(GROUP), plain(cfg), run.meta, bool(cfg.resume))
+    if tracked.resumed:
+        tracked = replace(tracked, group=tracked.kept("group"))
+    else:
+        tracked.keep("group", tracked.group)
+    return Trackers(trackers, tracked)
 
 
 def plain(node):

@@ -333,6 +333,8 @@ def identify(cfg, overrides):
             note["breakaway_unknown"] = found.edges.open
         save_parameters(run.folder / "parameters.yaml", *found.saved, source, note)
         found.history.to_csv(run.folder / "metrics.csv", index=False)
+        for row in found.history.to_dict("records"):
+            run.told("metrics", row)
         write_description(run.folder / "model", robot, found.dynamics)
         run.summary(summary)
         pages.identification(run, robot, nominal, found, validation, summary, **how)

@@ -10,7 +10,7 @@ from typing import Any
 
 from r2s.errors import Stopped, UserError
 from r2s.stages import identify, train, transfer
-from r2s.stages.build import CONF, PACKAGE, console, make_robot, open_run, unread
+from r2s.stages.build import CONF, GROUP, PACKAGE, console, make_robot, open_run, unread
 
 STEPS = (
     "1/3 record the arm and identify it",
@@ -158,6 +158,7 @@ def pipeline(cfg, overrides):
     with open_run(cfg, overrides) as run:
         name = run.folder.name
         check_free(root, name)
+        os.environ.setdefault(GROUP, name)  # its steps belong together
         for what, step in zip(STEPS, commands(cfg, name, overrides), strict=True):
             print(what, file=sys.stderr)
             run_step(step)

@@ -1,0 +1,107 @@
+"""`r2s list` and `r2s look`: commands that read run folders. They compose no config and open no run folder."""
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+from r2s.errors import UserError, choices, nearest
+
+PORT = 9090
+
+
+def run_command(words: Sequence[str]) -> None:
+    """Do what was typed.
+
+    Args:
+        words: the command and its arguments.
+
+    Raises:
+        UserError: it cannot be done.
+    """
+    parser = ArgumentParser(prog="r2s")
+    commands = parser.add_subparsers(dest="command", required=True)
+    listing = commands.add_parser("list", help="the runs there are: status, what came of them, age")
+    listing.add_argument("--root", default="runs", help="where run folders live")
+    listing.add_argument("--stage", help="only runs of this stage")
+    listing.add_argument("--failed", action="store_true", help="only what failed or was killed")
+    looking = commands.add_parser("look", help="the viewer on one run, or on several side by side")
+    looking.add_argument("run", nargs="+", type=Path, metavar="RUN", help="a run folder")
+    looking.add_argument("--web", action="store_true", help="serve the viewer to a browser on this computer")
+    looking.add_argument(
+        "--port", type=int, default=PORT, help=f"of --web, {PORT} unless told; the next one is used too"
+    )
+    typed = parser.parse_args(words)
+    {"list": list_runs, "look": look}[typed.command](typed)
+
+
+def list_runs(typed: Namespace) -> None:
+    """Print a table of run folders."""
+    from r2s.reporting.run_list import run_rows
+    from r2s.reporting.tables import print_table
+    from r2s.stages.build import STAGES, console
+
+    if typed.stage not in (None, *STAGES):
+        raise UserError(
+            f"--stage: no stage '{typed.stage}'; allowed: {choices(STAGES)}{nearest(typed.stage, STAGES)}"
+        )
+    table = run_rows(typed.root, stage=typed.stage, failed=typed.failed)
+    if table.empty:
+        kind = " that failed or was killed" * typed.failed
+        print(f"no run{f' of stage={typed.stage}' if typed.stage else ''}{kind} in {typed.root}/")
+        return
+    print_table(console(), table, f"{len(table)} runs in {typed.root}/")
+
+
+def look(typed: Namespace) -> None:
+    """Open the viewer; without a screen say so and write PNGs."""
+    from r2s.reporting.look import has_screen, open_native, serve_web, side_by_side
+
+    folders = [whole_run(run) for run in typed.run]
+    robot = robot_of(folders)
+    recording, pictures = folders[0] / "recording.rrd", sorted((folders[0] / "figures").glob("*.png"))
+    if len(folders) > 1:
+        out = folders[0].parent.parent / "look" / "_and_".join(f.name[:30] for f in folders)
+        labels = [
+            f.name if len({g.name for g in folders}) == len(folders) else f"{f.parent.name} {f.name}" for f in folders
+        ]
+        pictures = side_by_side(out, robot, dict(zip(labels, folders, strict=True)))
+        recording = out / "recording.rrd"
+    if typed.web:
+        serve_web([recording], typed.port)
+    elif has_screen():
+        open_native([recording])
+    else:
+        print(f"no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); --web serves {recording} to a browser")
+        for path in pictures:
+            print(f"  {path}")
+
+
+def whole_run(folder: Path) -> Path:
+    """Return a run folder that has something to look at.
+
+    Raises:
+        UserError: it has not.
+    """
+    if (folder / "recording.rrd").is_file():
+        return folder
+    if (folder / "meta.json").is_file():
+        raise UserError(f"look: {folder} has no recording.rrd; it was stopped before its end")
+    names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
+    raise UserError(f"look: '{folder}' is no run folder{nearest(folder.name, names)}")
+
+
+def robot_of(folders: Sequence[Path]):
+    """Return the robot of all these runs.
+
+    Raises:
+        UserError: they have different ones.
+    """
+    from omegaconf import OmegaConf
+
+    from r2s.stages.build import make_robot
+
+    configs = [OmegaConf.load(folder / "config.yaml") for folder in folders]
+    for folder, cfg in zip(folders, configs, strict=True):
+        if cfg.robot != configs[0].robot:
+            raise UserError(f"look: {folder} is of another robot than {folders[0]}; look at them one by one")
+    return make_robot(configs[0])

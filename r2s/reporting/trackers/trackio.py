@@ -1,0 +1,57 @@
+"""tracker=trackio: an SQLite file beside the run folders; `TRACKIO_DIR=runs/trackio trackio show` shows it."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torchrl.record.loggers.trackio import TrackioLogger
+
+from r2s.reporting.trackers.tracker import Tracked, needs
+
+
+class Trackio:
+    """A run of a project.
+
+    Args:
+        folder: of the databases, one a project, for a whole process; TRACKIO_DIR in the environment goes before it.
+        project: that the runs belong to.
+    """
+
+    def __init__(self, folder: str, project: str = "r2s"):
+        os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
+        os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # read when it is imported
+        needs("trackio", "trackio")
+        self._project = project
+
+    def start(self, run: Tracked) -> None:
+        """Begin a run, or go on with the one that the run folder names."""
+        import trackio
+
+        for module in (trackio, trackio.run, trackio.utils):
+            vars(module)["print"] = lambda *words, **how: None  # it talks into the output of the run
+        resume = "must" if run.resumed and run.kept("trackio") else "never"
+        config = run.settings | {"folder": str(run.folder.absolute())}
+        quiet = {"auto_log_gpu": False, "auto_log_cpu": False}
+        how = {"resume": resume, "group": run.group, "config": config, "embed": False, **quiet}
+        self._logger = TrackioLogger(run.name, self._project, **how)
+        run.keep("trackio", run.name)
+
+    def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
+        """Show a row of <table>.csv."""
+        self._logger.experiment.log({f"{table}/{k}": v for k, v in numbers.items()}, step=step)
+
+    def summary(self, numbers: Mapping[str, float]) -> None:
+        """Show the last word."""
+        self._logger.experiment.log({f"summary/{k}": v for k, v in numbers.items()})
+
+    def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
+        """Keep figures and files."""
+        import trackio
+
+        run = self._logger.experiment
+        if pictures:
+            run.log({f"figures/{path.stem}": trackio.Image(path) for path in pictures})
+        for path in files:
+            run.log_artifact(path, name=path.name, type=path.suffix.lstrip("."))
+        run.log({"status": status})
+        run.finish()

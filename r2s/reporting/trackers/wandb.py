@@ -1,0 +1,66 @@
+"""tracker=wandb: Weights & Biases, offline in the run folder; `wandb sync runs/*/*/wandb/offline-run-*` sends it."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from uuid import uuid4
+
+from torchrl.record.loggers.wandb import WandbLogger
+
+from r2s.reporting.trackers.tracker import Tracked, needs
+
+
+class Wandb:
+    """A run of a project.
+
+    Args:
+        project, entity: where it belongs; None is your own entity. offline: whether nothing leaves this computer.
+    """
+
+    def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):
+        os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        os.environ.setdefault("WANDB_SILENT", "true")
+        needs("wandb", "wandb")
+        self._where, self._offline = {"project": project, "entity": entity}, offline
+
+    def start(self, run: Tracked) -> None:
+        """Begin a run, or go on with the one that the run folder names."""
+        import wandb
+
+        known = run.kept("wandb") if run.resumed else None
+        name = known or uuid4().hex[:12]
+        run.keep("wandb", name)
+        self._folder = run.folder
+        self._logger = WandbLogger(
+            run.name,
+            offline=self._offline,
+            save_dir=run.folder,
+            id=name,
+            **self._where,
+            group=run.group,
+            job_type=run.stage,
+            config=run.settings,
+            log_env_packages=False,
+            settings=wandb.Settings(console="off"),
+        )
+
+    def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
+        """Show a row of <table>.csv."""
+        self._logger.log_metrics({f"{table}/{k}": v for k, v in numbers.items()}, step)
+
+    def summary(self, numbers: Mapping[str, float]) -> None:
+        """Show the last word."""
+        self._logger.experiment.summary.update({f"summary/{k}": v for k, v in numbers.items()})
+
+    def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
+        """Keep figures and files."""
+        import wandb
+
+        run = self._logger.experiment
+        if pictures:
+            run.log({f"figures/{path.stem}": wandb.Image(str(path)) for path in pictures})
+        for path in files:
+            run.save(str(path), base_path=str(self._folder), policy="now")
+        run.summary["status"] = status
+        run.finish(exit_code=0 if status == "done" else 1)
+        wandb.teardown()  # its service would outlive the run

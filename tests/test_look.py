@@ -1,0 +1,275 @@
+"""`r2s list` and `r2s look`: what the run folders are, and what a person sees of them."""
+
+import base64
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import time
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from conftest import ROOT, conf
+
+from r2s import cli
+from r2s.errors import UserError
+from r2s.reporting.run_list import ago, run_rows
+from r2s.reporting.viewer_layout import Overlay
+from r2s.runs import status_of
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+GONE = 2**22 - 3  # a process id beyond what Linux gives by default
+
+
+def folder(root: Path, stage: str, name: str, status: str, summary: dict | None = None, **more) -> Path:
+    """Write a run folder, begun two hours ago by a process that is gone, with two evaluations."""
+    at = root / stage / name
+    at.mkdir(parents=True)
+    start = (datetime.now().astimezone() - timedelta(hours=2)).isoformat(timespec="seconds")
+    process = {"host": platform.node(), "pid": GONE}
+    (at / "meta.json").write_text(
+        json.dumps({"status": status, "stage": stage, "start": start, "process": process} | more)
+    )
+    robot = {"_target_": "r2s.physics.robot.load_robot", **conf("robot/panda")}
+    (at / "config.yaml").write_text(yaml.safe_dump({"robot": robot}))
+    curve = {
+        "env_steps": [1000, 2000],
+        "wall_clock_s": [1.0, 2.0],
+        "success_5cm": [0.5, 1.0],
+        "success_2cm": [0.2, 0.9],
+    }
+    curve |= {"success_1cm": [0.1, 0.75], "success_5mm": [0.0, 0.5], "distance_median_m": [0.1, 0.01]}
+    pd.DataFrame(curve | {"return_paper": [-300.0, -90.0]}).to_csv(at / "evaluations.csv", index=False)
+    if summary:
+        (at / "summary.json").write_text(json.dumps(summary))
+        (at / "recording.rrd").write_bytes(b"")
+    return at
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    reach = {"success_1cm": 0.98, "return_paper": -85.2}
+    folder(tmp_path, "train", "good", "done", {"best": reach, "last": reach})
+    folder(tmp_path, "train", "shot", "running")
+    folder(tmp_path, "train", "wrong", "failed", error="UserError: no such thing")
+    folder(tmp_path, "train", "halted", "stopped")
+    error = {"torque_rmse_Nm": [0.2, 0.4], "nominal_torque_rmse_Nm": [1.0, 2.0]}
+    folder(tmp_path, "identify", "found", "done", {"train": error, "validation": error})
+    folder(tmp_path, "transfer", "there", "done", {"mujoco": reach, "twin": reach | {"success_1cm": 0.9}})
+    (tmp_path / "train" / "no run").mkdir()
+    return tmp_path
+
+
+def test_a_run_that_was_killed_says_so():
+    """SIGKILL leaves `running` in meta.json; on another computer nobody can know."""
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    meta = {"status": "running", "process": {"host": platform.node(), "pid": child.pid}}
+    assert status_of(meta) == "running"
+    child.kill()
+    child.wait()
+    assert status_of(meta) == "killed"
+    assert status_of(meta | {"process": {"host": "elsewhere", "pid": child.pid}}) == "running"
+    assert status_of(meta | {"status": "done"}) == "done"
+
+
+def test_the_list_has_status_figures_and_age(root):
+    """Every run is in it, with the figures that its stage is about."""
+    rows = run_rows(root)
+    assert rows["status"].to_dict() == {
+        "train/good": "done",
+        "train/shot": "killed",
+        "train/wrong": "failed",
+        "train/halted": "stopped",
+        "identify/found": "done",
+        "transfer/there": "done",
+    }
+    assert set(rows["age"]) == {"2 h"}
+    figures = rows["what came of it"]
+    assert figures["train/good"] == "98 % < 1 cm, return -85"
+    assert figures["train/shot"] == "75 % < 1 cm, return -90 after 2k env steps"
+    assert figures["train/wrong"] == "UserError: no such thing"
+    assert figures["identify/found"] == "torque RMSE 0.3 Nm, nominal 1.5"
+    assert figures["transfer/there"] == "mujoco 98 %; twin 90 % < 1 cm"
+    assert set(run_rows(root, failed=True).index) == {"train/shot", "train/wrong"}
+    assert set(run_rows(root, stage="identify").index) == {"identify/found"}
+    assert run_rows(root / "nowhere").empty
+    assert [ago(s) for s in (3, 90, 7200, 3e5)] == ["3 s", "2 min", "2 h", "3 d"]
+
+
+def typed(*words: str, monkeypatch, capsys) -> tuple[int, str, str]:
+    """Do a command in this process: exit status, output, errors."""
+    monkeypatch.setattr(sys, "argv", ["r2s", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return end.value.code, *capsys.readouterr()
+
+
+def test_the_command_lists(root, monkeypatch, capsys):
+    """`r2s list --failed`, and a stage that is none."""
+    status, out, _ = typed("list", "--root", str(root), "--failed", monkeypatch=monkeypatch, capsys=capsys)
+    assert status == 0
+    assert "train/shot" in out
+    assert "train/good" not in out
+    status, _, err = typed("list", "--stage", "trian", monkeypatch=monkeypatch, capsys=capsys)
+    assert status == 2
+    assert "did you mean 'train'" in err
+
+
+def test_without_a_screen_it_says_so_and_writes_pictures(root, monkeypatch, capsys):
+    """Two runs side by side: one recording with both, and their curves as a PNG."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    other = shutil.copytree(root / "train" / "good", root / "train" / "twice")
+    runs = [str(root / "train" / "good"), str(other)]
+    status, out, err = typed("look", *runs, monkeypatch=monkeypatch, capsys=capsys)
+    assert status == 0, err
+    assert "no screen here" in out
+    (picture,) = re.findall(r"^  (\S+\.png)$", out, flags=re.M)
+    assert Path(picture).stat().st_size > 5000
+    assert (Path(picture).parent / "recording.rrd").stat().st_size > 1000
+
+
+def test_what_cannot_be_looked_at_is_one_line(root, monkeypatch, capsys):
+    """A folder that is none, a run that was stopped, arms that differ."""
+    for word, said in (("god", "did you mean 'good'"), ("halted", "it was stopped before its end")):
+        run = str(root / "train" / word)
+        status, _, err = typed("look", run, monkeypatch=monkeypatch, capsys=capsys)
+        assert status == 2
+        assert len(err.splitlines()) == 1
+        assert said in err
+    other = root / "transfer" / "there"
+    (other / "config.yaml").write_text("robot: {name: ur10e}\n")
+    runs = [str(root / "train" / "good"), str(other)]
+    status, _, err = typed("look", *runs, monkeypatch=monkeypatch, capsys=capsys)
+    assert "another robot" in err
+
+
+def test_only_this_computer_is_served(monkeypatch):
+    """`--web` binds to the loopback address."""
+    from r2s.reporting import look
+
+    seen = []
+
+    class Viewer:
+        def __init__(self, words):
+            seen.extend(words)
+
+        def poll(self):
+            return 1
+
+        def wait(self):
+            return 1
+
+        def terminate(self):
+            pass
+
+    monkeypatch.setattr(look.subprocess, "Popen", Viewer)
+    with pytest.raises(UserError, match="exit status 1"):
+        look.serve_web([Path("recording.rrd")], 9090)
+    assert seen[seen.index("--bind") + 1] == "127.0.0.1"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_the_web_viewer_opens_without_an_error(root, panda, tmp_path):
+    """`r2s look --web` in headless Chromium: the picture is no blank page and its console has no error."""
+    from websockets.sync.client import connect
+
+    from r2s.reporting.viewer import write_recording
+
+    run = root / "identify" / "found"
+    t = np.arange(4000) * 1e-3
+    torque = np.sin(np.outer(t, np.arange(1, 8)))
+    overlay = Overlay(t, torque, {"nominal": 0.5 * torque, "identified": 0.95 * torque})
+    write_recording(run / "recording.rrd", panda, overlays={"torque": overlay})
+    web = [sys.executable, str(ROOT / "run.py"), "look", str(run), "--web", "--port", "9490"]
+    said = open(tmp_path / "web.log", "w+")  # noqa: SIM115
+    surf = [
+        CHROMIUM,
+        "--headless=new",
+        "--no-sandbox",
+        "--use-gl=angle",
+        "--use-angle=swiftshader",
+        "--remote-debugging-port=9492",
+    ]
+    surf += [
+        "--enable-unsafe-swiftshader",
+        "--window-size=1300,800",
+        f"--user-data-dir={tmp_path / 'chromium'}",
+        "about:blank",
+    ]
+    with (
+        subprocess.Popen(web, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT) as server,
+        subprocess.Popen(surf, stderr=subprocess.PIPE, text=True) as browser,
+    ):
+        try:
+            socket = waited(lambda: next(iter(re.findall(r"ws://\S+", browser.stderr.readline())), None))
+            url = waited(
+                lambda: next(iter(re.findall(r"look: (http://\S+)", (tmp_path / "web.log").read_text())), None)
+            )
+            errors, picture = visited(connect, socket, url)
+        finally:
+            browser.terminate()
+            server.terminate()
+    (tmp_path / "look.png").write_bytes(picture)
+    if kept := os.environ.get("R2S_KEEP"):
+        shutil.copy(tmp_path / "look.png", kept)
+    assert errors == []
+    assert len(picture) > 30_000, "a blank page"
+
+
+def waited(ask, seconds: float = 90.0):
+    """Return the first answer that is one."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if answer := ask():
+            return answer
+        time.sleep(0.2)
+    raise TimeoutError
+
+
+def visited(connect, socket: str, url: str, seconds: float = 45.0) -> tuple[list[str], bytes]:
+    """Return what the console of a page says of errors in its first seconds, and a PNG of it at their end.
+
+    The viewer asks for news and sends statistics; where there is no way out, those two fail.
+    """
+    with connect(socket, max_size=None) as tab:
+        count, errors = 0, []
+
+        def ask(method: str, session: str | None = None, **params) -> dict:
+            nonlocal count
+            count += 1
+            words = {"id": count, "method": method, "params": params} | ({"sessionId": session} if session else {})
+            tab.send(json.dumps(words))
+            while (answer := json.loads(tab.recv(timeout=90))).get("id") != count:
+                heard(answer)
+            return answer["result"]
+
+        def heard(message: dict) -> None:
+            kind, params = message.get("method"), message.get("params", {})
+            if kind == "Runtime.exceptionThrown":
+                errors.append(json.dumps(params))
+            if kind == "Runtime.consoleAPICalled" and params["type"] == "error":
+                errors.append(json.dumps(params["args"]))
+
+        target = ask("Target.createTarget", url="about:blank")["targetId"]
+        session = ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        ask("Runtime.enable", session)
+        ask("Page.enable", session)
+        ask("Page.navigate", session, url=url)
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                heard(json.loads(tab.recv(timeout=left)))
+            except TimeoutError:
+                break
+        data = ask("Page.captureScreenshot", session, format="png")["data"]
+    return [e for e in errors if "Failed to fetch" not in e], base64.b64decode(data)
