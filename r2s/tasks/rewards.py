@@ -1,7 +1,7 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
-A reward is a weighted sum of terms. Two of them are not in the paper: a bonus for precision, and a price of asking for
-what the driver's law does not let through. The replay buffer keeps the terms. So when the curriculum moves its
+A reward is a weighted sum of terms. Two of them are not in the paper: a bonus for precision, and a price of asking
+for what the law does not let through. The replay buffer keeps the terms. So when the curriculum moves its
 weights, every stored transition is worth what the present weights say.
 """
 
