@@ -6,9 +6,11 @@ clock does not wait is driven from a process of its own, r2s/arm/live.py.
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.signal import savgol_filter
 
 from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
@@ -18,6 +20,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
 
 LOGGED_S = 1.0  # before a stop, of every cycle
+SMOOTH = 20  # cycles to either side, from whose angles a speed is told: an encoder's noise leaves 2e-4 rad/s
 ATTEMPTS = 3  # to bring an arm to its start, each with the operator's consent
 
 
@@ -74,6 +77,7 @@ class DrivenArm:
     Attributes:
         stops: why episodes ended early, where they did. timing: see there.
         done: episodes that the arm was brought to the start of, or tried to: all, unless it was `halted`.
+        speeds: (1, T, n) rad/s after each control step of the last episode, from the angles of all its cycles.
         halted: why there are no further episodes, or None: the operator was asked after a stop, and did not agree.
 
     Args:
@@ -92,6 +96,7 @@ class DrivenArm:
         self.stops: list[Stop] = []
         self.timing = Timing()
         self.done = 0
+        self.speeds = np.zeros((1, task.steps, arm.robot.n))
         self.halted: str | None = None
 
     def place(self, starts: np.ndarray, first: int) -> State:
@@ -101,6 +106,7 @@ class DrivenArm:
         where he does not agree, neither this nor any later episode begins.
         """
         self._log.clear()
+        self._angles: list[np.ndarray] = []
         self._episode, self._stopped, self._sent, self._limited = first, False, 0.0, 0
         if self.halted is None:
             self._approach(starts[0])
@@ -128,6 +134,9 @@ class DrivenArm:
         reason = self._driven.end()
         if not self._stopped and reason is not None:  # the end came before the arm was at rest
             self._stop(f"{self._driven.state.t:.2f} s", reason)
+        told = smooth_speeds(self._angles, self._substeps)[: self.speeds.shape[1]]
+        self.speeds[:] = 0.0  # an arm that was stopped rests
+        self.speeds[0, : len(told)] = told
         return np.array([self._stopped])
 
     def cycle(self, target: np.ndarray | None) -> bool:
@@ -136,6 +145,7 @@ class DrivenArm:
             self._driven(target)
         except ArmStopped as reason:
             self._stop(f"{self._driven.state.t:.2f} s", reason)
+        self._angles.append(self._driven.state.q)
         began, now = self._driven.clock
         self.timing.driver.append(now - began)
         if self._sent:
@@ -171,6 +181,18 @@ class DrivenArm:
         state, self._limited = as_state(self._kinematics, s, effort, stopped, share), limited
         self._told = time.perf_counter()
         return state
+
+
+def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
+    """Return speeds (., n) rad/s in each `every`-th of the cycles that angles (n,) rad are of.
+
+    A parabola through SMOOTH cycles to either side (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
+    """
+    window = min(2 * SMOOTH + 1, len(angles) - 1 + len(angles) % 2)
+    if window < 3:
+        return np.zeros((0, 1))
+    speeds = savgol_filter(np.array(angles), window, 2, deriv=1, delta=SIM_DT, axis=0)
+    return speeds[every - 1 :: every]
 
 
 def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:

@@ -60,7 +60,7 @@ class LiveArm:
     `with LiveArm(...) as arms`: the arm is opened in the process, stopped and closed at the end whatever happens.
 
     Attributes:
-        robot: the arm's. stops, timing, done, halted: as of `DrivenArm`.
+        robot: the arm's. stops, timing, done, speeds, halted: as of `DrivenArm`.
 
     Args:
         open_arm: returns the arm, or a context manager that gives it; runs in the process, so it must be picklable.
@@ -78,6 +78,7 @@ class LiveArm:
         self.stops: list[Stop] = []
         self.timing = Timing()
         self.done = 0
+        self.speeds = np.zeros((1, task.steps, robot.n))
         self.halted: str | None = None
         self._kinematics = Kinematics(robot)
         self._operator: Callable[[str], bool] | None = None
@@ -147,7 +148,7 @@ class LiveArm:
     def end(self) -> np.ndarray:
         """Stop the arm; return (1,), whether it had stopped, or was being stopped, before."""
         self._over.write(np.ones(1))
-        self.stops, stopped, timing = self._hear("ended")
+        self.stops, stopped, timing, self.speeds = self._hear("ended")
         self.timing.driver, self.timing.period = timing.driver, timing.period
         return np.array([stopped])
 
@@ -248,7 +249,7 @@ def _episode(
     finally:
         gc.enable()
         stopped = bool(driven.end()[0])
-    line.send(("ended", (driven.stops, stopped, driven.timing)))
+    line.send(("ended", (driven.stops, stopped, driven.timing, driven.speeds)))
 
 
 def _said(over: Slot) -> bool:

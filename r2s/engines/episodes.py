@@ -29,6 +29,7 @@ class EngineArms:
     """
 
     width = 1
+    speeds = None
 
     def __init__(
         self,

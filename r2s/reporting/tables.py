@@ -56,7 +56,7 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         }
         distance = row.get("distance_median_m")
         cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
-        cells["return"] = number(row.get("return_paper"), "{:.1f}")
+        cells["return"] = number(row.get("return_smooth", row.get("return_paper")), "{:.1f}")
         cells["at rest, %"] = number(None if row.get("rest") is None else 100 * row["rest"], "{:.1f}")
         table[_counted(label, row)] = cells
     return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")

@@ -1,6 +1,7 @@
 """Episodes of a policy, and how well they reached: one rollout and one set of measures for simulators and arms."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -26,12 +27,16 @@ class Arms(Protocol):
 
     Attributes:
         robot: what each of them is. width: how many episodes run at once; fewer than all run one after the other.
+        speeds: (width, T, n) rad/s after each control step of the episodes that have ended, without the noise that an
+            arm's own have; None where they have none.
     """
 
     @property
     def robot(self) -> Robot: ...  # noqa: D102 (said above)
     @property
     def width(self) -> int: ...  # noqa: D102
+    @property
+    def speeds(self) -> np.ndarray | None: ...  # noqa: D102
 
     def place(self, starts: np.ndarray, first: int) -> State:
         """Begin the episodes first, first + 1, ... at rest at starts (width, n) rad."""
@@ -69,7 +74,8 @@ def rollout(
     torque, weights = task.torque(robot), task.paper_weights
     shape = (count, task.steps)
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
-    ee, distance, reward, limited = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape), np.zeros(count)
+    ee, limited = np.zeros((*shape, 3)), np.zeros(count)
+    distance, reward, smooth = (np.zeros(shape) for _ in range(3))
 
     def ask(state: State, goals: np.ndarray) -> np.ndarray:
         observation = torch.from_numpy(task.observe(state, goals, torque))
@@ -92,20 +98,29 @@ def rollout(
             limited[now] += state.limited / task.steps
             q[now, k], dq[now, k], ee[now, k], tau[now, k] = state.q, state.dq, state.ee, state.tau
             before = dq[now, k]
-        distance[now, -1][arms.end()] = np.inf  # reached means reached and held by an arm that still runs
+        stopped = arms.end()
+        smooth[now] = reward[now]
+        if arms.speeds is not None:
+            rate = np.diff(arms.speeds, axis=1, prepend=0.0) * task.ctrl_hz
+            for k in range(task.steps):
+                then = replace(state, q=q[now, k], dq=arms.speeds[:, k], ee=ee[now, k], tau=tau[now, k])
+                smooth[now, k] = task.judge(then, rate[:, k], goals[now], reference)[1] @ weights
+        distance[now, -1][stopped] = np.inf  # reached means reached and held by an arm that still runs
         progress(min(first + width, count), count)
     t = (1 + np.arange(task.steps)) / task.ctrl_hz
     q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
     return Episodes(
-        t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward, q_left=q_left, limited=limited
-    )
+        t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward, reward_smooth=smooth,
+        q_left=q_left, limited=limited,
+    )  # fmt: skip
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
     """Return one row of evaluations.csv.
 
     success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
-    of the mean distance in that time. return_paper: mean sum of eq. (2). time_to_reach_s: median time after which the
+    of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: without the noise of measured
+    speeds, which eq. (2) takes for accelerations. time_to_reach_s: median time after which the
     hand stays within 2 cm, of the episodes that got there. overshoot_m: how far out of 2 cm it came again after it
     had first been within, mean of those that had. rest: share of episodes in which every joint is slower than REST
     for the whole last 0.5 s: a hand can lie on a joint's axis. q_left_rad: how close joints come to position limits,
@@ -131,6 +146,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
         "success_5mm": float((last.max(1) < 0.005).mean()),
         "distance_median_m": float(np.median(last.mean(1))),
         "return_paper": float(episodes.reward.sum(1).mean()),
+        "return_smooth": float(episodes.reward_smooth.sum(1).mean()),
         "time_to_reach_s": float(np.median(since[there]) * step) if there.any() else float("nan"),
         "overshoot_m": float(np.mean(later)) if later else float("nan"),
         "rest": float((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST).mean()),

@@ -49,6 +49,7 @@ class Episodes:
     Attributes:
         t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m. tau: (E, T, n) Nm, the command at the end of
         the step. distance: (E, T) m. reward: (E, T), eq. (2).
+        reward_smooth: (E, T), the same with the noise of the speeds taken out, where an arm measured them.
         q_left: (E,) rad, how close any joint came to a position limit.
         limited: (E,), in which share of the cycles the driver's law changed what was asked for.
     """
@@ -61,6 +62,7 @@ class Episodes:
     tau: np.ndarray
     distance: np.ndarray
     reward: np.ndarray
+    reward_smooth: np.ndarray
     q_left: np.ndarray
     limited: np.ndarray
 
