@@ -49,9 +49,9 @@ class Watched:
         return command
 
 
-def judged(arm, policy, task, starts, goals) -> dict[str, float]:
+def judged(arm, friction, policy, task, starts, goals) -> dict[str, float]:
     """Return one row: how the policy does on the arm, and what the law does to it."""
-    driven = DrivenArm(arm, task)
+    driven = DrivenArm(arm, task, friction)
     watched = driven._driven.driver = Watched(driven._driven.driver)
     row = task.measures(rollout(policy, driven, task, starts, goals))
     asked, sent = np.array(watched.asked), np.array(watched.sent)
@@ -85,9 +85,9 @@ def main(folder: str) -> None:
         arm = SimulatedArm(
             robot, replace(dynamics, delay=1e-3 * ms, lag=np.float64(2e-3)), position_noise=1e-5, velocity_noise=3e-3
         )
-        rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, policy, task, starts, goals)
+        rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, dynamics.level, policy, task, starts, goals)
     for seed in TWINS:
-        rows[f"twin {seed}"] = judged(Twin(robot, seed), policy, task, starts, goals)
+        rows[f"twin {seed}"] = judged(Twin(robot, seed), dynamics.level, policy, task, starts, goals)
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("arm")
     text = f"""# The driver's law at 1 kHz
 

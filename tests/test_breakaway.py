@@ -175,7 +175,7 @@ def test_the_twin_lets_go_where_its_friction_does(panda, poses, seed):
         believed, true = arm._nominal.gravity_torque(pose), arm._engine.gravity_torque(pose)
         coulomb = p[hidden.C_POS if sign > 0 else hidden.C_NEG, j]
         level = p[hidden.BREAK, j] * coulomb + p[hidden.MU, j] * abs(believed[j])
-        left = believed[j] - true[j] + p[hidden.OFFSET, j] + hidden._drag(p, pose, j)
+        left = believed[j] - true[j] + p[hidden.OFFSET, j] + hidden._dragged(p, pose, j)
         error[k] = (sign * (found.value[k] + left) - level) / level
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert np.mean(np.abs(error) < 0.15) > 0.8

@@ -32,6 +32,7 @@ from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
 
 PANDA = load_robot(**conf("robot/panda"))
+LEVEL = nominal_dynamics(PANDA, **conf("friction/paper")).level
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 
 
@@ -105,7 +106,7 @@ def test_every_command_comes_out_of_a_driver(monkeypatch):
     episodes = fixed_episodes(PANDA, task, 1)
 
     def reach(arm):
-        rollout(make_policy(PANDA, task, (8,)), DrivenArm(arm, task), task, *episodes)
+        rollout(make_policy(PANDA, task, (8,)), DrivenArm(arm, task, LEVEL), task, *episodes)
 
     for move in (
         lambda arm: record(arm, turn(0.4, 0.05)),
@@ -159,7 +160,7 @@ def test_a_held_ramp_is_bounded():
 def test_after_a_stop_there_is_no_command():
     """Whatever is asked of a motion that was ended, nothing more is sent before the next one begins."""
     arm = Watched()
-    driven = Driven(arm, Driver(PANDA, PANDA.tau_max))
+    driven = Driven(arm, Driver(PANDA, PANDA.tau_max, LEVEL))
     driven.place(PANDA.q_home)
     with pytest.raises(ArmStopped, match="no finite action"):
         silent(driven)
@@ -258,7 +259,7 @@ def test_pressed_and_released_counts_as_pressed(there):
 def test_no_episode_begins_before_an_operator_said_so(answers, done):
     """Each stop is asked about once; where the answer is no, what was not tried is no episode."""
     task, arm = replace(TASK, episode_s=0.1), Guarded(answers)
-    driven = DrivenArm(arm, task)
+    driven = DrivenArm(arm, task, LEVEL)
     rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 3))
     assert driven.done == done
     assert len(driven.stops) == done
@@ -306,7 +307,7 @@ def hostile(cycles, seed):
 
 def spoiled(arm, rng):
     """Let a policy act that says nothing, too much or nonsense for some of its time."""
-    driven = Driven(arm, Driver(PANDA, TASK.torque(PANDA)))
+    driven = Driven(arm, Driver(PANDA, TASK.torque(PANDA), LEVEL))
     driven.place(PANDA.q_home)
     try:
         for k in range(1500):

@@ -203,7 +203,7 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
         arm = make(panda, address, operator=lambda reason: True)
         starts = np.stack([panda.q_home, panda.q_home])
         goals = fixed_episodes(panda, task, 2)[1]
-        driven = DrivenArm(arm, task)
+        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
         stops = driven.stops
         arm.close()
@@ -224,7 +224,7 @@ def test_a_stop_button_ends_a_deployment(client, panda):
     with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
         arm = make(panda, address, operator=lambda reason: True)
         starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
-        driven = DrivenArm(arm, task)
+        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
         stops = driven.stops
         arm.close()

@@ -233,11 +233,12 @@ def test_the_first_two_terms_are_equation_2(distance, distance0, dq, ddq):
         expected -= K2 * np.tanh(abs(v))
         expected -= K3 * np.tanh(abs(a)) / abs(K4 - min(1.0, d))
         expected -= K5 * np.tanh(abs(a)) / (K6 + d)
-    out = terms(np.array([distance]), np.array([distance0]), np.array([dq]), np.array([ddq]))[0]
+    out = terms(np.array([distance]), np.array([distance0]), np.array([dq]), np.array([ddq]), np.array([0.3]))[0]
     assert len(out) == len(TERMS)
     assert out[0] + out[1] == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert out @ PAPER == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert 0 <= out[TERMS.index("precision")] <= 1  # a bonus
+    assert out[TERMS.index("limited")] == -0.3  # a price
 
 
 def test_the_environments_reward_is_equation_2_of_its_own_motion(make):

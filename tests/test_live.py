@@ -27,6 +27,7 @@ from r2s.tasks.reach import ReachTask
 PACE_S = 4e-3  # that a millisecond of the arm takes here, so that a loaded machine is no stalled policy
 DEADLINE = round(DEADLINE_S / SIM_DT)
 TASK = ReachTask(episode_s=0.2)
+LEVEL = np.ones(7)  # Nm
 
 
 class Paced(SimulatedArm):
@@ -82,7 +83,7 @@ def panda():
 def test_a_policy_that_stalls(panda, tmp_path):
     """30 ms are borne; 60 and 500 lead to damping after 50, and to rest; nothing is commanded after the stop."""
     path, stalls = tmp_path / "commands", (30, 60, 500)
-    with LiveArm(partial(Paced, panda, path), panda, TASK) as arms:
+    with LiveArm(partial(Paced, panda, path), panda, TASK, LEVEL) as arms:
         starts, goals = fixed_episodes(panda, TASK, len(stalls))
         episodes = rollout(Stalls(panda, arms, stalls), arms, TASK, starts, goals)
     assert [stop.episode for stop in arms.stops] == [1, 2]
@@ -108,7 +109,7 @@ def test_a_policy_that_throws_leaves_an_arm_at_rest(panda, tmp_path):
             return super().action(observation)
 
     path = tmp_path / "commands"
-    with pytest.raises(ZeroDivisionError), LiveArm(partial(Paced, panda, path), panda, TASK) as arms:
+    with pytest.raises(ZeroDivisionError), LiveArm(partial(Paced, panda, path), panda, TASK, LEVEL) as arms:
         rollout(Throws(panda, arms, (0,)), arms, TASK, *fixed_episodes(panda, TASK, 1))
     assert not arms._process.is_alive()
     assert len(commands(path)) == 1
@@ -122,7 +123,7 @@ from test_live import *
 
 if __name__ == "__main__":
     panda = load_robot(**conf("robot/panda"))
-    with LiveArm(partial(Paced, panda, sys.argv[1]), panda, TASK) as arms:
+    with LiveArm(partial(Paced, panda, sys.argv[1]), panda, TASK, LEVEL) as arms:
         class Dies(Stalls):
             def action(self, observation):
                 if self._arms.cycle >= 80:

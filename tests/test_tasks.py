@@ -85,7 +85,7 @@ def quiet(dynamics):
 
 
 @pytest.mark.parametrize(
-    "make", [lambda task: ArmBatch(PANDA, task, NEW, 1, 1), lambda task: DrivenArm(quiet(NEW), task)]
+    "make", [lambda task: ArmBatch(PANDA, task, NEW, 1, 1), lambda task: DrivenArm(quiet(NEW), task, NEW.level)]
 )
 def test_time_begins_with_the_episode(make):
     """A state says how long its episode has run, in the batch and on an arm; a second episode starts at 0."""
@@ -111,7 +111,7 @@ def test_an_episode_that_stops_keeps_its_last_state():
     """An arm that stops at once: the state of the stop lasts, its distance is worth nothing at the end."""
     task, starts = Line(), np.tile(PANDA.q_home, (2, 1))
     starts[1, 1] = PANDA.q_max[1] - 0.01  # within what a driver brings to rest
-    arms = DrivenArm(quiet(replace(NEW, offset=0 * NEW.offset)), task)
+    arms = DrivenArm(quiet(replace(NEW, offset=0 * NEW.offset)), task, NEW.level)
     done = rollout(Still(), arms, task, starts, task.goals(PANDA, np.random.default_rng(0), 2))
     assert [stop.episode for stop in arms.stops] == [1]
     assert np.array_equal(done.q[1], np.broadcast_to(done.q[1, 0], done.q[1].shape))

@@ -69,6 +69,7 @@ class Drivers:
         robot: its limits, and what it is believed to weigh. torque: (n,) Nm, the most that a target may ask for.
         m: arms. cutoff_hz: low-pass on the target. period_s: s between the targets of a policy.
         soft_start_s: s, over which the targets of a motion fade in; 0: not at all.
+        friction: (n,) Nm, how much is believed to hold each joint.
     """
 
     def __init__(
@@ -77,11 +78,13 @@ class Drivers:
         torque: np.ndarray,
         m: int,
         *,
+        friction: np.ndarray,
         cutoff_hz: float = 100.0,
         period_s: float = 0.02,
         soft_start_s: float = 0.0,
     ):
         self._shape, self._torque, self._limits = (m, robot.n), torque, limits(robot, torque)
+        self._friction = np.array(friction, dtype=float)
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
         self._fast = DQ_INSIDE * robot.dq_max
         self._factor, self._fade = low_pass_factor(cutoff_hz), round(soft_start_s / SIM_DT)
@@ -128,7 +131,7 @@ class Drivers:
         self._arms.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         bounds = self._torque, self._low, self._high, self._fast
         settings = self._deadline, self._factor, self._fade
-        arms = self._mass, self._bias, self._limits
+        arms = self._friction, self._mass, self._bias, self._limits
         out = drive(q, dq, seen, tau_J_d, target if said else q, said, *bounds, *settings, *arms, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
@@ -163,8 +166,9 @@ def look(q, dq, to_q, to_dq):
 
 @njit(cache=True)
 def drive(
-    q, dq, seen, applied, target, said, torque, low, high, fast, deadline, factor, fade, mass, bias, limits, memory
-):
+    q, dq, seen, applied, target, said, torque, low, high, fast, deadline, factor, fade,
+    friction, mass, bias, limits, memory,
+):  # fmt: skip
     """Return the commands (m, n) Nm of this cycle; arguments as of `Drivers`, seen (m,): the state is finite."""
     out, (m, n) = np.empty_like(memory.sent), q.shape
     work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
@@ -197,7 +201,7 @@ def drive(
         last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
         if seen[i]:
             share, now = memory.share[i], effort[0, 0]
-            changed = guard(q[i], dq[i], now, last, share, mass[i], bias[i], limits, work, out[i])
+            changed = guard(q[i], dq[i], now, last, share, friction, mass[i], bias[i], limits, work, out[i])
             memory.limited[i] += changed
         else:
             for j in range(n):
@@ -209,8 +213,8 @@ def drive(
 class Driver:
     """The last word on every command of one arm; arguments as of `Drivers`."""
 
-    def __init__(self, robot: Robot, torque: np.ndarray, **settings: float):
-        self._drivers = Drivers(robot, torque, 1, **settings)
+    def __init__(self, robot: Robot, torque: np.ndarray, friction: np.ndarray, **settings: float):
+        self._drivers = Drivers(robot, torque, 1, friction=friction, **settings)
 
     def reset(self) -> None:
         """Begin a motion, from zero torque."""

@@ -22,6 +22,7 @@ from r2s.arm.tracking import CUTOFF_HZ, Tracker
 from r2s.errors import UserError, check_number
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
+from r2s.excitation.safety import friction_margin
 from r2s.physics.robot import SIM_DT, Robot
 
 SPEED = 0.2  # of dq_max, on the way to a place
@@ -133,7 +134,10 @@ class Franka:
         self._stopped: str | None = "no motion was started; call move_to first"
         self._rest()
         # a cycle of references would keep an arm that nobody has any more, and its connection
-        self._own = Driven(weakref.proxy(self), Driver(robot, TORQUE_SHARE * robot.tau_max, cutoff_hz=CUTOFF_HZ))
+        self._own = Driven(
+            weakref.proxy(self),
+            Driver(robot, TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot), cutoff_hz=CUTOFF_HZ),
+        )
 
     def move_to(self, q: np.ndarray) -> ArmState:
         """Go to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.

@@ -65,7 +65,7 @@ class LiveArm:
     Args:
         open_arm: returns the arm, or a context manager that gives it; runs in the process, so it must be picklable.
         robot: whose number of joints the arm has.
-        task, soft_start_s: as of `DrivenArm`.
+        task, friction, soft_start_s: as of `DrivenArm`.
 
     Raises:
         UserError, ArmStopped: what opening the arm says.
@@ -73,7 +73,15 @@ class LiveArm:
 
     width = 1
 
-    def __init__(self, open_arm: Callable[[], Any], robot: Robot, task: Task, *, soft_start_s: float = 0.0):
+    def __init__(
+        self,
+        open_arm: Callable[[], Any],
+        robot: Robot,
+        task: Task,
+        friction: np.ndarray,
+        *,
+        soft_start_s: float = 0.0,
+    ):
         self.robot, self._task, self._n = robot, task, robot.n
         self.stops: list[Stop] = []
         self.timing = Timing()
@@ -83,7 +91,7 @@ class LiveArm:
         self._kinematics = Kinematics(robot)
         self._operator: Callable[[str], bool] | None = None
         self._target, self._state, self._over = Slot(robot.n), Slot(5 * robot.n + 4), Slot(1)
-        self._given = open_arm, task, soft_start_s, self._target, self._state, self._over
+        self._given = open_arm, task, friction, soft_start_s, self._target, self._state, self._over
 
     def __enter__(self) -> "LiveArm":
         context = multiprocessing.get_context("spawn")  # a fork would copy threads in any state
@@ -189,6 +197,7 @@ def _serve(
     line: Connection,
     open_arm: Callable[[], Any],
     task: Task,
+    friction: np.ndarray,
     soft_start_s: float,
     target: Slot,
     state: Slot,
@@ -209,7 +218,7 @@ def _serve(
             operator = None
             if isinstance(arm, Operated):
                 operator, arm.operator = arm.operator, ask  # whose terminal is that of the other process
-            driven = DrivenArm(arm, task, soft_start_s=soft_start_s)
+            driven = DrivenArm(arm, task, friction, soft_start_s=soft_start_s)
             line.send(("ready", (arm.robot, operator)))
             while True:
                 _, starts, first = line.recv()

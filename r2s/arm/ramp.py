@@ -79,7 +79,8 @@ def ramp(
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
     most = limit + BRAKE_SHARE * robot.tau_max  # an arm that slides is ramped from the command that held it
-    drive, recorded = _Drive(Driven(arm, Driver(robot, np.minimum(most, robot.tau_max), cutoff_hz=UNFILTERED_HZ))), []
+    most = np.minimum(most, robot.tau_max)  # which friction may hold, as far as one knows
+    drive, recorded = _Drive(Driven(arm, Driver(robot, most, 2 * most, cutoff_hz=UNFILTERED_HZ))), []
     try:
         for place in places:
             drive.place(place)

@@ -10,7 +10,7 @@ from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.errors import UserError
 from r2s.excitation.motion import Excitation
-from r2s.excitation.safety import FRICTION_ROOT, FRICTION_SHARE, check_limits
+from r2s.excitation.safety import check_limits, friction_margin
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
@@ -59,7 +59,9 @@ def record(
     rows = len(excitation.t)
     t = np.empty(rows)
     q, dq, tau = (np.empty((rows, arm.robot.n)) for _ in range(3))
-    driven = Driven(arm, Driver(arm.robot, TORQUE_SHARE * arm.robot.tau_max, cutoff_hz=CUTOFF_HZ))
+    driven = Driven(
+        arm, Driver(arm.robot, TORQUE_SHARE * arm.robot.tau_max, 2 * friction_margin(arm.robot), cutoff_hz=CUTOFF_HZ)
+    )
     driven.place(excitation.q[0])
 
     def seen(rows: int) -> Recording:
@@ -106,7 +108,7 @@ class Tracker:
         drive = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
         self._regressor = drive.transpose(1, 0, 2)  # (T, 3, n)
         self._theta = np.zeros((3, robot.n))
-        friction = np.minimum(FRICTION_SHARE * robot.tau_max, FRICTION_ROOT * np.sqrt(robot.tau_max))
+        friction = friction_margin(robot)
         self._most = np.array([UNBALANCED * robot.tau_max, friction, friction])
         # what a joint feels with the others free; Nm/s per (rad/s + BANDWIDTH rad) of error
         alone = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)

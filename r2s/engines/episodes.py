@@ -49,7 +49,7 @@ class EngineArms:
         """Make the arm of episode `first` and put it at rest at starts (1, n) rad."""
         dynamics = self._drawn.one(first)
         self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics)
-        self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque)
+        self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque, dynamics.level)
         self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
         self._actuation.reset()
         self._limited = 0

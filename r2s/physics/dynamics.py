@@ -84,6 +84,12 @@ class Dynamics:
         """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `bristle`: Family.torque."""
         return self.family.torque(dq, self.phi, bristle)
 
+    @property
+    def level(self) -> np.ndarray:
+        """(..., n) Nm, what friction surely holds a sliding joint with: the lesser of both ways at 1 rad/s."""
+        n = self.phi.shape[-2]
+        return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
+
     def one(self, k: int) -> "Dynamics":
         """Return the k-th of a batch (m, ...); fields that all arms share stay as they are."""
         values = {name: (getattr(self, name), axes) for name, axes in AXES.items()}

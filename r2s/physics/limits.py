@@ -4,8 +4,9 @@ Three rules, on a target that has come through the low-pass (r2s/physics/actuati
 
 1. All torque fades where a joint gets too fast or too close to a position limit, whatever made it so.
 2. No joint accelerates beyond what can be taken back in time. With v the speed that is allowed at q,
-   -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque). Of all torques that keep to this the
-   nearest is sent, in the sense of Gauss' principle of least constraint: what stops at the joints would add.
+   -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque), wider by what friction is believed to eat.
+   Of all torques that keep to this the nearest is sent, in the sense of Gauss' principle of least constraint: what
+   stops at the joints would add. Friction widens the bounds only: one that is not there must not push.
 3. The sum is clipped to the torque range, and its rate is limited, last, against what the arm applied last.
 
 Rule 2 is a control barrier function in each joint (Ames et al., European Control Conference 2019). It is continuous
@@ -26,28 +27,31 @@ LATE = 0.012  # s, of torque and measurement: delays of 8 ms and lags of 3 ms ha
 RATE = round(1 / (math.e * LATE))
 # of RATE, at which a joint may close in on a position limit: second-order, critically damped
 APPROACH = 0.25 * RATE
-ALLOWED = 0.7  # of the velocity limits: what friction that nobody knows adds beyond is measured in docs/safety.md
-NOTHING = 0.9  # of the velocity limits, where no torque of the policy is left; it fades from ALLOWED on
+ALLOWED = 0.66  # of the velocity limits: what friction that nobody knows adds beyond is measured in docs/safety.md
+NOTHING = 0.82  # of the velocity limits, where no torque of the policy is left; it fades from ALLOWED on
 # rad within the position limits, where the allowed speed towards them has come down to nothing; at most a tenth of
 # a joint's range. In Q_FADES of it, from there on, the torque of the policy fades.
 Q_ALLOWED, Q_FADES = 0.1, 0.6
-SLOWER = 0.6  # of the speed that an FR3 allows near its position limits
-BRAKE_S = 0.15  # in which the allowed speeds come down to nothing when an arm is brought to rest
+SLOWER = 0.55  # of the speed that an FR3 allows near its position limits
+BRAKE_S = 0.1  # in which the allowed speeds come down to nothing when an arm is brought to rest
 
 # Columns of a matrix of limits (n, COLUMNS), one row for each joint.
 Q_LOW, Q_HIGH, Q_FADE, MOST, SLOWING, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
 COLUMNS = STEP + 1
-WORK = 6  # rows that `guard` works in, beside 2 n
+WORK = 7  # rows that `guard` works in, beside 2 n
 EXACT = 1e-9  # rad/s^2, to which accelerations keep to their bounds
 PIVOTS = 5  # rounds in which all joints change sides at once; then one by one, which always ends (Murty 1974)
 ROUNDS = 100
+DRY = 0.05  # rad/s, over which friction changes sign
+SURE = 0.5  # of the friction that is believed; of light joints only, for which it is not small
+MARGIN = 1.25  # rad, of the phase that a delay may cost: pi / 2 is where a loop swings for ever
 
 
 def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return what `guard` holds an arm to, (n, COLUMNS).
 
-    A joint is added inertia where a full action would throw it: light wrists are held by friction, which is not known
-    here. With it, an action of 1 from rest is just allowed.
+    A joint is added inertia where a full action would throw it, so that an action of 1 from rest is just allowed; but
+    no more than its loop bears, which is faster than RATE by what is added.
 
     Args:
         robot: gives position, velocity, torque and rate limits, and what it weighs at home.
@@ -59,7 +63,9 @@ def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     out[:, MOST], out[:, DQ_MAX] = ALLOWED * robot.dq_max, robot.dq_max
     deceleration, offset = robot.slowing or (np.full(robot.n, np.inf), np.zeros(robot.n))
     out[:, SLOWING], out[:, OFFSET] = 2 * SLOWER**2 * deceleration, SLOWER * offset
-    out[:, ADDED] = np.maximum(0.0, torque / (RATE * out[:, MOST]) - felt_inertia(robot))
+    felt = felt_inertia(robot)
+    most = (MARGIN / (RATE * LATE) - 1) * felt
+    out[:, ADDED] = np.clip(torque / (RATE * out[:, MOST]) - felt, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
     return out
 
@@ -81,11 +87,12 @@ class Guard:
         changed: in how many cycles so far the law changed what was asked for.
 
     Args:
-        model: one arm without gravity. robot, torque: as of `limits`.
+        model: one arm without gravity. robot, torque: as of `limits`. friction: (n,) Nm, as of `guard`.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray):
+    def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray, friction: np.ndarray):
         self._model, self._data, self._limits = model, mujoco.MjData(model), limits(robot, torque)
+        self._friction = friction
         self._work = np.empty((2 * robot.n + WORK, robot.n))
         self.changed = 0
 
@@ -95,27 +102,31 @@ class Guard:
         data.qpos[:], data.qvel[:] = q, dq
         mujoco.mj_fwdPosition(self._model, data)
         mujoco.mj_fwdVelocity(self._model, data)
-        now = data.M, data.qfrc_bias, self._limits, self._work
+        now = self._friction, data.M, data.qfrc_bias, self._limits, self._work
         self.changed += guard(q, dq, effort, last, 1.0, *now, out)
         return out
 
 
 @njit(cache=True, error_model="numpy")
-def guard(q, dq, effort, last, share, mass, bias, limits, work, out):
+def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
     """Write the command (n,) Nm of a cycle into `out`; return whether the law changed anything but the rate.
 
     Args:
         q, dq: (n,) rad, rad/s, finite. effort: (n,) Nm, what is asked for. last: (n,) Nm, what the arm applied last.
         share: of the allowed speeds that is left, 1 unless the arm is being brought to rest.
+        friction: (n,) Nm, how much is believed to hold each joint, at least 0.
         mass: (n (n + 1) / 2,) kg m^2, the lower triangle, row by row. bias: (n,) Nm, Coriolis torque.
         limits: (n, COLUMNS), of `limits`. work: (2 n + WORK, n), anything.
     """
     n = len(q)
-    ddq, low, high = work[2 * n], work[2 * n + 1], work[2 * n + 2]
+    ddq, low, high, eaten = work[2 * n], work[2 * n + 1], work[2 * n + 2], work[2 * n + 6]
     left = _left(q, dq, limits)
     for j in range(n):
         out[j] = left * effort[j]
         ddq[j] = out[j] - bias[j]
+        eaten[j] = 0.0
+        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # of a joint that moves, or whose torque would move it
+            eaten[j] = SURE * friction[j] * abs(np.tanh(dq[j] / DRY + out[j] / friction[j]))
     _factor(mass, limits, work)
     _solve(work, ddq)
     within = True
@@ -124,6 +135,11 @@ def guard(q, dq, effort, last, share, mass, bias, limits, work, out):
         down = _allowed(q[j] - limits[j, Q_LOW], share, limits[j])
         high[j], low[j] = RATE * (up - dq[j]), -RATE * (down + dq[j])
         within &= low[j] <= ddq[j] <= high[j]
+    if not within:
+        _widen(low, high, work)
+        within = True
+        for j in range(n):
+            within &= low[j] <= ddq[j] <= high[j]
     if not within:
         _push(ddq, low, high, work)
         for j in range(n):
@@ -186,8 +202,24 @@ def _solve(root, x):
 
 
 @njit(cache=True, error_model="numpy")
+def _widen(low, high, work):
+    """Widen the bounds by what friction may do to each joint, its neighbours' included; M^-1 is left in `work`."""
+    n = len(low)
+    root, mobility, eaten = work[:n], work[n : 2 * n], work[2 * n + 6]
+    for k in range(n):
+        for j in range(n):
+            mobility[k, j] = 1.0 if j == k else 0.0
+        _solve(root, mobility[k])
+        wider = 0.0
+        for j in range(n):
+            wider += abs(mobility[k, j]) * eaten[j]
+        low[k] -= wider
+        high[k] += wider
+
+
+@njit(cache=True, error_model="numpy")
 def _push(ddq, low, high, work):
-    """Write the torques (n,) Nm that stops at the joints would add into row 2 n + 3 of `work`.
+    """Write the torques (n,) Nm that stops at the joints would add into row 2 n + 3 of `work`, which has M^-1.
 
     They solve the linear complementarity problem of low <= ddq + M^-1 push <= high, a joint's push towards the inside
     and only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).
@@ -195,9 +227,6 @@ def _push(ddq, low, high, work):
     n = len(ddq)
     root, mobility, push, side, other = work[:n], work[n : 2 * n], work[2 * n + 3], work[2 * n + 4], work[2 * n + 5]
     for k in range(n):
-        for j in range(n):
-            mobility[k, j] = 1.0 if j == k else 0.0
-        _solve(root, mobility[k])
         side[k] = 1.0 if ddq[k] > high[k] else (-1.0 if ddq[k] < low[k] else 0.0)
     for turn in range(ROUNDS):
         for i in range(n):  # the pushes of the joints that are at a bound; Cholesky's root of their mobility

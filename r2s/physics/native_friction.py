@@ -32,11 +32,8 @@ DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # 
 MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
 NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
 GRAVITY = REST_POS + 1  # 3 wide
-DELAY, LAG, LIMITS = (
-    GRAVITY + 3,
-    GRAVITY + 4,
-    GRAVITY + 5,
-)  # of the arm; of the driver, COLUMNS wide, 0: there is none
+DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: of friction, as the driver's law believes
+LIMITS = LEVEL + 1  # of the driver, COLUMNS wide; 0: there is none
 WIDTH = LIMITS + COLUMNS
 MARKER = 7_202_020.0
 # Rows of what a step knows of its joints. REST and EDGES: two each, of the negative and the positive direction.
@@ -155,7 +152,9 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             desk = carray(stack((2 * n + WORK) * n), (2 * n + WORK, n))  # type: ignore[call-arg]
             cycle = SLOTS + int(kept[CYCLE, 0])
             sent = kept[LINE + cycle % SLOTS]
-            changed = guard(q, qvel, applied, kept[SENT], 1.0, mass, bias, user[:, LIMITS:], desk, sent)
+            changed = guard(
+                q, qvel, applied, kept[SENT], 1.0, user[:, LEVEL], mass, bias, user[:, LIMITS:], desk, sent
+            )
             kept[LIMITED, 0] += changed
             kept[SENT, :] = sent
             turn(kept[LINE:], kept[MOTOR], cycle, user[0, DELAY], user[0, LAG], applied)

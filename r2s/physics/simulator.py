@@ -185,7 +185,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.MOMENT_ERROR : f.MOMENT_ERROR + 3] = errors[1]
     rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
     rows[..., f.GRAVITY : f.GRAVITY + 3] = robot.gravity
-    rows[..., f.DELAY], rows[..., f.LAG] = delay, lag
+    rows[..., f.DELAY], rows[..., f.LAG], rows[..., f.LEVEL] = delay, lag, d.level
     # an arm in which links differ from nominal, or load counts, sums them up at every step; others are spared that
     differs = (d.load != 0) | (errors[0] != 0) | (errors[1] != 0).any(-1)
     rows[..., f.LINK] = differs.any(-1, keepdims=True)

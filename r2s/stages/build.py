@@ -189,6 +189,11 @@ def opened_arm(cfg, robot, noise=0):
         yield arm
 
 
+def is_twin(cfg):
+    """Return whether conf/arm is made from a seed, as often as one likes."""
+    return "_target_" in cfg.arm and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
+
+
 def arm_maker(cfg, robot):
     """Return what opens the arm of conf/arm in another process: with `part`, which names mistakes as typed."""
     if "_target_" not in cfg.arm:
@@ -198,9 +203,11 @@ def arm_maker(cfg, robot):
 
 
 @contextmanager
-def opened_arms(cfg, robot, task):
+def opened_arms(cfg, robot, task, friction, noise=0):
     """Give the arm of conf/arm behind its driver, for episodes of `task`: a `DrivenArm`, or a `LiveArm` where
     `live` says that the arm's clock does not wait. It is stopped at the end whatever happens.
+
+    friction: (n,) Nm, as of `DrivenArm`. noise: as of `opened_arm`.
     """
     from r2s.arm.deploy import DrivenArm
     from r2s.arm.interface import ArmStopped
@@ -208,15 +215,15 @@ def opened_arms(cfg, robot, task):
 
     fade = cfg.arm.get("soft_start_s", 0.0)
     if not cfg.arm.get("live", False):
-        with opened_arm(cfg, robot) as arm:
+        with opened_arm(cfg, robot, noise) as arm:
             try:
-                yield DrivenArm(arm, task, soft_start_s=fade)
+                yield DrivenArm(arm, task, friction, soft_start_s=fade)
             finally:
                 arm.stop()
         return
     with ExitStack() as stack:
         try:
-            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, soft_start_s=fade))
+            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, friction, soft_start_s=fade))
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         yield arms

@@ -1,13 +1,16 @@
 """stage=transfer: the same policy and goals in simulators and on an arm."""
 
+import os
 from contextlib import nullcontext
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.stages.build import (
     console,
     is_learner,
+    is_twin,
     loaded,
     make_controller,
     make_draw,
@@ -15,6 +18,7 @@ from r2s.stages.build import (
     make_robot,
     make_task,
     open_run,
+    opened_arm,
     opened_arms,
     part,
     set_threads,
@@ -61,6 +65,7 @@ def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals."""
     import numpy as np
 
+    from r2s.arm.spread import spread
     from r2s.engines.episodes import EngineArms
     from r2s.excitation.paths import check_path
     from r2s.excitation.safety import Space
@@ -86,9 +91,10 @@ def transfer(cfg, overrides):
             check_path(robot, np.array([robot.q_home, start]), what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
-    dynamics = draw = None
+    center = make_dynamics(trained, robot)
+    friction, dynamics, draw = center.level, None, None
     if cfg.simulator.name != "none":
-        dynamics = make_dynamics(trained, robot)
+        dynamics = center
         draw = make_draw(trained, robot, dynamics)
     engine = part(cfg.simulator, "simulator", robot) if "_target_" in cfg.simulator else None
     rows, episodes, timing = {}, {}, None
@@ -98,8 +104,17 @@ def transfer(cfg, overrides):
         progress = Progress(what)
         return progress, lambda k, n: progress(k / n, f"{k} goals")
 
-    opened = nullcontext() if cfg.arm.name == "none" else opened_arms(cfg, robot, task)
+    if twin := is_twin(cfg):
+        with opened_arm(cfg, robot):
+            pass  # what is wrong with it is said before there is a run folder
+    opened = nullcontext() if cfg.arm.name == "none" or twin else opened_arms(cfg, robot, task, friction)
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
+        on_twin = None
+        if twin:  # first: it forks, and then there are no threads yet
+            progress, shown = counted(f"reach on {cfg.arm.name}")
+            opens = partial(opened_arms, cfg, robot, task, friction)
+            on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
+            progress.close()
         if draw is not None:
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = task.measures(done), done
@@ -111,16 +126,20 @@ def transfer(cfg, overrides):
                 rows[cfg.simulator.name] = task.measures(done) | gap(done, episodes["mujoco"])
                 episodes[cfg.simulator.name] = done
         halted = None
-        if driven is not None:
+        if cfg.arm.name != "none":
             if dynamics is not None:  # what the model says of this arm
-                model = ArmBatch(driven.robot, task, dynamics, len(goals), cfg.threads, fade)
+                model = ArmBatch(driven.robot if driven else robot, task, dynamics, len(goals), cfg.threads, fade)
                 done = rollout(policy, model, task, starts, goals)
                 rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": len(model.stops)}, done
-            progress, shown = counted(f"reach on {cfg.arm.name}")
-            done = rollout(policy, driven, task, starts, goals, shown)
-            stops, timing, halted = driven.stops, driven.timing, driven.halted
-            progress.close()
-            count, row = driven.done, {"stops": len(stops), "episodes": driven.done, "asked": len(goals)}
+            count = len(goals)
+            if on_twin is not None:
+                done, stops, timing = on_twin
+            elif driven is not None:
+                progress, shown = counted(f"reach on {cfg.arm.name}")
+                done = rollout(policy, driven, task, starts, goals, shown)
+                stops, timing, halted, count = driven.stops, driven.timing, driven.halted, driven.done
+                progress.close()
+            row: dict = {"stops": len(stops), "episodes": count, "asked": len(goals)}
             if count:  # what was not done is no failure
                 done = first(done, count)
                 row = task.measures(done) | row
@@ -128,7 +147,7 @@ def transfer(cfg, overrides):
                 if "predicted" in rows:
                     row |= gap(done, first(episodes["predicted"], count))
             rows[cfg.arm.name] = row
-            for row in timing.table():
+            for row in timing.table() if timing else []:
                 run.log("timing", row)
             (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in stops) or "none\n")
         run.summary(rows)
