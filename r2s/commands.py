@@ -54,7 +54,7 @@ def list_runs(typed: Namespace) -> None:
 
 def look(typed: Namespace) -> None:
     """Open the viewer; without a screen say so and write PNGs."""
-    from r2s.reporting.look import has_screen, open_native, serve_web, side_by_side
+    from r2s.reporting.look import has_screen, open_native, show_in_browser, side_by_side
 
     folders = [whole_run(run) for run in typed.run]
     robot = robot_of(folders)
@@ -67,7 +67,7 @@ def look(typed: Namespace) -> None:
         pictures = side_by_side(out, robot, dict(zip(labels, folders, strict=True)))
         recording = out / "recording.rrd"
     if typed.web:
-        serve_web([recording], typed.port)
+        show_in_browser([recording], typed.port)
     elif has_screen():
         open_native([recording])
     else:

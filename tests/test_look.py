@@ -173,7 +173,7 @@ def test_only_this_computer_is_served(monkeypatch):
 
     monkeypatch.setattr(look.subprocess, "Popen", Viewer)
     with pytest.raises(UserError, match="exit status 1"):
-        look.serve_web([Path("recording.rrd")], 9090)
+        look.show_in_browser([Path("recording.rrd")], 9090)
     assert seen[seen.index("--bind") + 1] == "127.0.0.1"
 
 

@@ -39,7 +39,7 @@ def side_by_side(folder: Path, robot: Robot, runs: Mapping[str, Path]) -> list[P
         for path in sorted(run.glob("episodes_*.npz")):
             episodes[f"{label}, {path.stem.removeprefix('episodes_')}"] = unstack(path)
         if (run / "torque.npz").is_file():
-            with np.load(run / "torque.npz") as saved:
+            with np.load(run / "torque.npz", allow_pickle=False) as saved:
                 predicted = {k: saved[k] for k in ("nominal", "identified")}
                 overlays[label] = Overlay(saved["t"], saved["measured"], predicted)
         if (run / "evaluations.csv").is_file():
@@ -71,7 +71,7 @@ def open_native(recordings: Sequence[Path]) -> None:
     _ended(subprocess.Popen([sys.executable, "-m", "rerun", *map(str, recordings)]))
 
 
-def serve_web(recordings: Sequence[Path], port: int) -> None:
+def show_in_browser(recordings: Sequence[Path], port: int) -> None:
     """Serve the viewer to browsers on this computer alone, at `port`, until Ctrl-C."""
     words = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), "--port", str(port + 1)]
     process = subprocess.Popen([sys.executable, "-m", "rerun", *words, *map(str, recordings)])
