@@ -57,8 +57,8 @@ def main(wanted: str | None) -> None:
     pages = [
         "# Minutes to a policy",
         f"`python benchmarks/minutes.py PART` on {MACHINE}, one core per training, two trainings at a time. The last "
-        "policy of each training, whatever its evaluations said, on 200 goals, starts and drawn arms on which nothing "
-        "was chosen; success is held for the last 0.5 s. Compilation and evaluations count as time.",
+        "policy of each training, whatever its evaluations said, on 200 goals, starts and drawn arms on which "
+        "nothing was chosen; success is held for the last 0.5 s. Compilation and evaluations count as time.",
         *part("four"),
         *part("twelve"),
     ]
