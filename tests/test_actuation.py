@@ -161,7 +161,7 @@ def test_a_delayed_environment_is_the_same_one_later(panda, still):
     """With a delay of one control period every state comes one step later; the observed command does not."""
     task = ReachTask(episode_s=0.4)
     # so little that the driver's law, which feeds states back, has nothing to change
-    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (10, 3, 7)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (10, 3, 7)).astype(np.float32)
 
     def states(dynamics):
         env = TaskEnv(panda, task, lambda rng, m: dynamics, 3, nthread=1, seed=4)

@@ -208,6 +208,7 @@ def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     assert f"already there: {tmp_path}/train/lr0.001" in r2s(*sweep).stdout
 
 
+@pytest.mark.slow
 def test_the_grid_is_what_its_file_says(tmp_path):
     """paper_grid, cut down to two jobs, runs them side by side in folders named by their settings."""
     grid = ["-m", "+experiment=[paper_grid,toy]", f"root={tmp_path}", 'grid.algo="td3,tqc"', 'grid.lr="1e-3"']

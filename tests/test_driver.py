@@ -98,7 +98,7 @@ def hostile(cycles, seed, robot=PANDA, check=None, m=125):
     return count, reflexes, stops
 
 
-@pytest.mark.parametrize("least", [250_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("least", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_a_hostile_policy_never_breaks_a_rule(least):
     """NaN, infinities, 1e9, sign flips, silence, full torque, anywhere: no reflex of the arm, only orderly stops."""
     cycles, reflexes, stops = hostile(least, seed=1)
@@ -109,8 +109,8 @@ def test_a_hostile_policy_never_breaks_a_rule(least):
 
 def test_nor_those_of_an_fr3():
     """Which allows less speed the closer a joint is to a position limit, and none just before it."""
-    cycles, reflexes, _ = hostile(200_000, seed=1, robot=within_fr3(PANDA), check=FR3Reflexes(PANDA), m=100)
-    assert cycles >= 200_000
+    cycles, reflexes, _ = hostile(100_000, seed=1, robot=within_fr3(PANDA), check=FR3Reflexes(PANDA), m=100)
+    assert cycles >= 100_000
     assert not reflexes
 
 
@@ -161,7 +161,8 @@ def test_silence_is_damped_then_stopped():
     for _ in range(200):
         tau = driver(state_of(PANDA.q_home, speed, tau), None)
     assert driver.stopping == "no finite action for 50 ms"
-    assert np.all(tau * speed < 0)
+    assert np.all(tau[:6] * speed[:6] < 0)
+    assert abs(tau[6]) < 1e-9  # as light, friction takes its speed
     assert not driver.done
     driver(state_of(PANDA.q_home, np.zeros(7), tau), None)
     assert driver.done

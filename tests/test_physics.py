@@ -427,7 +427,8 @@ def test_the_viscous_term_of_the_sigmoid_may_be_left_out():
 @pytest.mark.parametrize(("law", "at_rest"), [(COULOMB, 1.2), (STRIBECK, 1.2 * 1.5)], ids=("coulomb", "stribeck"))
 def test_levels_are_what_the_parameters_say(law, at_rest):
     """1 Nm with 20 % asymmetry, and a half more at rest: both show beside the turn, and the rise is gone at speed."""
-    phi = np.array([1.0, 0.2, 0.3, 0.5, 0.1])[: len(law.names)]
+    values = dict(coulomb=1.0, asymmetry=0.2, viscous=0.3, rise=0.5, stribeck_velocity=0.1)
+    phi = np.array([values[name] for name in law.names if name in values])
     slow = np.array([0.06, -0.06])
     rise = at_rest / 1.2 - 1
     np.testing.assert_allclose(

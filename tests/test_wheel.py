@@ -16,7 +16,7 @@ def installed(tmp_path_factory) -> Path:
     """Return a folder that the wheel of this checkout is installed in, without what it depends on."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    for name in ("r2s", "conf"):
+    for name in ("r2s", "conf", "hydra_plugins"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", source)
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.limits import ALLOWED
 from r2s.physics.rigid_body import put_links
 from r2s.physics.robot import Robot
 from r2s.tasks.reach import ReachTask
 
 STIFF = 12.0  # rad/s, bandwidth of the feedback, critically damped: 50 Hz and the delays of an arm bear no more
 POSTURE = 1e-3  # weight of staying near the start in the inverse kinematics, against metres of the end effector
-FAST = 0.8  # of a joint's velocity limit
+FAST = 0.9 * ALLOWED  # of a joint's velocity limit: below what the driver's law lets be
 PEAK = 1.875  # of a minimum-jerk motion's speed, over its mean
 
 

@@ -190,8 +190,9 @@ def opened_arm(cfg, robot, noise=0):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is made from a seed, as often as one likes."""
-    return "_target_" in cfg.arm and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
+    """Return whether conf/arm is made from a seed, as often as one likes, with streams of noise."""
+    made = {"_target_", "seed"} <= cfg.arm.keys()
+    return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
 
 
 def arm_maker(cfg, robot):
