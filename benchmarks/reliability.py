@@ -61,7 +61,7 @@ NOT = """## What this run of the script did not come to
 
 The machine was shared and the time ended. Of three kills of tune two found a fault (a trial told as failed), and were not repeated after its mend; of the places the first three; damaged
 files and the other places are in the script and were not run to their end, nor were 600 command lines: 150 were, and the
-six that ended badly were mended and typed again, each one line. Of 700 files of run folders 473 were refused in one
+four causes of six that ended badly were mended and typed again; `algo=oracle algo.batch_size=nan` was not. Of 700 files of run folders 473 were refused in one
 line and 227 may stand: no traceback, no nonsense. Of 700 recordings 586 were refused
 and 114 may stand: no traceback, no nonsense. 17 of those that stand a first judge called nonsense, too strictly: a
 single row whose clock is wrong is dropped, a motion that begins anew is a second trajectory, and joints 1 and 2 of that
