@@ -472,6 +472,7 @@ def test_mistake_in_a_transfer_gets_one_line(mistake, trained, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_policy_for_an_fr3_meets_one(root):
     """Trained with its limits, which are those of the emulator, and through its client without a stop."""
     pytest.importorskip("pylibfranka")
@@ -552,7 +553,9 @@ def test_the_same_policy_in_dart(trained, root):
     ("arm", "package"),
     [
         ("panda_emulated", "panda_py"),
-        pytest.param("fr3_emulated", "pylibfranka", marks=pytest.mark.slow),  # above: once, with a policy of its own
+        pytest.param(
+            "fr3_emulated", "pylibfranka", marks=pytest.mark.slow
+        ),  # above: once, with a policy of its own, also slow
     ],
 )
 def test_a_policy_through_the_client_that_drives_hardware(trained, arm, package, tmp_path):

@@ -55,7 +55,7 @@ def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
             for key, title in SUCCESS.items()
         }
         distance = row.get("distance_median_m")
-        cells["median distance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
+        cells["median\ndistance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
         cells["return"] = number(row.get("return_smooth", row.get("return_paper")), "{:.1f}")
         cells["at rest, %"] = number(None if row.get("rest") is None else 100 * row["rest"], "{:.1f}")
         table[_counted(label, row)] = cells
