@@ -161,7 +161,7 @@ def test_wrong_shapes_are_named():
 
 @pytest.mark.parametrize("hold", HOLDS)
 def test_a_policy_meets_the_same_arm_in_every_engine(hold):
-    """Friction, breakaway, offsets, soft limits, delay: an episode in DART is the batch's, within 1e-3 mm."""
+    """Friction, breakaway, offsets, the driver's law, delay: an episode in DART is the batch's, within 1e-3 mm."""
     robot, task = load_robot(**conf("robot/panda")), ReachTask(episode_s=0.88, torque_fraction=0.15)
     truth = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass, hold=hold)

@@ -19,7 +19,7 @@ class ArmBatch:
     lag -> physics; then kinematics.
 
     Attributes:
-        stops: why episodes ended early: nothing stops an arm here. speeds: None, they have no noise.
+        speeds: None, they have no noise.
 
     Args:
         robot, task: the arm, and what rates and torques are asked of it.
@@ -36,7 +36,6 @@ class ArmBatch:
         self.sim = Simulator(robot, dynamics, width, nthread)
         self.sim.drive(limits(robot, self._torque))
         self.actuation = Actuation(robot, width, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
-        self.stops: list = []
         self.speeds = None
         self._limited = np.zeros(width)  # cycles before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numba import njit
 
+from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 
 # 1/s: a loop of this rate that is LATE seconds late answers without overshoot, rate x delay <= 1/e
@@ -63,21 +64,11 @@ def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     out[:, MOST], out[:, DQ_MAX] = ALLOWED * robot.dq_max, robot.dq_max
     deceleration, offset = robot.slowing or (np.full(robot.n, np.inf), np.zeros(robot.n))
     out[:, SLOWING], out[:, OFFSET] = 2 * SLOWER**2 * deceleration, SLOWER * offset
-    felt = felt_inertia(robot)
+    felt = 1 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
     most = (MARGIN / (RATE * LATE) - 1) * felt
     out[:, ADDED] = np.clip(torque / (RATE * out[:, MOST]) - felt, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
     return out
-
-
-def felt_inertia(robot: Robot) -> np.ndarray:
-    """Return (n,) kg m^2 that each joint feels at home with the others free: 1 over the diagonal of M^-1."""
-    model = robot.model(gravity=False)
-    data, mass = mujoco.MjData(model), np.empty((robot.n, robot.n))
-    data.qpos[:] = robot.q_home
-    mujoco.mj_fwdPosition(model, data)
-    mujoco.mj_fullM(model, data, mass)
-    return 1 / np.diag(np.linalg.inv(mass))
 
 
 class Guard:
