@@ -8,10 +8,12 @@ from statistics import median
 
 import pytest
 
+from r2s import compiled
+
 ROOT = Path(__file__).parent.parent
 # in the order in which data flows; a file of r2s/ itself is a room of its own
 ROOMS = [
-    *("errors", "files", "progress", "provenance", "runs"),
+    *("errors", "files", "progress", "provenance", "runs", "compiled"),
     *("physics", "recordings", "excitation", "identification", "tasks", "learning", "engines", "arm", "reporting"),
     *("stages", "commands", "cli", "notebook", "__main__"),
 ]
@@ -69,6 +71,29 @@ def test_nothing_imports_in_a_circle():
         free = {name for name, before in left.items() if not before & left.keys()}
         assert free, f"a circle among {sorted(left)}"
         left = {name: before for name, before in left.items() if name not in free}
+
+
+def test_what_is_compiled_is_kept_by_the_rule_of_compiled():
+    """By its own `njit` numba would go on with the compiled code of a module that has changed."""
+    for path in MODULES:
+        found = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        names = {alias.name for node in found if node.module == "numba" for alias in node.names}
+        assert name_of(path) == "compiled" or not names & {"njit", "jit", "cfunc", "vectorize"}, path
+
+
+def test_a_change_in_physics_makes_what_is_compiled_of_it_new(tmp_path, monkeypatch):
+    """Also in another room; a module that compiles nothing changes nothing."""
+    rooms = [tmp_path / "arm", tmp_path / "physics"]
+    for folder in rooms:
+        folder.mkdir()
+        (folder / "law.py").write_text("from r2s.compiled import njit\n")
+    monkeypatch.setattr(compiled, "PACKAGE", tmp_path)
+    stamps = lambda: [compiled._sources.__wrapped__(folder) for folder in rooms]  # noqa: E731
+    before = stamps()
+    (rooms[0] / "other.py").write_text("x = 1\n")
+    assert stamps() == before
+    (rooms[1] / "law.py").write_text("from r2s.compiled import njit\nRATE = 2\n")
+    assert all(new != old for new, old in zip(stamps(), before, strict=True))
 
 
 def test_every_room_is_there_and_says_what_it_is():

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import mujoco
 import mujoco.batch
 import numpy as np
-from numba import njit
 
 from r2s.arm.interface import ArmState
+from r2s.compiled import njit
 from r2s.physics.actuation import condition, low_pass_factor
 from r2s.physics.limits import BRAKE_S, MOST, STEP, TAU_MAX, WORK, guard, limits
 from r2s.physics.robot import SIM_DT, Robot

@@ -16,9 +16,9 @@ feel each other only through their gears, so each is solved by itself).
 """
 
 import numpy as np
-from numba import njit
 
 from r2s.arm.hidden_arm import ENCODER, drag
+from r2s.compiled import njit
 from r2s.physics.newton_euler import equations
 
 # Rows of the parameters (rows, n) ...

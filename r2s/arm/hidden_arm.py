@@ -5,9 +5,9 @@ and friction of its own. Nothing but the make itself reads what was drawn.
 """
 
 import numpy as np
-from numba import njit
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.physics.description import Bodies
 from r2s.physics.robot import SIM_DT, Robot

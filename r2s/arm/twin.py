@@ -15,7 +15,6 @@ Friction, per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), bristle z rad
 """
 
 import numpy as np
-from numba import njit
 
 from r2s.arm.hidden_arm import (
     ENCODER,
@@ -28,6 +27,7 @@ from r2s.arm.hidden_arm import (
     draw_surroundings,
     magnitudes,
 )
+from r2s.compiled import njit
 from r2s.engines.dart import DartEngine
 from r2s.physics.robot import SIM_DT, Robot
 

@@ -18,9 +18,9 @@ is the command from which it no longer can. No model of the arm is needed.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.optimize import least_squares
 
+from r2s.compiled import njit
 from r2s.errors import UserError
 from r2s.recordings.ramps import Ramps
 

@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT, Robot
 
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.errors import UserError
 from r2s.physics import convex
 from r2s.physics.convex import BODY, BOUND, POSE, farthest, within

@@ -6,7 +6,8 @@ of two cores is Gilbert, Johnson and Keerthi's (IEEE J. Robot. Autom. 4(2), 1988
 """
 
 import numpy as np
-from numba import njit
+
+from r2s.compiled import njit
 
 # Columns of a body: its kind, radius around the core, the core's half sizes, first and number of its vertices, radius
 # of the sphere about its centre that holds it

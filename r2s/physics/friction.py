@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.errors import UserError, choices, nearest
 
 WIDTH_DQ = 0.01  # rad/s, over which the sign of Coulomb friction turns: inside the dead zone

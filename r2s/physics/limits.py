@@ -17,8 +17,8 @@ import math
 
 import mujoco
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 

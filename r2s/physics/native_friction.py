@@ -13,13 +13,16 @@ where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 
 import ctypes
 from collections.abc import Callable
 from functools import cache
+from types import FunctionType
 from typing import Any
 
 import mujoco
 import numpy as np
-from numba import njit
-from numba.extending import is_jitted
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic, is_jitted
 
+from r2s.compiled import cfunc, njit
 from r2s.physics.actuation import SLOTS, turn
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.limits import COLUMNS, TAU_MAX, WORK, guard
@@ -44,7 +47,8 @@ BRISTLE, SENT, MOTOR, CYCLE, LIMITED, LINE = range(6)
 KEPT = LINE + SLOTS
 
 # the place of a law is its number in `jnt_user`
-_laws: list[Callable] = [*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None)]
+_BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
+_laws: list[Callable] = [*_BUILT_IN]
 
 
 def number(family: Family, hold: str) -> int:
@@ -79,6 +83,33 @@ def _no_law(asked, p, v, h, memory):
     return 0.0, 0.0
 
 
+def _in_order(laws: tuple[Callable, ...]) -> Callable:
+    """Return the compiled law that is each of these where it is asked for by its place."""
+    law: Callable = _no_law
+    for k in reversed(range(len(laws))):
+        law = _either(k, laws[k], law)
+    return law
+
+
+_law = _in_order(_BUILT_IN)
+
+
+@intrinsic
+def _as_doubles(typingctx, address):
+    def codegen(context, builder, signature, args):
+        return builder.inttoptr(args[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(types.int64), codegen
+
+
+@intrinsic
+def _stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its time
+    def codegen(context, builder, signature, args):
+        return builder.alloca(ir.DoubleType(), args[0])
+
+    return types.CPointer(types.float64)(types.int64), codegen
+
+
 @njit(inline="always")
 def _weight(mass, hx, hy, hz, anchor, axis, gravity):
     """Return Nm that gravity turns a joint with: axis . ((h - mass anchor) x gravity), of first moments h kg m."""
@@ -90,14 +121,21 @@ def _weight(mass, hx, hy, hz, anchor, axis, gravity):
 @cache
 def _callback(laws: tuple[Callable, ...]) -> Any:
     """Compile the force of these laws, in the order of their numbers, and put it into MuJoCo."""
-    from llvmlite import ir
-    from numba import carray, cfunc, types
-    from numba.extending import intrinsic
+    force = _force_at(_struct_offsets())
+    if own := laws[len(_BUILT_IN) :]:
+        names = {**globals(), "_law": _in_order(laws)}
+        force = FunctionType(force.__code__, names, closure=force.__closure__)
+    signature = types.void(types.CPointer(types.int64), types.CPointer(types.int64))
+    compiled = cfunc(signature, error_model="numpy", cache=not own)(force)
+    mujoco.set_mjcb_control(compiled.ctypes)
+    return compiled  # kept alive by the cache: MuJoCo holds only the address
 
-    law: Callable = _no_law
-    for k in reversed(range(len(laws))):
-        law = _either(k, laws[k], law)
-    at = _struct_offsets()
+
+def _force_at(at: dict[str, int]) -> Callable:
+    """Return the force to compile, of mjModel and mjData whose fields lie `at` these bytes.
+
+    The offsets are integers in its closure, which numba counts among what a kept function was compiled of.
+    """
     nv_at, nuser_at = at["nv"] // 8, at["nuser_jnt"] // 8
     user_at, damping_at = at["jnt_user"] // 8, at["dof_damping"] // 8
     qpos_at, qvel_at = at["qpos"] // 8, at["qvel"] // 8
@@ -110,46 +148,31 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         max(at[k] for k in _DATA_FIELDS) // 8 + 1,
     )
 
-    @intrinsic
-    def as_doubles(typingctx, address):
-        def codegen(context, builder, signature, args):
-            return builder.inttoptr(args[0], ir.DoubleType().as_pointer())
-
-        return types.CPointer(types.float64)(types.int64), codegen
-
-    @intrinsic
-    def stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its time
-        def codegen(context, builder, signature, args):
-            return builder.alloca(ir.DoubleType(), args[0])
-
-        return types.CPointer(types.float64)(types.int64), codegen
-
-    @cfunc(types.void(types.CPointer(types.int64), types.CPointer(types.int64)), error_model="numpy")
     def friction_force(model_ptr, data_ptr):
         model = carray(model_ptr, (model_words,))
         if model[nuser_at] != WIDTH:
             return
         n, nbody = model[nv_at], model[nbody_at]
-        user = carray(as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
-        damping = carray(as_doubles(model[damping_at]), (n,))  # type: ignore[call-arg]
+        user = carray(_as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
+        damping = carray(_as_doubles(model[damping_at]), (n,))  # type: ignore[call-arg]
         data = carray(data_ptr, (data_words,))
-        q = carray(as_doubles(data[qpos_at]), (n,))  # type: ignore[call-arg]
-        qvel = carray(as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
-        applied = carray(as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
-        qfrc_passive = carray(as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
-        kept = carray(as_doubles(data[memory_at]), (KEPT, n))  # type: ignore[call-arg]
+        q = carray(_as_doubles(data[qpos_at]), (n,))  # type: ignore[call-arg]
+        qvel = carray(_as_doubles(data[qvel_at]), (n,))  # type: ignore[call-arg]
+        applied = carray(_as_doubles(data[applied_at]), (n,))  # type: ignore[call-arg]
+        qfrc_passive = carray(_as_doubles(data[passive_at]), (n,))  # type: ignore[call-arg]
+        kept = carray(_as_doubles(data[memory_at]), (KEPT, n))  # type: ignore[call-arg]
         memory = kept[BRISTLE]
-        xpos = carray(as_doubles(data[xpos_at]), (nbody, 3))  # type: ignore[call-arg]
-        xmat = carray(as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
-        anchor = carray(as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
-        axis = carray(as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
+        xpos = carray(_as_doubles(data[xpos_at]), (nbody, 3))  # type: ignore[call-arg]
+        xmat = carray(_as_doubles(data[xmat_at]), (nbody, 9))  # type: ignore[call-arg]
+        anchor = carray(_as_doubles(data[anchor_at]), (n, 3))  # type: ignore[call-arg]
+        axis = carray(_as_doubles(data[axis_at]), (n, 3))  # type: ignore[call-arg]
         net = user[0, NET] != 0.0  # of all joints of an arm, or of none
         driven = user[0, LIMITS + TAU_MAX] > 0.0
         if net or driven:
-            bias = carray(as_doubles(data[bias_at]), (n,))  # type: ignore[call-arg]
-            mass = carray(as_doubles(data[mass_at]), (n * (n + 1) // 2,))  # type: ignore[call-arg]
+            bias = carray(_as_doubles(data[bias_at]), (n,))  # type: ignore[call-arg]
+            mass = carray(_as_doubles(data[mass_at]), (n * (n + 1) // 2,))  # type: ignore[call-arg]
         if driven and user[0, MARK] == MARKER:
-            desk = carray(stack((2 * n + WORK) * n), (2 * n + WORK, n))  # type: ignore[call-arg]
+            desk = carray(_stack((2 * n + WORK) * n), (2 * n + WORK, n))  # type: ignore[call-arg]
             cycle = SLOTS + int(kept[CYCLE, 0])
             sent = kept[LINE + cycle % SLOTS]
             changed = guard(
@@ -160,8 +183,8 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             turn(kept[LINE:], kept[MOTOR], cycle, user[0, DELAY], user[0, LAG], applied)
             kept[CYCLE, 0] += 1.0
         if net:
-            work = carray(stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
-            joint = carray(stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
+            work = carray(_stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
+            joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
             slow = False
         # mass and first moment of everything beyond a joint, errors and nominal
         em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -169,7 +192,7 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
             if user[j, MARK] != MARKER:
                 return
             v = 0.0 if net and abs(qvel[j]) < TINY else qvel[j]
-            friction, slope = law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
+            friction, slope = _law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
             pull, loaded = user[j, OFFSET], 0.0
             if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
                 pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
@@ -211,8 +234,7 @@ def _callback(laws: tuple[Callable, ...]) -> Any:
         if net and (slow or turns(mass, damping, user[0, STEP], joint[SPEED], joint[FORCE], work)):
             _hold(mass, damping, bias, applied, qvel, user, joint, work, qfrc_passive)
 
-    mujoco.set_mjcb_control(friction_force.ctypes)
-    return friction_force  # kept alive by the cache: MuJoCo holds only the address
+    return friction_force
 
 
 @njit(cache=True, error_model="numpy")

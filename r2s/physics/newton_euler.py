@@ -8,8 +8,8 @@ which it is tested against.
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot

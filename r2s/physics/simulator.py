@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import mujoco
 import mujoco.batch
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics import native_friction as native
 from r2s.physics.actuation import steps_late
 from r2s.physics.dynamics import Dynamics

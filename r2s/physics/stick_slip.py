@@ -10,7 +10,8 @@ Hard stops are MuJoCo's own: where a joint lies at one, they come on top of what
 """
 
 import numpy as np
-from numba import njit
+
+from r2s.compiled import njit
 
 TINY = 1e-9  # rad/s, what round-off leaves of a joint that is held: it is at rest
 HELD, FREE = 0.0, 2.0  # in place of a direction: at rest, and without edges to be held by

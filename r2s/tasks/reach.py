@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.errors import UserError, check_number
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks import rewards
