@@ -281,7 +281,7 @@ def test_exported_policy_is_the_trained_policy(trained):
     task = ReachTask(**(conf("task/reach") | {"reach": tuple(config["robot"]["reach"])}))
     policy = load_policy(trained, load_robot(**conf("robot/panda")), task)
     session = onnxruntime.InferenceSession(str(trained / "policy.onnx"))
-    seen = torch.randn(5, 47)
+    seen = torch.randn(5, 54)
     torque = session.run(None, {"observation": seen.numpy()})[0]
     scale = policy.torque_scale.numpy()
     assert np.abs((torque - policy(seen).detach().numpy()) / scale).max() < 1e-5

@@ -339,7 +339,7 @@ def test_the_observation_is_the_one_an_arm_gives(make):
 
 
 def test_the_observation_is_what_its_docstring_lists(panda):
-    """5 n + 12 numbers in SI units, in the order of the docstring."""
+    """6 n + 12 numbers in SI units, in the order of the docstring."""
     rng = np.random.default_rng(0)
     q, dq, effort = rng.normal(size=(3, 2, 7))
     ee, goal = rng.normal(size=(2, 2, 3))
@@ -348,15 +348,16 @@ def test_the_observation_is_what_its_docstring_lists(panda):
     error = goal - ee
     pull = np.stack([j.T @ e for j, e in zip(jacobian, error, strict=True)])
     parts = [q, dq, ee, goal, error, effort / torque, np.tanh(error / 0.02), pull, np.tanh(pull / 0.015)]
+    parts.append(np.tanh(dq / 0.1))
     np.testing.assert_allclose(out, np.concatenate(parts, 1), rtol=1e-6, atol=1e-7)
-    assert out.shape == (2, 47)
+    assert out.shape == (2, 54)
     assert out.dtype == np.float32
 
 
 def test_the_scale_of_observations_fits_them(make, panda, task):
     """Normalised observations of random motion are of order one: none is far off, all but joint 7's pull move."""
     centre, scale = task.observation_scale(panda)
-    assert centre.shape == scale.shape == (47,)
+    assert centre.shape == scale.shape == (54,)
     assert np.all(scale > 0)
     rows = torch.cat([row["observation"] for row in run(make(8), actions(30, 8))]).numpy()
     normal = (rows - centre) / scale

@@ -15,6 +15,7 @@ from r2s.tasks.task import Episodes, State
 
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
+FINE_DQ = 0.1  # rad/s: a joint that creeps would hardly be seen, and one that the hand turns on is not missed
 CLOSE_M = 1e-3  # at least this is a distance that others are divided by
 MIDDLE = 0.05, 0.95  # of random postures: between these quantiles of their distances goals lie by default
 POSTURES = 500  # that those are told from
@@ -71,7 +72,8 @@ class ReachTask:
     @property
     def observed(self) -> str:
         """What is in an observation."""
-        return f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}); rad, rad/s, m"
+        fine = f"tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
+        return f"q dq ee goal error effort {fine}; rad, rad/s, m"
 
     @property
     def paper_weights(self) -> np.ndarray:
@@ -111,22 +113,22 @@ class ReachTask:
         )
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (5 n + 12,) to normalise `observe` by: the task's own scales.
+        """Return mean and standard deviation (6 n + 12,) to normalise `observe` by: the task's own scales.
 
         Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
         decide about stopping at a goal vanish.
         """
         n, far = robot.n, self.region(robot)[1]
-        centre = np.zeros(5 * n + 12)
+        centre = np.zeros(6 * n + 12)
         low, high = robot.q_range
         centre[:n] = 0.5 * (low + high)
         places = [np.full(3, 0.5 * far)] * 3
         scale = [0.3 * (high - low), np.full(n, 0.5), *places, np.full(n, 0.5)]
-        scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(n)]
+        scale += [np.ones(3), np.full(n, 0.2 * far), np.ones(2 * n)]
         return centre, np.concatenate(scale)
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, 5 n + 12) float32 of goals (m, 3) m; `torque` (n,) Nm: an action of 1."""
+        """Return the observations (m, 6 n + 12) float32 of goals (m, 3) m; `torque` (n,) Nm: an action of 1."""
         return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
@@ -170,11 +172,11 @@ def observe(
     effort: np.ndarray,
     torque: np.ndarray,
 ) -> np.ndarray:
-    """Return the observation (m, 5 n + 12) float32 in SI units; the same on the arm as in simulation.
+    """Return the observation (m, 6 n + 12) float32 in SI units; the same on the arm as in simulation.
 
-    q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm): the last three
-    tell a network which joint moves the hand towards the goal, which it would otherwise have to learn; the effort is
-    state, because the rate limit lets a torque change by 1 Nm per ms only.
+    q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
+    tanh(dq / 0.1 rad/s). J^T error tells a network which joint moves the hand towards the goal, which it would
+    otherwise have to learn. The effort is state, because the rate limit lets a torque change by 1 Nm per ms only.
 
     Args:
         q, dq: (m, n) rad, rad/s.
@@ -183,12 +185,13 @@ def observe(
         effort: (m, n) Nm, the target as it has come through the low-pass. torque: (n,) Nm, an action of 1.
     """
     m, n = q.shape
-    out = np.empty((m, 5 * n + 12), np.float32)
+    out = np.empty((m, 6 * n + 12), np.float32)
     for i in range(m):
         for j in range(n):
             pull = 0.0
             for k in range(3):
                 pull += jacobian[i, k, j] * (goal[i, k] - ee[i, k])
+            out[i, 5 * n + 12 + j] = np.tanh(dq[i, j] / FINE_DQ)
             out[i, j], out[i, n + j], out[i, 2 * n + 9 + j] = q[i, j], dq[i, j], effort[i, j] / torque[j]
             out[i, 3 * n + 12 + j], out[i, 4 * n + 12 + j] = pull, np.tanh(pull / FINE_RAD)
         for k in range(3):

@@ -15,7 +15,8 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
-STILL = 0.2  # rad/s, scale of its stillness, of the fastest joint: a hand can lie on the axis of one that turns
+STILL = (0.2, 0.05)  # rad/s, of its stillness: of the fastest joint, as a hand can lie on the axis of one that turns
+MOVING = 0.35  # what each of these two takes away
 TERMS = ("distance", "smoothness", "precision", "limited")
 
 
@@ -27,7 +28,8 @@ def terms(
 
     distance    -k1 d, with d the distance over the initial one
     smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2) (1 - max tanh(|dq| / 0.2 rad/s) / 2)
+    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2)
+                (1 - 0.35 tanh(max|dq| / 0.2 rad/s) - 0.35 tanh(max|dq| / 0.05 rad/s))
     limited     -limited
 
     Args:
@@ -39,15 +41,15 @@ def terms(
     out = np.empty((len(distance), 4))
     for i in range(len(distance)):
         d = distance[i] / distance0[i]
-        speed, jerkiness, moving = 0.0, 0.0, 0.0
+        speed, jerkiness, fastest = 0.0, 0.0, 0.0
         for j in range(dq.shape[1]):
             speed += np.tanh(abs(dq[i, j]))
             jerkiness += np.tanh(abs(ddq[i, j]))
-            moving = max(moving, np.tanh(abs(dq[i, j]) / STILL))
+            fastest = max(fastest, abs(dq[i, j]))
         near = 1.0 - 0.5 * (np.tanh(distance[i] / PRECISION_M[0]) + np.tanh(distance[i] / PRECISION_M[1]))
         out[i, 0] = -K1 * d
         out[i, 1] = -K2 * speed - K3 * jerkiness / abs(K4 - min(1.0, d)) - K5 * jerkiness / (K6 + d)
-        out[i, 2] = near * (1.0 - 0.5 * moving)
+        out[i, 2] = near * (1.0 - MOVING * (np.tanh(fastest / STILL[0]) + np.tanh(fastest / STILL[1])))
         out[i, 3] = -limited[i]
     return out
 
