@@ -9,7 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 DPI = 120
+WIDTH = 12.0  # inches
 LEGEND_WIDTH = 160  # letters, of a figure
+# Inches around the panels and between them. A layout that measures every text would take most of a figure's time.
+LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
+LETTER = 0.085  # inches, of a label beside the first panel
 
 
 @contextmanager
@@ -18,20 +22,29 @@ def panels(
 ) -> Iterator[list[Axes]]:
     """Give `count` axes in a grid, with one legend for all, headed by `key`, and save the figure to `path`."""
     rows = -(-count // columns)
-    figure = Figure(figsize=(12, 0.9 + height * rows), dpi=DPI, layout="constrained")
+    figure = Figure(dpi=DPI)
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
     yield axes
     for axis in axes:
         axis.grid(alpha=0.3, linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
         axis.title.set_fontsize(10)
-    figure.suptitle(title, fontsize=13, fontweight="bold")
     named = {name: line for axis in axes for line, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    below = BOTTOM
     if named:
         fit = max(1, LEGEND_WIDTH // (max(map(len, named)) + 6))
-        columns = min(len(named), 6, fit)
+        wide = min(len(named), 6, fit)
         lines, labels = list(named.values()), list(named)
-        figure.legend(lines, labels, loc="outside lower center", ncols=columns, frameon=False, title=key)
+        below += LINE * (-(-len(named) // wide) + (key is not None)) + 0.1
+        figure.legend(lines, labels, loc="lower center", ncols=wide, frameon=False, title=key)
+    tall = TOP + height * rows + 0.2 * (rows - 1) + below
+    figure.suptitle(title, fontsize=13, fontweight="bold", y=1 - 0.12 / tall, va="top")
+    figure.set_size_inches(WIDTH, tall)
+    left = LEFT + LETTER * max(0, max(len(text.get_text()) for text in axes[0].get_yticklabels()) - 6)
+    panel = (WIDTH - left - RIGHT - (columns - 1) * ACROSS) / columns, (tall - TOP - below - (rows - 1) * DOWN) / rows
+    figure.subplots_adjust(
+        left / WIDTH, below / tall, 1 - RIGHT / WIDTH, 1 - TOP / tall, ACROSS / panel[0], DOWN / panel[1]
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
