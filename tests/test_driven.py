@@ -22,8 +22,10 @@ from r2s.arm.interface import ArmStopped, NotCleared
 from r2s.arm.ramp import BRAKE_SHARE, LARGEST, poses_about, ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.tracking import ASTRAY, CORRECTION, Tracker, record
+from r2s.errors import UserError
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
+from r2s.excitation.paths import check_path
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
@@ -33,6 +35,7 @@ from r2s.tasks.reach import ReachTask
 
 PANDA = load_robot(**conf("robot/panda"))
 LEVEL = nominal_dynamics(PANDA, **conf("friction/paper")).level
+LOW = np.array([0.0, 1.2, 0, -1.9, 0, 2.2, 0.8])  # the hand far out, a little above the table
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 
 
@@ -253,6 +256,37 @@ def test_pressed_and_released_counts_as_pressed(there):
         arm.move_to(PANDA.q_home)
     assert len(asked) == 2 * there
     assert len(client.sent) == 10
+
+
+def test_an_arm_goes_around_what_is_in_its_way(monkeypatch):
+    """Where the straight way would touch, `move_to` goes joint by joint; where there is none, nothing moves."""
+    client, places = Button(), []
+    arm = Franka(PANDA, client)
+    monkeypatch.setattr(Franka, "_go", lambda self, q: places.append(q))
+    folded = np.array([-1.1, 1.5, 1.1, -2.6, 0, 2.1, 0.8])
+    arm.move_to(folded)
+    assert len(places) == 6
+    np.testing.assert_array_equal(places[-1], folded)
+    check_path(PANDA, np.array([PANDA.q_home, *places]))
+    with pytest.raises(
+        ArmStopped, match=r"the way there: the end effector is 0.0.* m or more.*guide the arm by hand"
+    ):
+        arm.move_to(LOW)
+    assert len(places) == 6
+    assert client.sent == []
+
+
+def test_what_would_touch_is_not_begun():
+    """A recording that comes too near to the table, and a pose to ramp at, are refused before anything moves."""
+    t = SIM_DT * np.arange(2001)
+    down = Excitation(t, *minimum_jerk(PANDA.q_home, LOW, 2.0, t[:, None]))
+    for move in (lambda arm: record(arm, down), lambda arm: ramp(arm, [PANDA.q_home, LOW])):
+        arm = Watched()
+        with pytest.raises(
+            UserError, match=r"(excitation|pose 2): the end effector is 0\.0\d+ m above the base plane"
+        ):
+            move(arm)
+        assert arm.commands == []
 
 
 @pytest.mark.parametrize(("answers", "done"), [([False], 1), ([True, False], 2), ([True, True], 3)])

@@ -112,7 +112,9 @@ def test_an_arm_that_touches_something_has_ended_its_episode():
             """Push the second joint of the second arm."""
             return torch.tensor([[0.0] * 7, [0.0, 1.0, 0, 0, 0, 0, 0], [0.0] * 7])[: len(observation)]
 
-    done = rollout(Down(), ArmBatch(PANDA, task, NEW, 3, 1), task, starts, task.goals(PANDA, np.random.default_rng(0), 3))
+    done = rollout(
+        Down(), ArmBatch(PANDA, task, NEW, 3, 1), task, starts, task.goals(PANDA, np.random.default_rng(0), 3)
+    )
     when, what = done.collision[1].split(" s: ")
     assert what.endswith("and the table")
     assert list(done.collision[[0, 2]]) == ["", ""]
