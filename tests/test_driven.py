@@ -268,9 +268,7 @@ def test_an_arm_goes_around_what_is_in_its_way(monkeypatch):
     assert len(places) == 6
     np.testing.assert_array_equal(places[-1], folded)
     check_path(PANDA, np.array([PANDA.q_home, *places]))
-    with pytest.raises(
-        ArmStopped, match=r"the way there: the end effector is 0.0.* m or more.*guide the arm by hand"
-    ):
+    with pytest.raises(ArmStopped, match=r"the way there: the end effector is 0.0.* guide the arm by hand"):
         arm.move_to(LOW)
     assert len(places) == 6
     assert client.sent == []
@@ -282,9 +280,7 @@ def test_what_would_touch_is_not_begun():
     down = Excitation(t, *minimum_jerk(PANDA.q_home, LOW, 2.0, t[:, None]))
     for move in (lambda arm: record(arm, down), lambda arm: ramp(arm, [PANDA.q_home, LOW])):
         arm = Watched()
-        with pytest.raises(
-            UserError, match=r"(excitation|pose 2): the end effector is 0\.0\d+ m above the base plane"
-        ):
+        with pytest.raises(UserError, match=r"(excitation|pose 2): the end effector is 0\.0\d+ m above the base"):
             move(arm)
         assert arm.commands == []
 

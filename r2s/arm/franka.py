@@ -1,8 +1,8 @@
 """What the Panda and the FR3 have in common: the `Arm` protocol on a libfranka client, hardware or emulated.
 
 libfranka knows no "go there" in torque control, so `move_to` follows a slow joint path, checked before, with the
-recorder's tracking controller, through the same 1 kHz torque loop that everything else uses: the model of the client package is not
-needed, and what brings the arm to its place on hardware is what the emulator has tested.
+recorder's tracking controller, through the same 1 kHz torque loop that everything else uses: the model of the client
+package is not needed, and what brings the arm to its place on hardware is what the emulator has tested.
 """
 
 import importlib
@@ -144,8 +144,8 @@ class Franka:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Go to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
 
-        The way is the first of those of r2s/excitation/paths.py, from where the arm is, that keeps away from the limits,
-        the table and the arm itself.
+        The way is the first of those of r2s/excitation/paths.py, from where the arm is, that keeps away from limits,
+        table and arm.
 
         Raises:
             NotCleared: the arm has stopped before, and no operator agreed that it may move.

@@ -128,7 +128,7 @@ def record_motion(cfg, robot, motion, k, label):
 
 
 def ramp_poses(cfg, robot):
-    """Return the postures (., n) rad at which joints are to be ramped; raise UserError where there is no way there."""
+    """Return the postures (., n) rad at which joints are to be ramped; raise UserError where no way leads there."""
     from r2s.arm.ramp import check_ways, poses_about
 
     poses = poses_about(robot, cfg.data.ramp_poses if cfg.data.torque == "commanded" else 0)
