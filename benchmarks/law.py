@@ -6,29 +6,39 @@ every cycle. docs/law.md is made of it.
 
 The action of the law is what is sent less what is asked for. Its spectrum is judged by its largest line above 20 Hz,
 against the largest below: a loop that shakes has its line there.
+
+`python benchmarks/law.py cost` says what the law, and the motors' delay behind it, cost a training's environment: CPU
+time of one thread, with and without, in turns.
 """
 
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROOT, markdown
+import torch
+from common import MACHINE, NEW, ROBOT, ROOT, conf, markdown
 from omegaconf import OmegaConf
 
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
+from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import load_policy
+from r2s.physics.limits import limits
 from r2s.stages.build import make_dynamics, make_robot, make_task
 from r2s.stages.transfer import trained_config
 from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
 
 DELAYS_MS = (0, 2, 4, 6, 8)
 TWINS = range(4)
 GOALS = 20
+ARMS, STEPS, TURNS = 32, 25, 41
+ACTIONS = {"gentle": 0.1, "wild": 0.5}  # standard deviation of random actions: of a trained policy, of a new one
 
 
 class Watched:
@@ -73,6 +83,37 @@ def judged(arm, friction, policy, task, starts, goals) -> dict[str, float]:
     }
 
 
+def cost(size: float) -> dict[str, float]:
+    """Return one row: what the law costs an environment under random actions of this size."""
+    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    envs = [TaskEnv(ROBOT, task, lambda rng, m: NEW, ARMS, nthread=1) for _ in range(2)]
+    envs[1].arms.sim.drive(np.zeros_like(limits(ROBOT, task.torque(ROBOT))))  # a TAU_MAX of 0: there is none
+    torch.manual_seed(0)
+    states, took, limited = [env.reset() for env in envs], np.zeros((TURNS, 2)), 0.0
+    for turn in range(TURNS):
+        actions = (size * torch.randn(STEPS, ARMS, ROBOT.n)).clamp(-1, 1)
+        for which, env in enumerate(envs):
+            began = time.process_time()
+            for action in actions:
+                _, states[which] = env.step_and_maybe_reset(states[which].set("action", action))
+            took[turn, which] = time.process_time() - began
+        limited += envs[0].arms.read().limited.mean() / TURNS
+    rate = ARMS * STEPS / np.median(took[1:], axis=0)
+    return {
+        "limited, % of cycles": 100 * limited,
+        "with the law, arm steps/s": rate[0],
+        "without": rate[1],
+        "cost, %": 100 * (1 - np.median(took[1:, 1] / took[1:, 0])),
+    }
+
+
+def costs() -> pd.DataFrame:
+    """Return what the law costs under gentle and wild actions."""
+    return pd.DataFrame.from_dict({k: cost(size) for k, size in ACTIONS.items()}, orient="index").rename_axis(
+        "actions"
+    )
+
+
 def main(folder: str) -> None:
     """Write docs/law.md."""
     cfg = OmegaConf.create({"policy": folder})
@@ -96,12 +137,20 @@ noise. The law's action is what is sent less what is asked for; a line is the la
 episodes.
 
 {markdown(table.round(3))}
+
+What the law, and the motors' delay behind it, cost a training's environment of {ARMS} arms, in CPU time of one
+thread:
+
+{markdown(costs().round(1))}
 """
     (ROOT / "docs" / "law.md").write_text(text)
     print(table.round(3).to_string())
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["cost"]:
+        print(costs().round(1).to_string())
+        raise SystemExit
     if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
         raise SystemExit(__doc__)
     main(sys.argv[1])

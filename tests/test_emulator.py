@@ -333,6 +333,23 @@ def test_real_time_does_not_wait(client, panda):
         arm.close()
 
 
+@pytest.mark.slow  # in real time: on a machine with nothing else to do
+@pytest.mark.parametrize("realtime", [False, True])
+def test_twenty_episodes_complete(realtime, client, panda):
+    """With the collision reflex at its cautious thresholds and nobody who would let the arm go on after a stop."""
+    _, make, version = client
+    task = ReachTask(episode_s=1.0)
+    torch.manual_seed(0)
+    with Emulator(partial(Twin, panda, SEED), version=version, realtime=realtime) as address:
+        arm = make(panda, address, operator=lambda reason: False)
+        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
+        episodes = rollout(make_policy(panda, task, (8,)), driven, task, *fixed_episodes(panda, task, 20))
+        arm.close()
+    assert [str(stop) for stop in driven.stops] == []
+    assert (driven.done, driven.halted) == (20, None)
+    assert np.isfinite(episodes.distance).all()
+
+
 def test_the_other_robot_and_nobody(client, servers, panda):
     """A wrong version, and an address where nothing answers, give one line with libfranka's reason."""
     name, make, version = client

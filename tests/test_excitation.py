@@ -206,7 +206,6 @@ def home(**change):
             ["the end effector is 0.09", "above the base plane at 1.", "0.1 m or more"],
         ),
         ([home(), home(q6=3.6)], ["'link5' is 0.02", "m from link 'link7' at 1.", "0.03 m or more"]),
-        ([[-1.1, 1.5, 1.1, -2.6, 0, 2.1, 0.8]] * 2, ["on the straight way from q_home to the first posture"]),
     ],
 )
 def test_what_is_forbidden_is_named(postures, words):

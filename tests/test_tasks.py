@@ -14,6 +14,7 @@ from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.policy import make_policy
+from r2s.physics.contacts import touching
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.tasks.episode import measures, rollout
@@ -97,6 +98,33 @@ def test_time_begins_with_the_episode(make):
         for k in range(3):
             state = arms.step(np.zeros((1, PANDA.n)))
             np.testing.assert_allclose(state.t, (k + 1) / task.ctrl_hz, rtol=1e-12)
+
+
+def test_an_arm_that_touches_something_has_ended_its_episode():
+    """Of three arms one drives its hand into its link or the table: it stays as it was then, and did not reach."""
+    task = Line()
+    task.steps = 40
+    starts = np.tile(PANDA.q_home, (3, 1))
+    starts[1] = [0.0, 1.5, 0, -1.6, 0, 2.2, 0.8]  # the hand far out, a little above the table
+
+    class Down:
+        def action(self, observation):
+            """Push the second joint of the second arm."""
+            return torch.tensor([[0.0] * 7, [0.0, 1.0, 0, 0, 0, 0, 0], [0.0] * 7])[: len(observation)]
+
+    done = rollout(
+        Down(), ArmBatch(PANDA, task, NEW, 3, 1), task, starts, task.goals(PANDA, np.random.default_rng(0), 3)
+    )
+    when, what = done.collision[1].split(" s: ")
+    assert what.endswith("and the table")
+    assert list(done.collision[[0, 2]]) == ["", ""]
+    k = round(float(when) * task.ctrl_hz) - 1
+    touches = touching(PANDA)
+    assert not touches(done.q[1, :k]).any()
+    assert touches(done.q[1, k:]).all()
+    assert np.array_equal(done.q[1, k:], np.broadcast_to(done.q[1, k], done.q[1, k:].shape))
+    assert np.isinf(done.distance[:, -1]).tolist() == [False, True, False]
+    assert measures(done)["collision"] == pytest.approx(1 / 3)
 
 
 class Still:

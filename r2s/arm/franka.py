@@ -1,8 +1,8 @@
 """What the Panda and the FR3 have in common: the `Arm` protocol on a libfranka client, hardware or emulated.
 
-libfranka knows no "go there" in torque control, so `move_to` follows a slow joint path with the recorder's tracking
-controller, through the same 1 kHz torque loop that everything else uses: the model of the client package is not
-needed, and what brings the arm to its place on hardware is what the emulator has tested.
+libfranka knows no "go there" in torque control, so `move_to` follows a slow joint path, checked before, with the
+recorder's tracking controller, through the same 1 kHz torque loop that everything else uses: the model of the client
+package is not needed, and what brings the arm to its place on hardware is what the emulator has tested.
 """
 
 import importlib
@@ -22,7 +22,8 @@ from r2s.arm.tracking import CUTOFF_HZ, Tracker
 from r2s.errors import UserError, check_number
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
-from r2s.excitation.safety import friction_margin
+from r2s.excitation.paths import approach
+from r2s.excitation.safety import Space, friction_margin
 from r2s.physics.robot import SIM_DT, Robot
 
 SPEED = 0.2  # of dq_max, on the way to a place
@@ -131,6 +132,7 @@ class Franka:
         self._client, self._collision = client, collision
         self._reflexes = Reflexes(robot)
         self._moving, self._closed, self._watched = False, False, False
+        self._space: Space | None = None
         self._stopped: str | None = "no motion was started; call move_to first"
         self._rest()
         # a cycle of references would keep an arm that nobody has any more, and its connection
@@ -142,10 +144,13 @@ class Franka:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Go to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
 
+        The way is the first of those of r2s/excitation/paths.py, from where the arm is, that keeps away from limits,
+        table and arm.
+
         Raises:
             NotCleared: the arm has stopped before, and no operator agreed that it may move.
-            ArmStopped: q is outside the limits, the arm is not ready, it stops on the way, it is 0.1 rad off its
-                way, or it does not come within 10 mrad.
+            ArmStopped: q is outside the limits, the arm is not ready, there is no way (it has not moved), it stops on
+                the way, it is 0.1 rad off its way, or it does not come within 10 mrad.
 
         """
         q = np.array(q, dtype=float)
@@ -154,9 +159,10 @@ class Franka:
         self._reflexes.state(q, np.zeros(self.robot.n))
         self.stop()
         self._ready()
+        way = self._way(q)
         self._stopped = None
-        if np.abs(self._state.q - q).max() > NEAR:
-            self._go(q)
+        for place in way:
+            self._go(place)
         return self._state
 
     def read(self) -> ArmState:
@@ -255,6 +261,18 @@ class Franka:
             self._client.watch_for(self._collision)
             self._watched = True
         self._rest()
+
+    def _way(self, q: np.ndarray) -> np.ndarray:
+        """Return the postures (k, 7) rad to go to, one after the other; none, where the arm is at q (7,) already."""
+        here = self._state.q
+        if np.abs(here - q).max() <= NEAR:
+            return q[:0, None]
+        try:
+            self._space = self._space or Space(self.robot)
+            return approach(self.robot, here, q, what="the way there", space=self._space)[1:]
+        except UserError as forbidden:
+            self._stopped = f"{forbidden}; guide the arm by hand to where there is one"
+            raise ArmStopped(self._stopped) from None
 
     def _go(self, q: np.ndarray) -> None:
         path, moving = _slow_path(self.robot, self._state.q, q)

@@ -4,6 +4,7 @@ It runs on any arm behind the arm interface; r2s/identification/breakaway.py mak
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -12,6 +13,8 @@ from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState
 from r2s.errors import UserError
+from r2s.excitation.paths import approach
+from r2s.excitation.safety import TABLE_M, TOOL_M, Space
 from r2s.identification.breakaway import MOVED
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 from r2s.recordings.ramps import Ramps
@@ -38,6 +41,15 @@ def poses_about(robot: Robot, count: int) -> np.ndarray:
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
 
 
+def check_ways(
+    robot: Robot, poses: np.ndarray, *, what: str = "ramp.poses", table: float = TABLE_M, z_min: float = TOOL_M
+) -> None:
+    """Raise UserError where from home, or from the pose before, there is no way to one of the poses (P, n) rad."""
+    space = Space(robot, table=table, z_min=z_min)
+    for k, (a, b) in enumerate(pairwise([robot.q_home, *poses]), 1):
+        approach(robot, a, b, what=f"{what}: the way to pose {k}", space=space)
+
+
 def ramp(
     arm: Arm,
     poses: np.ndarray | Sequence[Sequence[float]],
@@ -45,6 +57,8 @@ def ramp(
     rate: np.ndarray | Sequence[float] | float | None = None,
     largest: np.ndarray | Sequence[float] | float | None = None,
     moved: float = MOVED,
+    table: float = TABLE_M,
+    z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
 ) -> Ramps:
     """Ramp every joint both ways at every pose and return one trajectory for each ramp.
@@ -57,19 +71,22 @@ def ramp(
 
     Args:
         arm: moved to each pose, and stopped at the end whatever happens.
-        poses: (P, n) rad, at least 0.15 rad inside the position limits.
+        poses: (P, n) rad, at least 0.15 rad inside the position limits, and away from table and arm, as the ways
+            to them are (r2s/excitation/paths.py), or nothing moves.
         rate: (n,) or one, Nm/s; 2.2 for joints of tau_max from 40 Nm, 4 below, where light links are seen to move
             within milliseconds; in proportion to tau_max below 12 Nm.
         largest: (n,) or one, Nm, at which a ramp gives up; 20 % of tau_max.
         moved: rad, well beyond what bristles bend before they let go.
+        table, z_min: m, as in `r2s.excitation.safety.check_motion`.
         progress: called after every ramp with (ramps done, ramps in all).
 
     Raises:
         ArmStopped: the arm ended the motion, or the driver did; nothing is returned of it.
-        UserError: an argument out of range.
+        UserError: an argument out of range, or no way to a pose.
     """
     robot = arm.robot
     places = _poses(robot, poses)
+    check_ways(robot, places, table=table, z_min=z_min)
     small = np.minimum(1.0, robot.tau_max / 12)
     rising = _positive("rate", rate, np.where(robot.tau_max >= BIG, 2.2, 4.0 * small), 0.1 * robot.dtau_max)
     limit = _positive("largest", largest, LARGEST * robot.tau_max, robot.tau_max)

@@ -10,7 +10,7 @@ from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.errors import UserError
 from r2s.excitation.motion import Excitation
-from r2s.excitation.safety import check_limits, friction_margin
+from r2s.excitation.safety import TABLE_M, TOOL_M, check_limits, check_space, friction_margin
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
@@ -34,6 +34,8 @@ def record(
     excitation: Excitation,
     *,
     torque: str = "commanded",
+    table: float = TABLE_M,
+    z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recording:
     """Follow the excitation at 1 kHz and return what the arm did.
@@ -44,17 +46,20 @@ def record(
 
     Args:
         arm: brought to the excitation's first posture here, and stopped at the end whatever happens.
-        excitation: on a clock of 1 ms.
+        excitation: on a clock of 1 ms; within the limits, and away from table and arm, or nothing moves.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, contains gravity).
+        table, z_min: m, as in `r2s.excitation.safety.check_motion`.
         progress: called now and then with (cycles done, cycles in all).
 
     Raises:
         ArmStopped: the arm ended the motion, or the driver did, or the arm went astray; what was recorded until then
             is the exception's `recording`.
+        UserError: what forbids the excitation.
 
     """
     declared_torque(torque)
     _check(arm.robot, excitation)
+    check_space(arm.robot, excitation, table=table, z_min=z_min)
     controller = Tracker(arm.robot, excitation)
     rows = len(excitation.t)
     t = np.empty(rows)

@@ -189,7 +189,8 @@ def _drive(p, s, line, mass, tau, q, v, gravity, cycle, delay, lag, h):
     passive, damping = np.empty(n), np.empty(n)
     whole = int(delay)
     late = delay - whole
-    line[cycle % slots] = tau
+    for i in range(n):  # as a slice it takes 2 s longer to compile
+        line[cycle % slots, i] = tau[i]
     newer, older = (cycle - whole) % slots, (cycle - whole - 1) % slots
     w = s[V_GUESS]
     for i in range(n):

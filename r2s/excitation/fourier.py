@@ -21,7 +21,6 @@ from r2s.excitation.safety import (
     TORQUE_SHARE,
     Motion,
     Space,
-    approach,
     check_motion,
     gravity_torque,
     torque_share,
@@ -53,6 +52,7 @@ KEPT = 3  # of them are made safe
 TRIES = 5  # changes at a time
 LEAST = 0.3  # of a joint's amplitude; what needs less to be safe is dropped
 MARGIN = 0.3  # of each clearance, and 0.03 of tau_max: for what lies between two samples
+WAY_STEPS = 40  # postures on the straight way from q_home to the first one, which is to be free
 FINE = 10  # samples for limits per sample for information and safety
 COARSE_HZ = 10
 BLOCK = 5000  # rows of the basis at a time
@@ -278,7 +278,8 @@ class _Family:
         return self._within_reach(moved[0][0], MARGIN)
 
     def _within_reach(self, offset: np.ndarray, margin: float) -> bool:
-        way = approach(self.robot, self.center + offset)
+        home = self.robot.q_home
+        way = home + np.linspace(0, 1, WAY_STEPS)[:, None] * (self.center + offset - home)
         return bool((self.space.gaps(way) / self.space.clearance).min() >= margin)
 
     def _shrunk(

@@ -21,7 +21,6 @@ GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # of tau_max, for |gravity| + |dynamics| + friction
 FRICTION_SHARE = 0.15  # of tau_max, what friction may take: 0.14 of a Panda's joint 5 ...
 FRICTION_ROOT = 0.5  # ... and no more than this times sqrt(tau_max): strong joints have less of it
-APPROACH_STEPS = 40  # postures on the straight way from q_home to the first one
 
 
 class Motion(Protocol):
@@ -138,19 +137,13 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 
 
 def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
-    """Raise UserError where a link comes too near to the table or to another link; also on the way to the start.
+    """Raise UserError where a link comes too near to the table or to another link.
 
-    That way is taken as straight in joint angles, from q_home.
+    The way to the start depends on where the arm is: r2s/excitation/paths.py, when it goes there.
     """
     space = Space(robot, table=table, z_min=z_min)
     rows = _every(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
-    space.check(approach(robot, motion.q[0]), lambda _: "on the straight way from q_home to the first posture")
-
-
-def approach(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return postures (., n) on the straight way from q_home to q (n,)."""
-    return robot.q_home + np.linspace(0, 1, APPROACH_STEPS)[:, None] * (q - robot.q_home)
 
 
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:

@@ -76,8 +76,10 @@ class Touching:
         names: of what can touch, such as "link 'link5' and link 'link1'", in the order of `first`.
     """
 
-    def __init__(self, robot: Robot, *, table: float = TABLE_M, more: float = 0.0):
+    def __init__(self, robot: Robot, *, table: float | None = TABLE_M, more: float = 0.0):
         model = robot.model(gravity=False)
+        stands = table is None
+        table = TABLE_M if table is None else table
         found = watched(robot, model, table=bool(np.isfinite(table)))
         geoms = sorted({*found.above, *(g for pair in found.pairs for g in pair)})
         self._links = links_of(robot, robot.mass, robot.com, robot.inertia)
@@ -89,6 +91,8 @@ class Touching:
         self.names = [f"{name_of(model, g)} and the table" for g in found.above]
         self.names += [f"{name_of(model, a)} and {name_of(model, b)}" for a, b in found.pairs]
         at_home = int(self.first(robot.q_home[None])[0])
+        if stands and 0 <= at_home < len(found.above):
+            self._table, at_home = -np.inf, -1
         if at_home >= 0:
             raise UserError(f"{robot.name}: {self.names[at_home]} at {table:g} m touch already at robot.q_home")
 
@@ -106,12 +110,13 @@ class Touching:
         return out
 
 
-def touching(robot: Robot, *, table: float = TABLE_M, more: float = 0.0) -> Touching:
+def touching(robot: Robot, *, table: float | None = TABLE_M, more: float = 0.0) -> Touching:
     """Return what tells of many arms at once whether they touch themselves or the table.
 
     Args:
         robot: its file's geoms.
-        table: m, its height in the base frame; -inf where there is none.
+        table: m, its height in the base frame; -inf where there is none. None: TABLE_M, or none where the arm is
+            below that at q_home, as one that hangs is.
         more: m, of distance that already counts as touching.
 
     Raises:

@@ -136,6 +136,12 @@ def transfer(
         sections["Why the arm stopped"] = [list(map(str, stops)) or "It did not."]
         if halted is not None:
             sections["Why not all goals were done"] = [halted]
+    touched = {
+        label: [f"episode {k + 1}, {what}" for k, what in enumerate(e.collision) if what]
+        for label, e in episodes.items()
+    }
+    if any(touched.values()):
+        sections["What touched what"] = [f"{label}, {line}" for label, lines in touched.items() for line in lines]
     write_recording(run.folder / "recording.rrd", robot, episodes=shown, figures=pictures, torque=torque)
     report_markdown(run.folder / "report.md", sections | {"Figures": [reach, *pictures.values()]})
 

@@ -77,6 +77,7 @@ def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         "overshoot, mm": ("overshoot_m", 1e3, "{:.1f}"),
         "limited, %": ("limited", 100, "{:.1f}"),
         "to position limits, rad": ("q_left_rad", 1, "{:.2f}"),
+        "collisions, %": ("collision", 100, "{:.1f}"),
         "stops": ("stops", 1, "{:.0f}"),
     }
     table = {

@@ -127,18 +127,24 @@ def record_motion(cfg, robot, motion, k, label):
     return motion, out
 
 
+def ramp_poses(cfg, robot):
+    """Return the postures (., n) rad at which joints are to be ramped; raise UserError where no way leads there."""
+    from r2s.arm.ramp import check_ways, poses_about
+
+    poses = poses_about(robot, cfg.data.ramp_poses if cfg.data.torque == "commanded" else 0)
+    if len(poses):
+        check_ways(robot, poses, what="data.ramp_poses")
+    return poses
+
+
 def record_ramps(cfg, robot):
     """Return the ramps of the breakaway protocol about the home posture, or None where none are asked for."""
-    import numpy as np
-
-    from r2s.arm.ramp import poses_about, ramp
-    from r2s.excitation.paths import check_path
+    from r2s.arm.ramp import ramp
     from r2s.progress import Progress
 
-    if not cfg.data.ramp_poses or cfg.data.torque != "commanded":
+    poses = ramp_poses(cfg, robot)
+    if not len(poses):
         return None
-    poses = poses_about(robot, cfg.data.ramp_poses)
-    check_path(robot, np.array([robot.q_home, *poses]), what="data.ramp_poses")
     progress = Progress("ramp the joints until they move")
     with opened_source(cfg, robot, 2) as arm:
         out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
@@ -287,6 +293,7 @@ def identify(cfg, overrides):
             inputs.append(file.ramps)
     else:
         called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
+        ramp_poses(cfg, robot)
         if cfg.data.kind == "simulated":
             make_truth(cfg, robot)
         if cfg.data.excitation:

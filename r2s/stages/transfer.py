@@ -29,10 +29,10 @@ WHY = {k: FROM_POLICY for k in ("robot", "friction", "inertia", "calibration", "
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
 
 
-def first(episodes, count):
-    """Return the first `count` of these episodes."""
+def some(episodes, which):
+    """Return those of these episodes that `which` (., ) numbers."""
     of_each = {f.name for f in fields(episodes)} - {"t"}
-    return replace(episodes, **{name: getattr(episodes, name)[:count] for name in of_each})
+    return replace(episodes, **{name: getattr(episodes, name)[which] for name in of_each})
 
 
 def reads(cfg):
@@ -67,7 +67,7 @@ def transfer(cfg, overrides):
 
     from r2s.arm.spread import spread
     from r2s.engines.episodes import EngineArms
-    from r2s.excitation.paths import check_path
+    from r2s.excitation.paths import approach
     from r2s.excitation.safety import Space
     from r2s.learning.batch import ArmBatch
     from r2s.learning.evaluate import fixed_episodes, make_evaluation
@@ -88,7 +88,7 @@ def transfer(cfg, overrides):
     if cfg.arm.name != "none":
         space = Space(robot)
         for k, start in enumerate(starts, 1):
-            check_path(robot, np.array([robot.q_home, start]), what=f"the start of episode {k}", space=space)
+            approach(robot, robot.q_home, start, what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
     center = make_dynamics(trained, robot)
@@ -127,25 +127,31 @@ def transfer(cfg, overrides):
                 episodes[cfg.simulator.name] = done
         halted = None
         if cfg.arm.name != "none":
-            if dynamics is not None:  # what the model says of this arm
-                model = ArmBatch(driven.robot if driven else robot, task, dynamics, len(goals), cfg.threads, fade)
-                done = rollout(policy, model, task, starts, goals)
-                rows["predicted"], episodes["predicted"] = task.measures(done) | {"stops": 0}, done
-            count = len(goals)
+            if dynamics is not None or driven is not None:  # what the model says of this arm
+                model = ArmBatch(driven.robot if driven else robot, task, center, len(goals), cfg.threads, fade)
+                predicted = rollout(policy, model, task, starts, goals)
+            if dynamics is not None:
+                rows["predicted"], episodes["predicted"] = task.measures(predicted) | {"stops": 0}, predicted
+            tried = np.arange(len(goals))
             if on_twin is not None:
                 done, stops, timing = on_twin
             elif driven is not None:
+                tried = np.flatnonzero(predicted.collision == "")
+                for k in np.flatnonzero(predicted.collision != ""):
+                    print(f"episode {k + 1} is left out: the arm would touch something, {predicted.collision[k]}")
+            if driven is not None and len(tried):
                 progress, shown = counted(f"reach on {cfg.arm.name}")
-                done = rollout(policy, driven, task, starts, goals, shown)
-                stops, timing, halted, count = driven.stops, driven.timing, driven.halted, driven.done
+                done = rollout(policy, driven, task, starts[tried], goals[tried], shown)
+                stops = [replace(stop, episode=int(tried[stop.episode])) for stop in driven.stops]
+                timing, halted, tried = driven.timing, driven.halted, tried[: driven.done]
                 progress.close()
-            row: dict = {"stops": len(stops), "episodes": count, "asked": len(goals)}
-            if count:  # what was not done is no failure
-                done = first(done, count)
+            row: dict = {"stops": len(stops), "episodes": len(tried), "asked": len(goals)}
+            if len(tried):  # what was not done is no failure
+                done = some(done, slice(len(tried)))
                 row = task.measures(done) | row
                 episodes[cfg.arm.name] = done
                 if "predicted" in rows:
-                    row |= gap(done, first(episodes["predicted"], count))
+                    row |= gap(done, some(predicted, tried))
             rows[cfg.arm.name] = row
             for row in timing.table() if timing else []:
                 run.log("timing", row)

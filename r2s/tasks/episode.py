@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from r2s.physics.contacts import touching
 from r2s.physics.robot import Robot
 from r2s.tasks.task import Episodes, State, Task
 
@@ -62,7 +63,8 @@ def rollout(
 ) -> Episodes:
     """Run one episode per goal.
 
-    An episode that was stopped keeps its last state and did not reach: its last distance is infinite.
+    An episode that was stopped, or in which the arm touches itself or the table (r2s/physics/contacts.py, looked at
+    after every control step), keeps its last state and did not reach: its last distance is infinite.
 
     Args:
         policy: observation -> action.
@@ -76,6 +78,7 @@ def rollout(
     q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
     ee, limited = np.zeros((*shape, 3)), np.zeros(count)
     distance, reward, smooth = (np.zeros(shape) for _ in range(3))
+    touches, collision = touching(robot, table=None), [""] * count
 
     def ask(state: State, goals: np.ndarray) -> np.ndarray:
         observation = torch.from_numpy(task.observe(state, goals, torque))
@@ -89,16 +92,23 @@ def rollout(
         now = slice(first, first + width)
         state = arms.place(starts[now], first)
         reference, before = task.reference(state, goals[now]), state.dq.copy()
+        over = np.zeros(width, dtype=bool)  # it has touched something
         for k in range(task.steps):
-            if not state.stopped.all():
+            if not (state.stopped | over).all():
                 state = arms.step(ask(state, goals[now]) * torque)
+            if over.any():
+                state = _kept(state, over, q[now, k - 1], dq[now, k - 1], ee[now, k - 1], tau[now, k - 1])
             ddq = (state.dq - before) * task.ctrl_hz
             distance[now, k], terms = task.judge(state, ddq, goals[now], reference)
             reward[now, k] = terms @ weights
             limited[now] += state.limited / task.steps
             q[now, k], dq[now, k], ee[now, k], tau[now, k] = state.q, state.dq, state.ee, state.tau
             before = dq[now, k]
-        stopped = arms.end()
+            hit = np.where(over | state.stopped, -1, touches.first(state.q))
+            for i in np.flatnonzero(hit >= 0):
+                collision[first + i] = f"{(1 + k) / task.ctrl_hz:.2f} s: {touches.names[hit[i]]}"
+            over |= hit >= 0
+        stopped = arms.end() | over
         smooth[now] = reward[now]
         if arms.speeds is not None:
             rate = np.diff(arms.speeds, axis=1, prepend=0.0) * task.ctrl_hz
@@ -111,8 +121,15 @@ def rollout(
     q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
     return Episodes(
         t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward, reward_smooth=smooth,
-        q_left=q_left, limited=limited,
+        q_left=q_left, limited=limited, collision=np.array(collision),
     )  # fmt: skip
+
+
+def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
+    """Return the state in which arms whose episode is `over` (m,) have stayed as they were: q, dq, ee and tau."""
+    names, here = ("q", "dq", "ee", "tau"), over[:, None]
+    kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
+    return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
 
 
 def measures(episodes: Episodes) -> dict[str, float]:
@@ -125,6 +142,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
     had first been within, mean of those that had. rest: share of episodes in which every joint is slower than REST
     for the whole last 0.5 s: a hand can lie on a joint's axis. q_left_rad: how close joints come to position limits,
     the 5 % quantile over episodes. limited: share of the cycles in which the driver's law changed what was asked for.
+    collision: share of episodes that ended because the arm touched itself or the table.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -152,6 +170,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
         "rest": float((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST).mean()),
         "q_left_rad": float(np.quantile(episodes.q_left, 0.05)),
         "limited": float(episodes.limited.mean()),
+        "collision": float((episodes.collision != "").mean()),
     }
 
 

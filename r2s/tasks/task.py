@@ -52,6 +52,7 @@ class Episodes:
         reward_smooth: (E, T), the same with the noise of the speeds taken out, where an arm measured them.
         q_left: (E,) rad, how close any joint came to a position limit.
         limited: (E,), in which share of the cycles the driver's law changed what was asked for.
+        collision: (E,) words: when it touched what, which ended it; "" where it touched nothing.
     """
 
     t: np.ndarray
@@ -65,6 +66,7 @@ class Episodes:
     reward_smooth: np.ndarray
     q_left: np.ndarray
     limited: np.ndarray
+    collision: np.ndarray
 
 
 class Task(Protocol):
