@@ -33,8 +33,8 @@ def rooms() -> str:
     """Return the page that lists the rooms."""
     rows = [f"| [`r2s.{name}`]({name}.md) | {words} |" for name, words in ROOMS.items()]
     words = (
-        "From the docstrings. A module imports only from its own room and from rooms above it in this table. Arrays are "
-        "NumPy's unless a signature says otherwise; shapes and units stand in the text."
+        "From the docstrings. A module imports only from its own room and from rooms above it in this table. Arrays "
+        "are NumPy's unless a signature says otherwise; shapes and units stand in the text."
     )
     return "\n".join(["# API", "", words, "", "| room | what is in it |", "|---|---|", *rows, ""])
 
@@ -45,4 +45,5 @@ def room(name: str) -> str:
     paths = sorted(at.rglob("*.py")) if at.is_dir() else [at.with_suffix(".py")]
     modules = [".".join(p.relative_to(ROOT).with_suffix("").parts) for p in paths if p.name != "__init__.py"]
     words = ROOMS[name][0].upper() + ROOMS[name][1:]
-    return "\n".join(["---", f"title: {name}", "---", f"# `r2s.{name}`", "", f"{words}.", "", *(f"::: {m}\n" for m in modules)])
+    head = ["---", f"title: {name}", "---", f"# `r2s.{name}`", "", f"{words}.", ""]
+    return "\n".join([*head, *(f"::: {module}\n" for module in modules)])
