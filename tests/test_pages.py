@@ -16,15 +16,13 @@ from test_cli import TOY, recording, server, succeed  # noqa: F401 (fixtures)
 from test_extending import EXAMPLES
 
 DOCS = ROOT / "docs"
-PAGES = [
-    ROOT / "README.md",
-    *(p for p in sorted(DOCS.glob("*.md")) if p.name != "extending.md"),
-]  # it has its own test
+OWN = "extending.md"  # test_extending.py types it
+PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.glob("*.md")) if p.name != OWN)]
 PROGRAM = r"(?:python|r2s|make|pip|pytest|rerun|source|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) "
 ELSEWHERE = {  # what this file does not type, and why
     r"make \w+": "sets up from the network; what it then does is stage=pipeline, these tests, the site below",
     r"pip install": "from the network",
-    r"(source|rerun|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) ": "the shell, and others' programs, which show and wait",
+    r"(source|rerun|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) ": "the shell; programs of others, which wait",
     r"python benchmarks/": "takes minutes to hours; its page names the machine that it ran on",
     r"python( -m r2s| run.py)$": "names of doors: test_wheel.py, and every other command",
     r"r2s (list|look)$": "names of commands: test_look.py",
@@ -47,7 +45,7 @@ def commands(page: Path) -> list[str]:
     return list(dict.fromkeys([*in_blocks(page), *inline]))
 
 
-LISTED = set(in_blocks(DOCS / "commands.md"))  # test_cli.py runs them
+LISTED = set(in_blocks(DOCS / "commands.md"))  # test_cli.py types them, test_look.py list and look
 TYPED = {
     page: [c for c in commands(page) if c not in LISTED and not any(re.match(k, c) for k in ELSEWHERE)]
     for page in PAGES
