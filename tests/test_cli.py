@@ -265,6 +265,20 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
     assert len(parameters["phi1"]["identifiable"]) == 7
 
 
+def test_every_number_and_figure_is_explained(trained, identified):
+    """docs/numbers.md names what summaries and metrics.csv hold, the sections of a report, and the figures."""
+    page = (ROOT / "docs" / "numbers.md").read_text()
+    named, rows = set(re.findall(r"`(\w+)`", page)), set(re.findall(r"^\| ([^`|]+?) \|", page, flags=re.M))
+    summary, errors = (json.loads((f / "summary.json").read_text()) for f in (trained, identified))
+    head = (trained / "metrics.csv").read_text().splitlines()[0].split(",")
+    clock = {"env_steps", "updates", "wall_clock_s"}
+    known = named | clock | {f"nominal_{name}" for name in named} | {f"weight_{k}" for k in range(4)}
+    assert {*summary["best"], *errors["validation"], *head} - known == set()
+    assert {p.stem for f in (trained, identified) for p in (f / "figures").glob("*.png")} <= named
+    sections = re.findall(r"^## (.+)", (identified / "report.md").read_text(), flags=re.M)
+    assert set(sections) <= rows
+
+
 def test_exported_policy_is_the_trained_policy(trained):
     """policy.onnx gives the torques of policy.pt, within 1e-5 of their scale, and carries what a driver needs."""
     import onnxruntime
