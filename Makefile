@@ -1,11 +1,11 @@
 # make run: everything on the embedded twin. make test: lint and tests. Both set up what is missing first.
-# make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
+# make docs: the site, strictly, into site/. make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test test-slow test-portable lint format bench setup clean
+.PHONY: run test test-slow test-portable lint format bench docs setup clean
 
 run: $(READY)
 	$(BIN)/python run.py stage=pipeline
@@ -31,6 +31,11 @@ format: $(READY)
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py
 
+docs: $(READY)
+	@$(BIN)/python -c 'import mkdocs, mkdocstrings_handlers.python' 2> /dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open site/index.html"
+
 setup: $(READY)
 
 # The pins of constraints.txt are what the tests were seen to pass with. `torch==2.13.0` is whatever build the user's
@@ -44,4 +49,4 @@ $(READY): pyproject.toml constraints.txt
 	@touch $(READY)
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache *.egg-info
+	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache *.egg-info

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from r2s.physics.robot import Robot
 from r2s.reporting.colours import KNOWN
 from r2s.reporting.log_rows import without_pauses
 from r2s.reporting.viewer import GOAL
@@ -59,9 +60,9 @@ def trace(start: np.ndarray, direction: np.ndarray, shapes: list, far: float) ->
     return start + way[:, None] * direction, way < far
 
 
-def shapes_at(q: np.ndarray, tint: str) -> list:
+def shapes_at(q: np.ndarray, tint: str, robot: Robot = ROBOT) -> list:
     """Return the capsules and cylinders of the arm at q (n,) rad: kind, size, position, rotation, colour."""
-    model = ROBOT.model(gravity=False)
+    model = robot.model(gravity=False)
     data = mujoco.MjData(model)
     data.qpos[:] = q
     mujoco.mj_forward(model, data)
@@ -72,18 +73,20 @@ def shapes_at(q: np.ndarray, tint: str) -> list:
     return [(model.geom_type[g], model.geom_size[g], data.geom_xpos[g], rotation[g], colour[g]) for g in shown]
 
 
-def frame_of(poses: np.ndarray) -> tuple[float, float, float, float]:
+def frame_of(poses: np.ndarray, robot: Robot = ROBOT) -> tuple[float, float, float, float]:
     """Return left, right, bottom and top, m from the foot of the arm, of what shows poses (K, n) rad."""
-    at = np.array([position for q in poses for _, _, position, _, _ in shapes_at(q, "w")])
+    at = np.array([position for q in poses for _, _, position, _, _ in shapes_at(q, "w", robot)])
     (left, bottom), (right, top) = (f(np.stack([at @ RIGHT, at @ UP], -1), axis=0) for f in (np.min, np.max))
     return left - MARGIN, right + MARGIN, bottom - MARGIN, top + MARGIN
 
 
-def picture(q: np.ndarray, tint: str, frame: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def picture(
+    q: np.ndarray, tint: str, frame: tuple, robot: Robot = ROBOT, pixels: float = PIXELS_PER_M
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what is seen of one pose: (H, W, 3) colours, (H, W) whether it is the arm, (H, W) light on the floor."""
-    shapes = shapes_at(q, tint)
+    shapes = shapes_at(q, tint, robot)
     left, right, bottom, top = frame
-    x, y = (np.arange(a, b, 1 / PIXELS_PER_M) for a, b in ((left, right), (bottom, top)))
+    x, y = (np.arange(a, b, 1 / pixels) for a, b in ((left, right), (bottom, top)))
     u, v = (grid.ravel() for grid in np.meshgrid(x, y[::-1]))
     start = u[:, None] * RIGHT + v[:, None] * UP + 3 * EYE
     hit, arm = trace(start, -EYE, shapes, 6.0)

@@ -4,6 +4,7 @@ Also here: at the end of a session nothing that it started may still run.
 """
 
 import os
+import re
 import time
 import uuid
 from pathlib import Path
@@ -34,6 +35,13 @@ def conf(path: str) -> dict:
         document |= {k: panda[k] for k in of_the_task}
     beside = {"_target_", "defaults", *of_the_task} if group == "robot" else {"_target_"}
     return {k: v for k, v in document.items() if k not in beside} if isinstance(document, dict) else document
+
+
+def in_blocks(page: Path) -> list[str]:
+    """Return the commands in a page's ```bash blocks, a line each, without comments."""
+    blocks = re.findall(r"^```bash\n(.*?)^```", page.read_text(), flags=re.S | re.M)
+    lines = [re.sub(r"(^| +)# .*", "", line).strip() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if line]
 
 
 @pytest.fixture(scope="session")

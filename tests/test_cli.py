@@ -1,4 +1,4 @@
-"""The front door: the README's own commands at toy size, and a user's mistakes."""
+"""The front door: the commands of docs/commands.md at toy size, and a user's mistakes."""
 
 import fcntl
 import json
@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import REAL, ROOT, conf
+from conftest import REAL, ROOT, conf, in_blocks
 
 from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
@@ -177,12 +177,6 @@ def stopped(root) -> Path:
     return folder
 
 
-def readme_commands() -> list[str]:
-    blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.S)
-    lines = [line for block in blocks for line in block.splitlines()]
-    return [line.removeprefix("python run.py ") for line in lines if line.startswith("python run.py")]
-
-
 def test_a_resumed_identification_ends_where_an_uninterrupted_one_does(stopped, identified):
     """Killed, then `resume=`: the same numbers in every file that holds results; resumed again it is refused."""
     succeed(f"resume={stopped}")
@@ -220,9 +214,12 @@ def test_the_grid_is_what_its_file_says(tmp_path):
     assert all((tmp_path / "train" / name / "policy.onnx").is_file() for name in names)
 
 
-@pytest.mark.parametrize("command", [c for c in readme_commands() if not c.startswith(("resume=", "list", "look"))])
-def test_readme_command(command, root, recording, trained, identified):
-    """Every `python run.py` line of the README ends well and says where its files are."""
+COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / "commands.md")]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if not c.startswith(("resume=", "list", "look"))])
+def test_command(command, root, recording, trained, identified):
+    """Every `python run.py` line of docs/commands.md ends well and says where its files are."""
     command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))
     command = command.replace("TRAIN_FOLDER", str(trained)).replace("runs/train", f"{root}/train")
     command = command.replace("budget.minutes=4", "budget.minutes=0.05")
@@ -266,6 +263,20 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
     assert set(parameters) == {"phi1", "phi2", "phi3", "inertia_scale", "offset", "delay"}
     assert parameters["phi1"]["unit"] == "Nm"
     assert len(parameters["phi1"]["identifiable"]) == 7
+
+
+def test_every_number_and_figure_is_explained(trained, identified):
+    """docs/numbers.md names what summaries and metrics.csv hold, the sections of a report, and the figures."""
+    page = (ROOT / "docs" / "numbers.md").read_text()
+    named, rows = set(re.findall(r"`(\w+)`", page)), set(re.findall(r"^\| ([^`|]+?) \|", page, flags=re.M))
+    summary, errors = (json.loads((f / "summary.json").read_text()) for f in (trained, identified))
+    head = (trained / "metrics.csv").read_text().splitlines()[0].split(",")
+    clock = {"env_steps", "updates", "wall_clock_s"}
+    known = named | clock | {f"nominal_{name}" for name in named} | {f"weight_{k}" for k in range(4)}
+    assert {*summary["best"], *errors["validation"], *head} - known == set()
+    assert {p.stem for f in (trained, identified) for p in (f / "figures").glob("*.png")} <= named
+    sections = re.findall(r"^## (.+)", (identified / "report.md").read_text(), flags=re.M)
+    assert set(sections) <= rows
 
 
 def test_exported_policy_is_the_trained_policy(trained):
@@ -653,7 +664,7 @@ def test_help_does_not_import_torch():
 @pytest.mark.slow  # test_identify.py has it without the command
 @pytest.mark.skipif(not REAL.is_file(), reason="the real Panda recording is not beside this checkout")
 def test_real_panda_is_predicted_better_than_by_the_published_model(tmp_path):
-    """The README's command on the real recording: held-out torque improves on average over the joints."""
+    """The command on the real recording: held-out torque improves on average over the joints."""
     succeed(
         "stage=identify",
         "data=recording",
