@@ -105,8 +105,7 @@ def arm_of(exported: Exported, **other: Any) -> dict[str, Any]:
 
 
 def hostile(robot: Robot, task: ReachTask, cycles: int) -> dict[str, np.ndarray]:
-    """Return states and targets that no driver should meet: (cycles, n) each, which of the targets are said, and where
-    motions begin.
+    """Return states and targets (cycles, n) that no driver should meet, which are said, and where motions begin.
 
     Joints jump beyond their limits and their speeds, a few values are not finite, targets come, go and are anything,
     and what the arm applied last is not always what was sent (that is NaN here).
@@ -228,7 +227,7 @@ def test_the_runtime_does_what_r2s_does_for_ten_thousand_cycles(exported, runtim
 CHECK = """
 #include <cstdio>
 #include "law.hpp"
-int main() {  // q, dq, tau_J_d, target, goal, whether it is said, whether a motion begins; torque and observation back
+int main() {  // q, dq, tau_J_d, target, goal, is it said, does a motion begin; torque and observation back
   constexpr int n = law::n;
   law::Driver driver;
   double x[4 * n + 5];
@@ -316,17 +315,26 @@ def swap(values: list) -> None:
     values[0], values[1] = values[1], values[0]
 
 
+def limit(contract: dict, name: str, joint: int, value: float) -> None:
+    """Change a limit of a joint wherever the contract says it."""
+    own, rows = contract["law"]["joint"], {**contract["torque"], **contract["limits"]}
+    in_law = {"max_Nm": "tau_max", "max_rate_Nm_per_s": "step", "asked_for_Nm": "asked", "dq_max_rad_per_s": "dq_max"}
+    rows[name][joint - 1] = value
+    own[in_law[name]][joint - 1] = value * (contract["law"]["number"]["cycle_s"] if in_law[name] == "step" else 1)
+
+
 MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a joint too many": (lambda c: c["joints"].append("joint8"), "of 7 joints, the arm has 8"),
     "another order": (lambda c: swap(c["joints"]), "joint 1 of the arm is 'joint1', of the bundle 'joint2'"),
     "another policy rate": (lambda c: c["rates"].update(policy_hz=100), "says policy_hz '100', policy.onnx '50'"),
     "another cycle": (lambda c: c["rates"].update(cycle_hz=500), "in a cycle of 500 Hz"),
-    "a torque limit": (lambda c: swap(c["torque"]["max_Nm"][3:5]) or c["torque"]["max_Nm"].__setitem__(4, 87.0), "tau_max of joint 5"),
-    "a lower torque limit": (lambda c: c["torque"]["max_Nm"].__setitem__(0, 50.0), "says torque_max_Nm"),
-    "a torque rate": (lambda c: c["torque"]["max_rate_Nm_per_s"].__setitem__(2, 2e3), "dtau_max of joint 3"),
-    "a speed limit": (lambda c: c["limits"]["dq_max_rad_per_s"].__setitem__(1, 9.0), "dq_max of joint 2"),
+    "a torque limit": (lambda c: limit(c, "max_Nm", 5, 87.0), "tau_max of joint 5"),
+    "a limit of the law alone": (lambda c: c["law"]["joint"]["tau_max"].__setitem__(4, 87.0), "law.joint.tau_max is"),
+    "a lower torque limit": (lambda c: limit(c, "max_Nm", 1, 50.0), "says torque_max_Nm"),
+    "a torque rate": (lambda c: limit(c, "max_rate_Nm_per_s", 3, 2e3), "dtau_max of joint 3"),
+    "a speed limit": (lambda c: limit(c, "dq_max_rad_per_s", 2, 9.0), "dq_max of joint 2"),
     "a position limit": (lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0), "q_min of joint 4 is -3.07"),
-    "what an action asks for": (lambda c: c["torque"]["asked_for_Nm"].__setitem__(0, 20.0), "torque_scale_Nm"),
+    "what an action asks for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "torque_scale_Nm"),
     "the convention": (lambda c: c["torque"].update(convention="with gravity"), "torque 'with gravity'"),
     "a missing link": (lambda c: c["model"]["links"].pop(), "model.links is of 6 joints"),
     "a missing row of the law": (lambda c: c["law"]["joint"].pop("most"), "damaged: KeyError 'most'"),
@@ -419,7 +427,7 @@ def test_states_of_another_size_are_refused(exported, runtime):
 
 
 def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
-    """A bundle that is there, a run that is none, a controller, a policy.onnx that is another, a task without words."""
+    """A bundle that is there, a run that is none, a controller, another policy.onnx, a task without words."""
 
     def refused(words: str, run: Path, *more: str) -> None:
         with pytest.raises(UserError, match=words):

@@ -103,7 +103,7 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
         seen_ = " ".join(str(error).split())[:100]
         raise UserError(f"export: {source / 'policy.onnx'} is damaged ({seen_})") from None
     if not off.max() < SAME:
-        raise UserError(f"export: policy.onnx of {source} is not its policy.pt: torques differ by {off.max():.2g} of 1")
+        raise UserError(f"export: policy.onnx of {source} is not its policy.pt: actions differ by {off.max():.2g}")
 
 
 def one_file() -> str:

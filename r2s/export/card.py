@@ -33,10 +33,10 @@ def card(
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
     title = f"{config['algo']['name']} for {contract['robot']}, {source.name}"
     head: list[Item] = [
-        f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}; the driver's law makes "
-        f"of it what an arm may be sent at {rates['cycle_hz']} Hz. contract.json says all of it in numbers.",
-        "It reaches points and stays there. It knows nothing of what stands around the arm, of people, and of its own "
-        "links: it may reach through itself.",
+        f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}; the driver's law "
+        f"makes of it what an arm may be sent at {rates['cycle_hz']} Hz. contract.json says all of it in numbers.",
+        "It reaches points and stays there. It knows nothing of what stands around the arm, of people, and of its "
+        "own links: it may reach through itself.",
     ]
     best = summary["best"]
     trained: list[Item] = [
@@ -56,7 +56,11 @@ def card(
     for place, row in measured.items():
         rows[place] = row
     done: list[Item] = [reach_rows({k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})]
-    stops = [f"{place}: stopped in {row['stops']} of {row['asked']} episodes" for place, row in measured.items() if row.get("stops")]
+    stops = [
+        f"{place}: stopped in {row['stops']} of {row['asked']} episodes"
+        for place, row in measured.items()
+        if row.get("stops")
+    ]
     if stops:
         done.append(stops)
     names = {place.split(" ")[0] for place in measured}
@@ -64,16 +68,18 @@ def card(
     arms = [p for p in missing if p in ("panda", "fr3")]
     untried: list[Item] = [f"Not tried: {', '.join(missing)}." if missing else "It was tried wherever r2s can."]
     if arms:
-        untried.append("No arm of metal has run it: begin as docs/safety.md says, slowly and with a hand on the stop.")
+        untried.append(
+            "No arm of metal has run it: begin as docs/safety.md says, slowly and with a hand on the stop."
+        )
     return {
         title: head,
         "Trained on": trained,
         "Measured": done,
         "Not tried": untried,
         "Limits": [
-            "Goals outside of what contract.json calls `goal.trained`, payloads, contact and other hands were not part "
-            "of the training. The law holds the arm within its limits of torque, speed and position; it does not make "
-            "a motion sensible."
+            "Goals outside of what contract.json calls `goal.trained`, payloads, contact and other hands were not "
+            "part of the training. The law holds the arm within its limits of torque, speed and position; it does "
+            "not make a motion sensible."
         ],
     }
 

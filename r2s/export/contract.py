@@ -4,8 +4,7 @@ Every number of the driver's law stands here, as r2s/physics/limits.py and r2s/a
 none of its own. JSON knows no infinity: null stands for a limit that is not there.
 """
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -67,6 +66,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, A
             "dq_max_rad_per_s": listed(robot.dq_max),
         },
         "observation": observation(robot, task),
+        "start": {"q_rad": listed(robot.q_home), "within_rad": getattr(task, "start_spread", None)},
         "goal": goal(robot, task),
         "model": {
             "gravity": "none: the arm compensates it",
@@ -82,10 +82,10 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
     """Return what is where in an observation: name, unit, what it is made of, and its slice."""
     if not hasattr(task, "layout"):
         raise UserError(
-            f"export: {type(task).__name__} does not say how its observations are made; it needs a method layout(robot) "
-            "-> list of r2s.tasks.task.Entry"
+            f"export: {type(task).__name__} does not say how its observations are made; it needs a method "
+            "layout(robot) -> list of r2s.tasks.task.Entry"
         )
-    says: Says = task
+    says = cast(Says, task)
     entries, at = [], 0
     for e in says.layout(robot):
         if e.of not in MADE_OF:
@@ -96,7 +96,9 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
         entries.append({"name": e.name, "unit": e.unit, "of": e.of} | place)
         at += wide
     if at != len(task.observation_scale(robot)[0]):
-        raise UserError(f"export: {type(task).__name__}.layout is of {at} numbers, its observations have another size")
+        raise UserError(
+            f"export: {type(task).__name__}.layout is of {at} numbers, its observations have another size"
+        )
     words = {"size": at, "dtype": "float32", "history": 0, "preview": 0, "words": task.observed}
     return words | {"normalised": "in policy.onnx", "entries": entries}
 
@@ -129,8 +131,8 @@ def numbers(task: Task) -> dict[str, float]:
     return own | {"damp_s": driver.DAMP_S, "still": driver.STILL, "deadline_s": deadline}
 
 
-def listed(values: np.ndarray | Sequence[float] | float) -> Any:
+def listed(values: Any) -> Any:
     """Return numbers as JSON has them; null where they are not finite."""
     if np.ndim(values) == 0:
-        return float(values) if np.isfinite(values) else None  # type: ignore[arg-type]
-    return [listed(v) for v in values]  # type: ignore[union-attr]
+        return float(values) if np.isfinite(values) else None
+    return [listed(v) for v in values]

@@ -110,7 +110,8 @@ class Driver:
 
     def __init__(self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0):
         self._model, self._number = model, law["number"]
-        self._j = {k: per_joint(v, -np.inf if k in ("q_low", "q_stop_low") else np.inf) for k, v in law["joint"].items()}
+        none = {"q_low": -np.inf, "q_stop_low": -np.inf}
+        self._j = {k: per_joint(v, none.get(k, np.inf)) for k, v in law["joint"].items()}
         self._fade = round(soft_start_s / self._number["cycle_s"])
         self.reset()
 
@@ -211,7 +212,9 @@ class Driver:
         speed = np.minimum(self._share * j["most"], c["approach"] * way)
         slows = (way > 0.0) & np.isfinite(j["slowing"])
         if slows.any():
-            by = np.where(slows, np.sqrt(np.where(slows, j["slowing"] * way, 0.0) + j["offset"] ** 2) - j["offset"], np.inf)
+            by = np.where(
+                slows, np.sqrt(np.where(slows, j["slowing"] * way, 0.0) + j["offset"] ** 2) - j["offset"], np.inf
+            )
             speed = np.minimum(speed, by)
         return speed
 

@@ -99,6 +99,12 @@ def _check(contract: dict[str, Any]) -> None:
             raise BundleError(f"contract.json: {name} is of {len(values)} joints, the arm has {n}")
     if missing := [k for k in LAW_NUMBER if not isinstance(law["number"].get(k), int | float)]:
         raise BundleError(f"contract.json: law.number.{missing[0]} is missing")
+    step = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
+    same = {"tau_max": torque["max_Nm"], "asked": torque["asked_for_Nm"], "step": step}
+    same["dq_max"] = contract["limits"]["dq_max_rad_per_s"]
+    for name, values in same.items():
+        if law["joint"][name] != values:
+            raise BundleError(f"contract.json: law.joint.{name} is {law['joint'][name]}, elsewhere it is {values}")
     if torque["convention"] != CONVENTION:
         raise BundleError(f"contract.json: torque '{torque['convention']}'; this runtime sends it '{CONVENTION}'")
     cycle, policy = rates["cycle_hz"], rates["policy_hz"]
@@ -112,7 +118,7 @@ def _check(contract: dict[str, Any]) -> None:
         wide = size.get(entry["of"], n)
         if entry["of"] not in MADE_OF or entry["slice"] != [at, at + wide]:
             raise BundleError(
-                f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; of {at} on are free"
+                f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; {at} is next"
             )
         at += wide
     if at != seen["size"]:
@@ -128,9 +134,13 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
         if theirs != ours:
             raise BundleError(f"joint {j} of the arm is '{theirs}', of the bundle '{ours}'")
     if arm.cycle_hz != contract["rates"]["cycle_hz"]:
-        raise BundleError(f"the arm's cycle is of {arm.cycle_hz:g} Hz, the bundle's of {contract['rates']['cycle_hz']} Hz")
+        raise BundleError(
+            f"the arm's cycle is of {arm.cycle_hz:g} Hz, the bundle's of {contract['rates']['cycle_hz']} Hz"
+        )
     if arm.torque != contract["torque"]["convention"]:
-        raise BundleError(f"the arm takes torque '{arm.torque}', the bundle gives '{contract['torque']['convention']}'")
+        raise BundleError(
+            f"the arm takes torque '{arm.torque}', the bundle gives '{contract['torque']['convention']}'"
+        )
     limits, torque = contract["limits"], contract["torque"]
     asked = {"q_max": ("rad", limits["q_max_rad"]), "dq_max": ("rad/s", limits["dq_max_rad_per_s"])}
     asked |= {"tau_max": ("Nm", torque["max_Nm"]), "dtau_max": ("Nm/s", torque["max_rate_Nm_per_s"])}
@@ -199,7 +209,9 @@ class Runtime:
         q, dq, tau_J_d, goal = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d, goal))
         if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or goal.shape != (3,):
             shapes = ", ".join(str(x.shape) for x in (q, dq, tau_J_d, goal))
-            raise BundleError(f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and 3 are allowed")
+            raise BundleError(
+                f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and 3 are allowed"
+            )
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the driver's to stop
             self._model.place(q)
             target = None
@@ -241,7 +253,9 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
         if metadata.get(name) != value:
             raise BundleError(f"contract.json says {name} '{value}', policy.onnx '{metadata.get(name)}'")
     if not metadata.get("torque", "").startswith(torque["convention"]):
-        raise BundleError(f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'")
+        raise BundleError(
+            f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'"
+        )
 
 
 def main() -> int:
