@@ -281,6 +281,15 @@ def test_the_loop_for_libfranka_compiles(exported):
     subprocess.run([*command, str(LIBFRANKA / "loop.cpp")], check=True)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
+def test_the_loop_compiles_against_what_it_calls_of_libfranka(exported):
+    """tests/standins declares it, for where the headers themselves are not."""
+    own = ["-I", str(ROOT / "tests" / "standins"), "-I", str(exported.folder)]
+    words = [str(COMPILER), "-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *own]
+    subprocess.run([*words, str(LIBFRANKA / "loop.cpp")], check=True)
+
+
 def test_the_bundle_is_whole(exported, runtime):
     """Every file is in the contract with its digest; the three models are the arm, and the law is in numbers."""
     contract = runtime.load(exported.folder)

@@ -67,6 +67,7 @@ class Policy {
 };
 
 int main(int argc, char** argv) {
+  using law::operator-;
   if (argc != 6) {
     std::fprintf(stderr, "usage: %s ROBOT_ADDRESS POLICY.onnx X Y Z   (goal in m, in the base frame)\n", argv[0]);
     return 2;
