@@ -16,7 +16,7 @@ from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.stages.build import CONF, GROUP, STAGES, loaded, unread
 
 STOPPED = 3  # exit status of a run that a stopped arm has ended
-COMMANDS = ("look", "list")
+COMMANDS = ("look", "list", "export")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
@@ -284,13 +284,15 @@ def main():
 
 
 def command(words: Sequence[str]) -> int:
-    """Do `look` or `list`, which read run folders and compose no config; return the exit status."""
+    """Do one of COMMANDS, which read run folders and compose no config; return the exit status."""
     from r2s.commands import run_command
 
     try:
         run_command(words)
     except UserError as error:
-        return stop(error)
+        return stop(" ".join(str(error).split()))
+    except OSError as error:  # a full disk, a folder that may not be written
+        return stop(f"{error.strerror}{f': {error.filename}' if error.filename else ''}")
     except KeyboardInterrupt:
         return 130
     return 0

@@ -1,4 +1,6 @@
-"""`r2s list` and `r2s look`: commands that read run folders. They compose no config and open no run folder."""
+"""`r2s list`, `r2s look` and `r2s export`: commands that read run folders. They compose no config and open no run
+folder.
+"""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
@@ -30,8 +32,11 @@ def run_command(words: Sequence[str]) -> None:
     looking.add_argument(
         "--port", type=int, default=PORT, help=f"of --web, {PORT} unless told; the next one is used too"
     )
-    typed = parser.parse_args(words)
-    {"list": list_runs, "look": look}[typed.command](typed)
+    exporting = commands.add_parser("export", help="a policy that travels: a bundle that runs without r2s")
+    exporting.add_argument("run", type=Path, metavar="RUN", help="the run folder of a finished training")
+    exporting.add_argument("--to", type=Path, help="the new folder, also to=FOLDER; RUN/bundle unless told")
+    typed = parser.parse_args([f"--{w}" if w.startswith("to=") else w for w in words])
+    {"list": list_runs, "look": look, "export": export}[typed.command](typed)
 
 
 def list_runs(typed: Namespace) -> None:
@@ -74,6 +79,23 @@ def look(typed: Namespace) -> None:
         print(f"no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); --web serves {recording} to a browser")
         for path in pictures:
             print(f"  {path}")
+
+
+def export(typed: Namespace) -> None:
+    """Write the bundle of a trained policy."""
+    from r2s.export.bundle import write_bundle
+    from r2s.learning.policy import load_policy
+    from r2s.stages.build import CONF, is_learner, make_dynamics, make_robot, make_task, plain
+    from r2s.stages.transfer import trained_config
+
+    source, trained = trained_config(Namespace(policy=typed.run))
+    if not is_learner(trained):
+        raise UserError(f"export: {source} is of algo={trained.algo.name}, which is no network that could travel")
+    robot, task = make_robot(trained), make_task(trained)
+    policy, to = load_policy(source, robot, task), typed.to or source / "bundle"
+    places = [path.stem for group in ("simulator", "arm") for path in (CONF / group).glob("*.yaml")]
+    write_bundle(to, source, robot, task, make_dynamics(trained, robot), policy, plain(trained), places)
+    print(f"written: {to}")
 
 
 def whole_run(folder: Path) -> Path:

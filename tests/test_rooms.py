@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     *("errors", "files", "progress", "provenance", "runs", "compiled"),
     *("physics", "recordings", "excitation", "identification", "tasks", "learning", "engines", "arm", "reporting"),
-    *("stages", "commands", "cli", "notebook", "__main__"),
+    *("export", "stages", "commands", "cli", "notebook", "__main__"),
 ]
 SEES_A_CONFIG = ("stages", "commands", "cli", "__main__")
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))

@@ -151,7 +151,10 @@ def identify(
     refused = False
 
     def ended(name: str, search: Search, u: np.ndarray, report: Report = told) -> np.ndarray:
-        return np.asarray(step(name, lambda: {"u": search(problem, u, report)})["u"])
+        u = np.asarray(step(name, lambda: {"u": search(problem, u, report)})["u"])
+        if getattr(search, "level", "") == "torque":  # it weighs as it goes on; one that is remembered does not
+            problem.quick_data.adapt(space.from_unit(u), fitted=True)
+        return u
 
     for k, search in enumerate(searches):
         on_level = getattr(search, "level", "") == "torque"

@@ -69,13 +69,16 @@ class Checkpoint:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+NO_ROOM = ("PytorchStreamWriter", "iostream error", "inline_container.cc")
+
+
 def save_tensors(path: Path, content: dict[str, Any]) -> None:
     """Write a file that appears only once it is whole; raises OSError where there is no room for it."""
     with whole(path) as part:
         try:
             torch.save(content, part)
-        except RuntimeError as error:  # so torch says it
-            if not any(words in str(error) for words in ("PytorchStreamWriter", "iostream error")):
+        except RuntimeError as error:  # so torch says it, from one place of its writer or another
+            if not any(words in str(error) for words in NO_ROOM):
                 raise
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
 

@@ -11,7 +11,7 @@ from r2s.errors import UserError, check_number
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks import rewards
 from r2s.tasks.episode import measures
-from r2s.tasks.task import Episodes, State
+from r2s.tasks.task import Entry, Episodes, State
 
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
@@ -130,6 +130,20 @@ class ReachTask:
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the observations (m, 6 n + 12) float32 of goals (m, 3) m; `torque` (n,) Nm: an action of 1."""
         return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
+
+    def layout(self, robot: Robot) -> list[Entry]:
+        """Return what `observe` puts where, in its order."""
+        return [
+            Entry("q", "rad", "q"),
+            Entry("dq", "rad/s", "dq"),
+            Entry("ee", "m", "ee"),
+            Entry("goal", "m", "goal"),
+            Entry("error", "m", "error"),
+            Entry("effort / torque", "1", "effort", divided_by=tuple(self.torque(robot).tolist())),
+            Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
+            Entry("J'error", "m^2/rad", "pull"),
+            Entry(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
+        ]
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, the distances at the start, at least CLOSE_M."""

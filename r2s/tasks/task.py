@@ -69,6 +69,23 @@ class Episodes:
     collision: np.ndarray
 
 
+@dataclass(frozen=True)
+class Entry:
+    """What a stretch of an observation is, for a program that has to make it without r2s.
+
+    Attributes:
+        name: of it. unit: SI, "1" where it has none.
+        of: what it is made of: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error).
+        divided_by: one number, or one for each element; None: nothing. tanh: whether tanh is taken then.
+    """
+
+    name: str
+    unit: str
+    of: str
+    divided_by: float | tuple[float, ...] | None = None
+    tanh: bool = False
+
+
 class Task(Protocol):
     """What is asked of an arm in episodes of `steps` control steps.
 

@@ -1,0 +1,118 @@
+"""MODEL_CARD.md: what a policy was trained on, where it was measured, and where nobody has tried it."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from r2s.reporting.document import Item
+from r2s.reporting.tables import reach_rows
+
+LEFT_OUT = ("_target_", "name")
+NO_SDF = "Its rotors are in arm.xml and arm.urdf; SDF cannot say them, so there is no arm.sdf."
+
+
+def card(
+    source: Path,
+    config: Mapping[str, Any],
+    meta: Mapping[str, Any],
+    contract: Mapping[str, Any],
+    bundle: Path,
+    places: Sequence[str],
+) -> dict[str, list[Item]]:
+    """Return the sections of the card.
+
+    Args:
+        source: the run folder. config, meta: of it. contract: of the bundle. bundle: where it is being written.
+        places: names of the simulators and arms that there are.
+    """
+    summary = json.loads((source / "summary.json").read_text())
+    rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
+    title = f"{config['algo']['name']} for {contract['robot']}, {source.name}"
+    head: list[Item] = [
+        f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}; the driver's law "
+        f"makes of it what an arm may be sent at {rates['cycle_hz']} Hz. contract.json says all of it in numbers.",
+        "It reaches points and stays there. It knows nothing of what stands around the arm, of people, and of its "
+        "own links: it may reach through itself.",
+    ]
+    best = summary["best"]
+    trained: list[Item] = [
+        [
+            f"algorithm: {settings(config['algo'])}",
+            f"task: {settings(config['task'])}",
+            f"randomization: {settings(config['dr'])}",
+            f"{best['env_steps']:,} steps of the environment, {best['updates']:,} updates; seed {meta.get('seed')}; "
+            f"r2s commit {commit or 'unknown'}",
+            model(source, config),
+        ]
+    ]
+    if not (bundle / "model" / "arm.sdf").is_file():
+        trained.append(NO_SDF)
+    rows = {"MuJoCo, as trained, goals on which nothing was chosen": best}
+    measured = transfers(source)
+    for place, row in measured.items():
+        rows[place] = row
+    done: list[Item] = [reach_rows({k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})]
+    stops = [
+        f"{place}: stopped in {row['stops']} of {row['asked']} episodes"
+        for place, row in measured.items()
+        if row.get("stops")
+    ]
+    if stops:
+        done.append(stops)
+    names = {place.split(" ")[0] for place in measured}
+    missing = sorted(p for p in places if p not in names and p != "none" and p != "mujoco")
+    arms = [p for p in missing if p in ("panda", "fr3")]
+    untried: list[Item] = [f"Not tried: {', '.join(missing)}." if missing else "It was tried wherever r2s can."]
+    if arms:
+        untried.append(
+            "No arm of metal has run it: begin as docs/safety.md says, slowly and with a hand on the stop."
+        )
+    return {
+        title: head,
+        "Trained on": trained,
+        "Measured": done,
+        "Not tried": untried,
+        "Limits": [
+            "Goals outside of what contract.json calls `goal.trained`, payloads, contact and other hands were not "
+            "part of the training. The law holds the arm within its limits of torque, speed and position; it does "
+            "not make a motion sensible."
+        ],
+    }
+
+
+def settings(group: Mapping[str, Any]) -> str:
+    """Return a group of a config as words."""
+    name = group.get("name") or group.get("_target_", "").rsplit(".", 1)[-1]
+    own = (f"{k} {v}" for k, v in group.items() if k not in LEFT_OUT and v is not None)
+    return ", ".join([*([name] if name else []), *own])
+
+
+def model(source: Path, config: Mapping[str, Any]) -> str:
+    """Return where the model that it was trained on comes from."""
+    path = source / "parameters.yaml"
+    if not path.is_file():
+        return f"model: nominal, friction {settings(config['friction'])}; no recording of an arm is in it"
+    said = yaml.safe_load(path.read_text()).get("source", {})
+    return f"model: identified, from {', '.join(f'{k} {v}' for k, v in said.items())} (parameters.yaml)"
+
+
+def transfers(source: Path) -> dict[str, dict[str, Any]]:
+    """Return what the finished transfers of a policy beside it measured: place and run -> its row."""
+    found: dict[str, dict[str, Any]] = {}
+    for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
+        try:
+            meta = json.loads((path.parent / "meta.json").read_text())
+            # a folder may have been moved with its root: the last two names tell
+            parents = [Path(p).resolve().parts[-2:] for p in meta["parents"]]
+            if meta["status"] not in ("done", "stopped") or source.resolve().parts[-2:] not in parents:
+                continue
+            for place, row in json.loads(path.read_text()).items():
+                if place != "predicted" and np.isfinite(row.get("success_1cm", np.nan)):
+                    found[f"{place} ({path.parent.name})"] = row
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue  # not whole, or not ours
+    return found

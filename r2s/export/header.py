@@ -1,0 +1,56 @@
+"""contract.hpp: what a C++ program needs of contract.json, as constants; examples/libfranka includes it."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from r2s.export.law import LINK
+from r2s.export.runtime import MADE_OF
+
+LOWEST = ("q_low", "q_stop_low")  # where null is minus infinity
+
+
+def header(contract: Mapping[str, Any], policy_sha256: str) -> str:
+    """Return a C++17 header: arrays of the model and of the law, and how an observation is made."""
+    model, law, seen, rates = (contract[k] for k in ("model", "law", "observation", "rates"))
+    joints = ", ".join(json.dumps(name) for name in contract["joints"])
+    words = {"robot": contract["robot"], "torque": contract["torque"]["convention"], "policy_sha256": policy_sha256}
+    lines = ["// Written by r2s export from contract.json.", "#pragma once", "#include <cmath>", ""]
+    lines += ["namespace contract {", "", f"constexpr int n = {len(contract['joints'])};"]
+    lines += [f"constexpr const char* {name} = {json.dumps(word)};" for name, word in words.items()]
+    lines += [f"constexpr const char* joints[n] = {{{joints}}};"]
+    lines += [f"constexpr int cycle_hz = {rates['cycle_hz']}, policy_hz = {rates['policy_hz']};"]
+    lines += [f"constexpr double start[n] = {_braced(contract['start']['q_rad'])};  // rad, at rest", ""]
+    lines += [_rows(name, [link[name] for link in model["links"]]) for name in LINK]
+    lines += [f"constexpr double hand[3] = {_braced(model['hand_m'])};"]
+    lines += [f"constexpr double rotors[n] = {_braced(model['rotors'])};", ""]
+    for name, values in law["joint"].items():
+        none = "-INFINITY" if name in LOWEST else "INFINITY"
+        lines.append(f"constexpr double {name}[n] = {_braced(values, none)};  // {law['units'][name]}")
+    lines += [f"constexpr double {name} = {value!r};" for name, value in law["number"].items()]
+    lines += ["", "// an entry of an observation is tanh(of / divided_by), or without tanh"]
+    lines += [f"enum Of {{ {', '.join('of_' + word for word in MADE_OF)} }};"]
+    lines += ["struct Entry { Of of; int begin, count; bool tanh; double divided_by[n > 3 ? n : 3]; };"]
+    lines += [f"constexpr int observations = {seen['size']};", "constexpr Entry entries[] = {"]
+    for e in seen["entries"]:
+        begin, end = e["slice"]
+        by = e["divided_by"] if isinstance(e["divided_by"], list) else [e["divided_by"] or 1.0] * (end - begin)
+        lines.append(f"    {{of_{e['of']}, {begin}, {end - begin}, {str(e['tanh']).lower()}, {_braced(by)}}},")
+    return "\n".join([*lines, "};", "", "}  // namespace contract", ""])
+
+
+def _rows(name: str, values: list[Any]) -> str:
+    """Return the constant of what each link has; a matrix is one row, of a tensor six numbers are."""
+    if name == "frame":
+        values = [[x for row in frame for x in row] for frame in values]
+    elif name == "tensor":
+        values = [[t[0][0], t[1][1], t[2][2], t[0][1], t[0][2], t[1][2]] for t in values]
+    wide = f"[{len(values[0])}]" if isinstance(values[0], list) else ""
+    note = "  // xx yy zz xy xz yz" if name == "tensor" else ""
+    return f"constexpr double {name}[n]{wide} = {_braced(values)};{note}"
+
+
+def _braced(values: Any, none: str = "INFINITY") -> str:
+    if isinstance(values, list):
+        return f"{{{', '.join(_braced(v, none) for v in values)}}}"
+    return none if values is None else repr(values)

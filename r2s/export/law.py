@@ -1,0 +1,238 @@
+"""The driver's law in NumPy, of an arm that a contract describes: a second writing of r2s/physics/limits.py.
+
+It needs nothing of r2s. `r2s export` puts it and runtime.py together into r2s_runtime.py, the one file of a bundle.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
+LAW_JOINT = (
+    *("q_low", "q_high", "q_fade", "most", "slowing", "offset", "dq_max", "added", "tau_max", "step"),
+    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop"),
+)
+LAW_NUMBER = (
+    *("cycle_s", "low_pass", "rate", "approach", "allowed", "nothing", "exact", "dry", "sure", "pivots", "rounds"),
+    *("brake_s", "damp_s", "still", "deadline_s"),
+)
+
+
+def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
+    """Return (n,) of what a contract lists, where null stands for `none`: JSON knows no infinity."""
+    return np.array([none if v is None else v for v in values], dtype=float)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a x b (..., 3); np.cross takes thrice as long."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+
+
+class Model:
+    """The arm's kinematics and dynamics without gravity, from `model` of a contract."""
+
+    def __init__(self, model: dict[str, Any]):
+        self.n = len(model["links"])
+        place, frame, axis, mass, com, tensor = (
+            np.array([link[k] for link in model["links"]], dtype=float).reshape(self.n, *shape)
+            for k, shape in LINK.items()
+        )
+        self._place, self._axis, self._mass, self._com, self._tensor = place, axis, mass, com, tensor
+        along = axis[:, :, None] * axis[:, None, :]
+        skew = np.stack([cross(axis, np.broadcast_to(e, axis.shape)) for e in np.eye(3)], -1)
+        # Rodrigues' rotation by q in the frame of a joint: constant + sin(q) odd + cos(q) even
+        self._constant, self._odd, self._even = frame @ along, frame @ skew, frame @ (np.eye(3) - along)
+        self._hand = np.array(model["hand_m"], dtype=float)
+        self._rotors = np.diag(np.array(model["rotors"], dtype=float))
+        self._before = np.tril(np.ones((self.n, self.n)))[:, :, None]  # whether joint j moves link k: j <= k
+
+    def place(self, q: np.ndarray) -> None:
+        """Take the arm to q (n,) rad."""
+        turn = self._constant + np.sin(q)[:, None, None] * self._odd + np.cos(q)[:, None, None] * self._even
+        self.frame, self.origin = np.empty((self.n, 3, 3)), np.empty((self.n, 3))
+        R, p = np.eye(3), np.zeros(3)
+        for i in range(self.n):
+            p = p + R @ self._place[i]
+            R = R @ turn[i]
+            self.frame[i], self.origin[i] = R, p
+        self.axis = (self.frame @ self._axis[:, :, None])[..., 0]
+
+    def hand(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the end effector (3,) m and its Jacobian (3, n) m/rad."""
+        ee = self.frame[-1] @ self._hand + self.origin[-1]
+        return ee, cross(self.axis, ee - self.origin).T
+
+    def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
+
+        Newton and Euler's for the torque; the sum of J_k^T (m, I)_k J_k over the links k for the matrix.
+        """
+        R, p, z, n = self.frame, self.origin, self.axis, self.n
+        spin = z * dq[:, None]
+        omega = np.cumsum(spin, 0)
+        alpha = np.cumsum(cross(omega - spin, spin), 0)
+        own = (R @ self._com[:, :, None])[..., 0]
+        centre = p + own
+        way = np.diff(p, axis=0)
+        carried = cross(alpha[:-1], way) + cross(omega[:-1], cross(omega[:-1], way))
+        a = cross(alpha, own) + cross(omega, cross(omega, own))
+        a[1:] += np.cumsum(carried, 0)
+        tensor = R @ self._tensor @ R.transpose(0, 2, 1)
+        force = self._mass[:, None] * a
+        turning = (tensor @ omega[:, :, None])[..., 0]
+        moment = (tensor @ alpha[:, :, None])[..., 0] + cross(omega, turning) + cross(centre, force)
+        force, moment = np.cumsum(force[::-1], 0)[::-1], np.cumsum(moment[::-1], 0)[::-1]
+        bias = (z * (moment - cross(p, force))).sum(1)
+        moves = self._before * cross(np.broadcast_to(z, (n, n, 3)), centre[:, None] - p)  # of link k by joint j
+        turns = self._before * np.broadcast_to(z, (n, n, 3))
+        heavy = moves * self._mass[:, None, None]
+
+        def flat(x: np.ndarray) -> np.ndarray:
+            return x.transpose(1, 0, 2).reshape(n, -1)
+
+        mass = flat(heavy) @ flat(moves).T + flat(turns @ tensor) @ flat(turns).T
+        return mass + self._rotors, bias
+
+
+class Driver:
+    """The driver's law, once per cycle: what is sent is within the arm's rules, whatever a policy says.
+
+    Attributes:
+        effort: (n,) Nm, the target as it has come through the low-pass. stopping: why the arm is being brought to
+            rest, or None.
+
+    Args:
+        law: of a contract. model: of the same. soft_start_s: s, over which the torque of a motion fades in.
+    """
+
+    def __init__(self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0):
+        self._model, self._number = model, law["number"]
+        none = {"q_low": -np.inf, "q_stop_low": -np.inf}
+        self._j = {k: per_joint(v, none.get(k, np.inf)) for k, v in law["joint"].items()}
+        self._fade = round(soft_start_s / self._number["cycle_s"])
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a motion, from zero torque."""
+        n = self._model.n
+        self.effort, self._target, self._filtered, self._sent = np.zeros((4, n))
+        self.stopping: str | None = None
+        self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
+
+    @property
+    def done(self) -> bool:
+        """Whether a motion that is being stopped is at rest, or has had its time."""
+        over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
+        return self.stopping is not None and (self._rests or over)
+
+    def __call__(
+        self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, target: np.ndarray | None, placed: bool = False
+    ) -> np.ndarray:
+        """Return the command (n,) Nm of this cycle.
+
+        Args:
+            q, dq: (n,) rad, rad/s, of this cycle. tau_J_d: (n,) Nm, what the arm applied last.
+            target: (n,) Nm that the policy wants; None where it has said nothing.
+            placed: whether the model is at q already.
+        """
+        j, c = self._j, self._number
+        seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
+        if target is not None and np.isfinite(target).all():
+            self._target, self._silent = np.clip(target, -j["asked"], j["asked"]), 0
+        else:
+            self._silent += 1
+        if self.stopping is None:
+            self.stopping = self._reason(q, dq, seen)
+        stopping = self.stopping is not None
+        self._damped += stopping
+        self._rests = seen and bool((np.abs(dq) < c["still"]).all())
+        if stopping:  # from the speed that there is, at once
+            self._target = np.zeros_like(self._target)
+            if seen and self._damped == 1:
+                self._share = min(1.0, float((np.abs(dq) / j["most"]).max()))
+            self._share = max(0.0, self._share - c["cycle_s"] / c["brake_s"])
+        self._cycle += 1
+        wanted = self._target * (self._cycle / self._fade if self._cycle < self._fade else 1.0)
+        self._filtered = self._filtered + c["low_pass"] * (wanted - self._filtered)
+        self.effort = self.effort + np.clip(self._clipped(self._filtered) - self.effort, -j["step"], j["step"])
+        last = tau_J_d if np.isfinite(tau_J_d).all() else self._sent
+        out = np.zeros_like(self.effort)
+        if seen:
+            if not placed:
+                self._model.place(q)
+            out = self._guard(q, dq)
+        self._sent = last + np.clip(self._clipped(out) - last, -j["step"], j["step"])
+        return self._sent.copy()
+
+    def _clipped(self, tau: np.ndarray) -> np.ndarray:
+        return np.clip(tau, -self._j["tau_max"], self._j["tau_max"])
+
+    def _reason(self, q: np.ndarray, dq: np.ndarray, seen: bool) -> str | None:
+        j, c = self._j, self._number
+        if self._silent * c["cycle_s"] > c["deadline_s"]:
+            return f"no finite action for {1e3 * c['deadline_s']:g} ms"
+        if not seen:
+            return "the arm's state is not finite"
+        if (near := (q < j["q_stop_low"]) | (q > j["q_stop_high"])).any():
+            return f"joint {near.argmax() + 1} is at {q[near.argmax()]:.3f} rad, too close to its limit"
+        if (fast := np.abs(dq) > j["dq_stop"]).any():
+            return f"joint {fast.argmax() + 1} is at {dq[fast.argmax()]:.3f} rad/s, too close to its limit"
+        return None
+
+    def _guard(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm nearest to the effort under which no joint accelerates beyond its bounds."""
+        j, c = self._j, self._number
+        near = max(
+            float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
+            float((np.maximum(q - j["q_high"], j["q_low"] - q) / j["q_fade"]).max()),
+        )
+        out = (1.0 - min(max(near, 0.0), 1.0)) * self.effort
+        mass, bias = self._model.equations(dq)
+        mobility = np.linalg.inv(mass + np.diag(j["added"]))
+        ddq = mobility @ (out - bias)
+        high = c["rate"] * (self._allowed(j["q_high"] - q) - dq)
+        low = -c["rate"] * (self._allowed(q - j["q_low"]) + dq)
+        if ((low <= ddq) & (ddq <= high)).all():
+            return out
+        light = (j["friction"] > 0.0) & (j["added"] > 0.0)
+        held = np.where(light, j["friction"], 1.0)
+        eaten = np.where(light, c["sure"] * held * np.abs(np.tanh(dq / c["dry"] + out / held)), 0.0)
+        wider = np.abs(mobility) @ eaten
+        low, high = low - wider, high + wider
+        if ((low <= ddq) & (ddq <= high)).all():
+            return out
+        return out + self._push(mobility, ddq, low, high)
+
+    def _allowed(self, way: np.ndarray) -> np.ndarray:
+        """Return (n,) rad/s, how fast joints may go that have `way` (n,) rad left."""
+        j, c = self._j, self._number
+        speed = np.minimum(self._share * j["most"], c["approach"] * way)
+        slows = (way > 0.0) & np.isfinite(j["slowing"])
+        if slows.any():
+            by = np.where(
+                slows, np.sqrt(np.where(slows, j["slowing"] * way, 0.0) + j["offset"] ** 2) - j["offset"], np.inf
+            )
+            speed = np.minimum(speed, by)
+        return speed
+
+    def _push(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the torques (n,) Nm that stops at the joints would add: block principal pivoting."""
+        c = self._number
+        side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
+        push = np.zeros_like(ddq)
+        for turn in range(c["rounds"]):
+            at = np.flatnonzero(side)
+            push = np.zeros_like(ddq)
+            push[at] = np.linalg.solve(mobility[np.ix_(at, at)], np.where(side > 0, high, low)[at] - ddq[at])
+            reached = ddq + mobility @ push
+            free = np.where(reached > high + c["exact"], 1, np.where(reached < low - c["exact"], -1, 0))
+            other = np.where(side == 0, free, np.where(side * push > 0.0, 0, side))  # none pulls outwards
+            changed = np.flatnonzero(other != side)
+            if not len(changed):
+                break
+            changed = changed if turn < c["pivots"] else changed[-1:]
+            side[changed] = other[changed]
+        return push

@@ -1,0 +1,277 @@
+"""A bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, and nothing of r2s.
+
+    python r2s_runtime.py BUNDLE         is it whole, and what does it want of an arm?
+
+    runtime = Runtime("BUNDLE", Arm(joints=[...], cycle_hz=1000, torque="without gravity", ...))
+    runtime.reset()                      # at rest, before a motion
+    while not runtime.done:              # every millisecond
+        tau = runtime(q, dq, tau_J_d, goal)
+
+What the bundle wants stands in its contract.json. What does not fit it is a BundleError of one line.
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r2s.export.law import LAW_JOINT, LAW_NUMBER, Driver, Model, per_joint
+
+FORMAT = 1
+CONVENTION = "without gravity"
+# what an entry of an observation may be made of; `pull` is J^T error
+MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
+
+
+class BundleError(ValueError):
+    """Why a bundle does not run here, in one line."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What the arm is that a bundle is to run on; the bundle is refused where it was made for another.
+
+    Attributes:
+        joints: their names, from the base on. cycle_hz: of its torque commands.
+        torque: "without gravity" where the arm adds its own compensation of gravity, as libfranka's do.
+        q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. One for each joint: what the arm allows.
+    """
+
+    joints: Sequence[str]
+    cycle_hz: float
+    torque: str
+    q_min: Sequence[float]
+    q_max: Sequence[float]
+    dq_max: Sequence[float]
+    tau_max: Sequence[float]
+    dtau_max: Sequence[float]
+
+
+def seal_of(contract: dict[str, Any]) -> str:
+    """Return the digest of all that a contract says."""
+    said = {k: v for k, v in contract.items() if k != "seal"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def load(folder: str | Path) -> dict[str, Any]:
+    """Return the contract of a bundle that is whole.
+
+    Raises:
+        BundleError: a file is missing or was changed, or the contract says what cannot be.
+    """
+    path = Path(folder) / "contract.json"
+    try:
+        contract = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BundleError(f"{path} cannot be read: {error}") from None
+    if not isinstance(contract, dict) or contract.get("format") != FORMAT:
+        seen = contract.get("format") if isinstance(contract, dict) else None
+        raise BundleError(f"{path} is of format {seen!r}; this runtime reads {FORMAT}")
+    try:
+        for name, digest in contract["files"].items():
+            file = Path(folder) / name
+            if not file.is_file():
+                raise BundleError(f"{name} is missing in {folder}")
+            if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
+                raise BundleError(f"{name} is not what was exported: its sha256 is another")
+        _check(contract)
+        if contract["seal"] != seal_of(contract):
+            raise BundleError("contract.json is not what was exported: its seal is another")
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise BundleError(f"contract.json is damaged: {type(error).__name__} {error}") from None
+    return contract
+
+
+def _check(contract: dict[str, Any]) -> None:
+    """Raise BundleError where a contract says what cannot be, or what this runtime does not do."""
+    n, rates, torque, seen = len(contract["joints"]), contract["rates"], contract["torque"], contract["observation"]
+    law, model = contract["law"], contract["model"]
+    lists = {f"limits.{k}": v for k, v in contract["limits"].items()} | {"model.links": model["links"]}
+    lists |= {f"torque.{k}": torque[k] for k in ("max_Nm", "max_rate_Nm_per_s", "asked_for_Nm")}
+    lists |= {f"law.joint.{k}": law["joint"][k] for k in LAW_JOINT} | {"model.rotors": model["rotors"]}
+    for name, values in lists.items():
+        if len(values) != n:
+            raise BundleError(f"contract.json: {name} is of {len(values)} joints, the arm has {n}")
+    if missing := [k for k in LAW_NUMBER if not isinstance(law["number"].get(k), int | float)]:
+        raise BundleError(f"contract.json: law.number.{missing[0]} is missing")
+    step = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
+    same = {"tau_max": torque["max_Nm"], "asked": torque["asked_for_Nm"], "step": step}
+    same["dq_max"] = contract["limits"]["dq_max_rad_per_s"]
+    for name, values in same.items():
+        if law["joint"][name] != values:
+            raise BundleError(f"contract.json: law.joint.{name} is {law['joint'][name]}, elsewhere it is {values}")
+    if torque["convention"] != CONVENTION:
+        raise BundleError(f"contract.json: torque '{torque['convention']}'; this runtime sends it '{CONVENTION}'")
+    cycle, policy = rates["cycle_hz"], rates["policy_hz"]
+    if cycle != round(1 / law["number"]["cycle_s"]) or policy <= 0 or cycle % policy:
+        raise BundleError(f"contract.json: a policy of {policy} Hz in a cycle of {cycle} Hz; the law's is of 1000 Hz")
+    for what in ("history", "preview"):
+        if seen[what]:
+            raise BundleError(f"contract.json: observations of {what} {seen[what]}; this runtime has none to give")
+    at, size = 0, {"ee": 3, "goal": 3, "error": 3}
+    for entry in seen["entries"]:
+        wide = size.get(entry["of"], n)
+        if entry["of"] not in MADE_OF or entry["slice"] != [at, at + wide]:
+            raise BundleError(
+                f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; {at} is next"
+            )
+        at += wide
+    if at != seen["size"]:
+        raise BundleError(f"contract.json: {at} observations in all, and {seen['size']} as it says")
+
+
+def fits(contract: dict[str, Any], arm: Arm) -> None:
+    """Raise BundleError where a bundle was made for another arm, or asks for more than this one allows."""
+    own, n = contract["joints"], len(contract["joints"])
+    if len(arm.joints) != n:
+        raise BundleError(f"the arm has {len(arm.joints)} joints, the bundle is of {n}")
+    for j, (theirs, ours) in enumerate(zip(arm.joints, own, strict=True), 1):
+        if theirs != ours:
+            raise BundleError(f"joint {j} of the arm is '{theirs}', of the bundle '{ours}'")
+    if arm.cycle_hz != contract["rates"]["cycle_hz"]:
+        raise BundleError(
+            f"the arm's cycle is of {arm.cycle_hz:g} Hz, the bundle's of {contract['rates']['cycle_hz']} Hz"
+        )
+    if arm.torque != contract["torque"]["convention"]:
+        raise BundleError(
+            f"the arm takes torque '{arm.torque}', the bundle gives '{contract['torque']['convention']}'"
+        )
+    limits, torque = contract["limits"], contract["torque"]
+    asked = {"q_max": ("rad", limits["q_max_rad"]), "dq_max": ("rad/s", limits["dq_max_rad_per_s"])}
+    asked |= {"tau_max": ("Nm", torque["max_Nm"]), "dtau_max": ("Nm/s", torque["max_rate_Nm_per_s"])}
+    asked["q_min"] = "rad", limits["q_min_rad"]
+    for name, (unit, most) in asked.items():
+        allowed = np.array(getattr(arm, name), dtype=float)
+        sign = -1.0 if name == "q_min" else 1.0
+        wanted = per_joint(most, sign * np.inf)
+        if allowed.shape != (n,):
+            raise BundleError(f"{name} of the arm has {allowed.size} values, the bundle is of {n} joints")
+        if (beyond := ~(sign * allowed >= sign * wanted)).any():
+            j = int(beyond.argmax())
+            raise BundleError(
+                f"{name} of joint {j + 1} is {allowed[j]:g} {unit} at the arm; the bundle goes to {wanted[j]:g}"
+            )
+
+
+class Runtime:
+    """A policy and its driver: joint states in, the torque of each cycle out.
+
+    Attributes:
+        contract: what the bundle says. driver: see there.
+
+    Args:
+        folder: the bundle. arm: what it is to run on. soft_start_s: s, over which the torque of a motion fades in.
+
+    Raises:
+        BundleError: the bundle is not whole, is of another arm, or its policy is not what its contract says.
+    """
+
+    def __init__(self, folder: str | Path, arm: Arm, soft_start_s: float = 0.0):
+        import onnxruntime
+
+        self.contract = contract = load(folder)
+        fits(contract, arm)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # others would be waited for
+        try:
+            policy = onnxruntime.InferenceSession(str(Path(folder) / "policy.onnx"), options)
+        except Exception as error:  # of many kinds
+            raise BundleError(f"policy.onnx cannot be loaded: {' '.join(str(error).split())}") from None
+        agree(contract, policy.get_modelmeta().custom_metadata_map)
+        self._policy, self._model = policy, Model(contract["model"])
+        self.driver = Driver(contract["law"], self._model, soft_start_s)
+        self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
+        self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a motion, from rest and zero torque."""
+        self.driver.reset()
+        self._cycle = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the driver has brought the arm to rest; `driver.stopping` says why."""
+        return self.driver.done
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm to send in this cycle.
+
+        Args:
+            q, dq: (n,) rad, rad/s, as the arm measures them. tau_J_d: (n,) Nm, what it applied last.
+            goal: (3,) m in the base frame, finite.
+        """
+        q, dq, tau_J_d, goal = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d, goal))
+        if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or goal.shape != (3,):
+            shapes = ", ".join(str(x.shape) for x in (q, dq, tau_J_d, goal))
+            raise BundleError(
+                f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and 3 are allowed"
+            )
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the driver's to stop
+            self._model.place(q)
+            target = None
+            if self._cycle % self._every == 0:
+                seen = self.observe(q, dq, goal)
+                target = self.act(seen) if np.isfinite(seen).all() else None
+            self._cycle += 1
+            return self.driver(q, dq, tau_J_d, target, placed=True)
+
+    def observe(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Return the observation (d,) float32 of the arm that the model has been placed at."""
+        ee, jacobian = self._model.hand()
+        error = goal - ee
+        made = {"q": q, "dq": dq, "ee": ee, "goal": goal, "error": error, "effort": self.driver.effort}
+        made["pull"] = jacobian.T @ error
+        scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
+        parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
+        return np.concatenate(parts).astype(np.float32)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm that the policy wants at an observation (d,)."""
+        return self._policy.run(["torque"], {"observation": observation[None]})[0][0].astype(float)
+
+
+def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
+    """Raise BundleError where policy.onnx says another thing of itself than the contract."""
+    limits, torque, rates = contract["limits"], contract["torque"], contract["rates"]
+
+    def words(values: Sequence[float | None], none: str = "inf") -> str:
+        return " ".join(none if v is None else f"{v:g}" for v in values)
+
+    said = {"joints": " ".join(contract["joints"]), "observation": contract["observation"]["words"]}
+    said |= {"policy_hz": str(rates["policy_hz"]), "low_pass_hz": str(rates["low_pass_hz"])}
+    said |= {"q_min_rad": words(limits["q_min_rad"], "-inf"), "q_max_rad": words(limits["q_max_rad"])}
+    said |= {"dq_max_rad_per_s": words(limits["dq_max_rad_per_s"]), "torque_max_Nm": words(torque["max_Nm"])}
+    said["torque_rate_max_Nm_per_s"] = words(torque["max_rate_Nm_per_s"])
+    said |= {"torque_scale_Nm": words(torque["asked_for_Nm"])}
+    for name, value in said.items():
+        if metadata.get(name) != value:
+            raise BundleError(f"contract.json says {name} '{value}', policy.onnx '{metadata.get(name)}'")
+    if not metadata.get("torque", "").startswith(torque["convention"]):
+        raise BundleError(
+            f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'"
+        )
+
+
+def main() -> int:
+    """Say what a bundle wants of an arm, and whether it is whole."""
+    try:
+        contract = load(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent)
+    except BundleError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    rates, torque, limits = contract["rates"], contract["torque"], contract["limits"]
+    print(f"whole: {contract['robot']}, joints {' '.join(contract['joints'])}")
+    print(f"policy {rates['policy_hz']} Hz, torque {torque['convention']} at {rates['cycle_hz']} Hz")
+    for name, values in {"max_Nm": torque["max_Nm"], **limits}.items():
+        print(f"{name}: {values}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,517 @@
+"""`r2s export`: the bundle is whole, its runtime does what r2s does, and it refuses what it was not made for."""
+
+import ast
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import ROOT, conf
+
+from r2s import commands
+from r2s.arm.deploy import as_state, episode_driver
+from r2s.arm.interface import ArmState
+from r2s.errors import UserError
+from r2s.export.bundle import one_file
+from r2s.export.contract import make_contract
+from r2s.export.law import Driver, Model
+from r2s.learning.networks import Policy
+from r2s.learning.policy import export_onnx, make_policy, save_policy
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import Robot, load_robot
+from r2s.tasks.reach import ReachTask
+
+EPISODE = 50  # cycles, of hostile motion
+LIBFRANKA = ROOT / "examples" / "libfranka"
+COMPILER = shutil.which("g++") or shutil.which("clang++")
+LAW_NM = 1e-9  # three writings of one law: sums of some tens of terms of 100 Nm, each to 1e-16
+# of what an action of 1 asks for: sums of float32 (eps 1.2e-7) in another order, of three layers of a gain of about 1
+POLICY = 1e-6
+
+
+@dataclass
+class Exported:
+    """A bundle and what it was made of."""
+
+    run: Path
+    folder: Path
+    robot: Robot
+    task: ReachTask
+    policy: Policy
+    friction: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Exported:
+    """The bundle of a policy that is as it was drawn: nothing of what is tested here is a matter of training."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    from r2s.stages.build import CONF, make_dynamics, make_robot, make_task
+
+    run = tmp_path_factory.mktemp("runs") / "train" / "drawn"
+    run.mkdir(parents=True)
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        config = compose("config", ["algo.hidden=[16,16]"])
+    OmegaConf.save(config, run / "config.yaml")
+    robot, task = make_robot(config), make_task(config)
+    torch.manual_seed(0)
+    policy = make_policy(robot, task, (16, 16)).eval()
+    save_policy(run, policy)
+    export_onnx(run / "policy.onnx", policy, robot, task)
+    best = {"env_steps": 960, "updates": 30, "success_1cm": 0.5, "return_paper": -100.0}
+    (run / "summary.json").write_text(json.dumps({"best": best, "last": best}))
+    (run / "meta.json").write_text(json.dumps({"status": "done", "inputs": {}, "seed": 3}))
+    transfer = run.parent.parent / "transfer" / "there"
+    transfer.mkdir(parents=True)
+    row = {"success_1cm": 0.9, "success_5cm": 1.0, "stops": 2, "episodes": 20, "asked": 20}
+    (transfer / "summary.json").write_text(json.dumps({"twin": row, "predicted": row}))
+    (transfer / "meta.json").write_text(json.dumps({"status": "done", "parents": [str(run)]}))
+    commands.run_command(["export", str(run)])
+    return Exported(run, run / "bundle", robot, task, policy, make_dynamics(config, robot).level)
+
+
+@pytest.fixture(scope="module")
+def runtime(exported) -> ModuleType:
+    """The one file of the bundle, as a program without r2s has it."""
+    spec = importlib.util.spec_from_file_location("r2s_runtime", exported.folder / "r2s_runtime.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules["r2s_runtime"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def arm_of(exported: Exported, **other: Any) -> dict[str, Any]:
+    """Return what a runtime is told of the arm, with some of it changed."""
+    r = exported.robot
+    own = {"joints": [f"joint{j + 1}" for j in range(r.n)], "cycle_hz": 1000, "torque": "without gravity"}
+    own |= {"q_min": r.q_min, "q_max": r.q_max, "dq_max": r.dq_max, "tau_max": r.tau_max, "dtau_max": r.dtau_max}
+    return own | other
+
+
+def hostile(robot: Robot, task: ReachTask, cycles: int) -> dict[str, np.ndarray]:
+    """Return states and targets (cycles, n) that no driver should meet, which are said, and where motions begin.
+
+    Joints jump beyond their limits and their speeds, a few values are not finite, targets come, go and are anything,
+    and what the arm applied last is not always what was sent (that is NaN here).
+    """
+    rng, n = np.random.default_rng(0), robot.n
+    low, high = robot.q_range
+    jumps = np.arange(cycles) // 5
+    inside = rng.uniform(low + 0.15, high - 0.15, (cycles, n)) + 0.2 * rng.uniform(-1, 1, (cycles, n)) * (
+        rng.random((cycles, 1)) < 0.2
+    )
+    share = rng.choice([0.05, 0.3, 0.6, 3.0], (cycles, 1), p=[0.4, 0.4, 0.17, 0.03])
+    q, dq = inside[jumps], (share * rng.uniform(-1, 1, (cycles, n)) * robot.dq_max)[jumps]
+    target = 3 * rng.normal(size=(cycles, n)) * task.torque(robot)
+    for values, odd in ((q, 0.002), (dq, 0.002), (target, 0.02)):
+        rows = np.flatnonzero(rng.random(cycles) < odd)
+        values[rows, rng.integers(n, size=len(rows))] = rng.choice([np.nan, np.inf, -np.inf], len(rows))
+    applied = np.where(rng.random((cycles, 1)) < 0.05, 50 * rng.normal(size=(cycles, n)), np.nan)
+    told = (np.arange(cycles) % 20 == 0) | (rng.random(cycles) < 0.1)
+    begin = np.arange(cycles) % EPISODE == 0
+    goal = rng.uniform(-0.7, 0.7, (cycles // EPISODE + 1, 3))[np.arange(cycles) // EPISODE]
+    return {"q": q, "dq": dq, "applied": applied, "target": target, "told": told, "begin": begin, "goal": goal}
+
+
+def driven(robot: Robot, task: ReachTask, friction: np.ndarray, cycles: int) -> dict[str, np.ndarray]:
+    """Return `hostile` motion with `tau` (cycles, n) Nm that r2s makes of it, and `last`, what the arm applied."""
+    motion = hostile(robot, task, cycles)
+    driver = episode_driver(robot, task, 0.0, friction)
+    tau, last = np.zeros((2, cycles, robot.n))
+    for k in range(cycles):
+        if motion["begin"][k]:
+            driver.reset()
+        sent = tau[k - 1] if k and not motion["begin"][k] else np.zeros(robot.n)
+        last[k] = np.where(np.isnan(motion["applied"][k]), sent, motion["applied"][k])
+        state = ArmState(1e-3 * k, motion["q"][k], motion["dq"][k], np.zeros(robot.n), last[k])
+        tau[k] = driver(state, motion["target"][k] if motion["told"][k] else None)
+    return motion | {"tau": tau, "last": last}
+
+
+@pytest.fixture(scope="module")
+def motion(exported) -> dict[str, np.ndarray]:
+    return driven(exported.robot, exported.task, exported.friction, 1000)
+
+
+def by_law(contract: dict[str, Any], motion: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the torques (cycles, n) Nm of the runtime's driver."""
+    driver = Driver(contract["law"], Model(contract["model"]))
+    out = np.empty_like(motion["tau"])
+    for k in range(len(out)):
+        if motion["begin"][k]:
+            driver.reset()
+        target = motion["target"][k] if motion["told"][k] else None
+        with np.errstate(invalid="ignore"):
+            out[k] = driver(motion["q"][k], motion["dq"][k], motion["last"][k], target)
+    return out
+
+
+def test_the_law_of_the_runtime_is_that_of_r2s(exported, motion):
+    """Every command of a hostile motion is the same within rounding, and the law had much to do."""
+    contract = json.loads((exported.folder / "contract.json").read_text())
+    assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
+
+
+@pytest.mark.parametrize("arm", ["six_joints", "kinova_gen3", "iiwa14", "fr3"])
+def test_so_it_is_for_other_arms(arm, panda):
+    """With rotors, with joints that turn without end, and with less speed near position limits."""
+    slow = (np.full(7, 6.0), np.full(7, 0.3))
+    file = ROOT / "tests" / "models" / "six_joints.xml" if arm == "six_joints" else f"r2s:models/{arm}.xml"
+    robot = replace(panda, slowing=slow) if arm == "fr3" else load_robot(str(file))
+    if arm == "six_joints":
+        robot = replace(robot, armature=np.full(6, 0.1))
+    task, friction = ReachTask(reach=None, height=-9.0, azimuth=3.2), np.linspace(0.0, 1.0, robot.n)
+    contract = json.loads(json.dumps(make_contract(robot, task, friction), allow_nan=False))
+    motion = driven(robot, task, friction, 300)
+    assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
+
+
+def compare(exported: Exported, runtime: ModuleType, cycles: int) -> float:
+    """Return the largest difference of Runtime and r2s, of what an action of 1 asks for, over so many hostile cycles.
+
+    Both see the same states and goals; each asks its own policy, with its own memory of what it has sent.
+    """
+    robot, task = exported.robot, exported.task
+    torque, kinematics = task.torque(robot), Kinematics(robot)
+    motion = hostile(robot, task, cycles)
+    driver = episode_driver(robot, task, 0.0, exported.friction)
+    other = runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported)))
+    tau, worst, every = np.zeros(robot.n), 0.0, task.substeps
+    for k in range(cycles):
+        if motion["begin"][k]:
+            driver.reset()
+            other.reset()
+            tau, since = np.zeros(robot.n), k
+        q, dq, goal = (motion[name][k] for name in ("q", "dq", "goal"))
+        last = np.where(np.isnan(motion["applied"][k]), tau, motion["applied"][k])
+        state, target = ArmState(1e-3 * k, q, dq, tau, last), None
+        if (k - since) % every == 0:
+            seen = task.observe(as_state(kinematics, state, driver.effort, False, 0.0), goal[None], torque)
+            with torch.no_grad():
+                target = exported.policy(torch.from_numpy(seen)).numpy()[0].astype(float)
+        tau = driver(state, target)
+        worst = max(worst, float((np.abs(other(q, dq, last, goal) - tau) / torque).max()))
+        assert (driver.stopping is None, driver.done) == (other.driver.stopping is None, other.done)
+    return worst
+
+
+def test_the_runtime_does_what_r2s_does(exported, runtime):
+    """From joint states and goals to torques, hostile ones included."""
+    assert compare(exported, runtime, 500) < POLICY
+
+
+@pytest.mark.slow
+def test_the_runtime_does_what_r2s_does_for_ten_thousand_cycles(exported, runtime):
+    assert compare(exported, runtime, 10_000) < POLICY
+    motion = driven(exported.robot, exported.task, exported.friction, 10_000)
+    contract = json.loads((exported.folder / "contract.json").read_text())
+    assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
+
+
+CHECK = """
+#include <cstdio>
+#include "law.hpp"
+int main() {  // q, dq, tau_J_d, target, goal, is it said, does a motion begin; torque and observation back
+  constexpr int n = law::n;
+  law::Driver driver;
+  double x[4 * n + 5];
+  while (std::fread(x, sizeof *x, 4 * n + 5, stdin) == 4 * n + 5) {
+    law::Joints v[4];
+    for (int k = 0; k < 4 * n; ++k) v[k / n][k % n] = x[k];
+    if (x[4 * n + 4] > 0) driver = law::Driver();
+    driver.model.place(v[0]);
+    const auto seen = law::observe(driver, v[0], v[1], {x[4 * n], x[4 * n + 1], x[4 * n + 2]});
+    const law::Joints tau = driver(v[0], v[1], v[2], x[4 * n + 3] > 0 ? &v[3] : nullptr);
+    std::fwrite(tau.data(), sizeof *x, n, stdout);
+    for (double s : seen) std::fwrite(&s, sizeof s, 1, stdout);
+  }
+}
+"""
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here: examples/libfranka/law.hpp is not compiled")
+def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
+    """examples/libfranka/law.hpp gives the same torques within rounding, and the same observations."""
+    (tmp_path / "check.cpp").write_text(CHECK)
+    command = [str(COMPILER), "-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+    command += ["-I", str(LIBFRANKA), "-I", str(exported.folder), "check.cpp", "-o", "check"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    flags = np.column_stack([motion["told"], motion["begin"]])
+    rows = [motion["q"], motion["dq"], motion["last"], motion["target"], motion["goal"], flags]
+    sent = np.ascontiguousarray(np.concatenate(rows, 1), dtype=float)
+    done = subprocess.run([tmp_path / "check"], input=sent.tobytes(), capture_output=True, check=True)
+    n = exported.robot.n
+    got = np.frombuffer(done.stdout).reshape(len(sent), -1)
+    assert np.abs(got[:, :n] - motion["tau"]).max() < LAW_NM
+    kinematics, torque = Kinematics(exported.robot), exported.task.torque(exported.robot)
+    k = next(k for k in range(len(sent)) if motion["begin"][k] and np.isfinite(sent[k]).all())  # the effort is zero
+    state = ArmState(0.0, motion["q"][k], motion["dq"][k], np.zeros(n), np.zeros(n))
+    told = as_state(kinematics, state, np.zeros(n), False, 0.0)
+    assert np.allclose(got[k, n:], exported.task.observe(told, motion["goal"][k][None], torque)[0], atol=1e-6)
+
+
+def has_header(name: str) -> bool:
+    """Return whether the compiler finds a header."""
+    words = [str(COMPILER), "-std=c++17", "-fsyntax-only", "-x", "c++", "-"]
+    return subprocess.run(words, input=f"#include <{name}>\n".encode(), capture_output=True).returncode == 0
+
+
+def test_the_loop_for_libfranka_compiles(exported):
+    """Where libfranka's and ONNX Runtime's headers are."""
+    missing = [h for h in ("franka/robot.h", "onnxruntime_cxx_api.h") if COMPILER is None or not has_header(h)]
+    if missing:
+        pytest.skip(f"examples/libfranka/loop.cpp is not compiled: no {' and no '.join(missing)} here")
+    command = [str(COMPILER), "-std=c++17", "-fsyntax-only", "-Wall", "-I", str(exported.folder)]
+    subprocess.run([*command, str(LIBFRANKA / "loop.cpp")], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler here")
+def test_the_loop_compiles_against_what_it_calls_of_libfranka(exported):
+    """tests/standins declares it, for where the headers themselves are not."""
+    own = ["-I", str(ROOT / "tests" / "standins"), "-I", str(exported.folder)]
+    words = [str(COMPILER), "-std=c++17", "-fsyntax-only", "-Wall", "-Wextra", "-Werror", *own]
+    subprocess.run([*words, str(LIBFRANKA / "loop.cpp")], check=True)
+
+
+def test_the_bundle_is_whole(exported, runtime):
+    """Every file is in the contract with its digest; the three models are the arm, and the law is in numbers."""
+    contract = runtime.load(exported.folder)
+    there = {p.relative_to(exported.folder).as_posix() for p in exported.folder.rglob("*") if p.is_file()}
+    assert there - {"contract.json"} == set(contract["files"])
+    assert {"policy.onnx", "MODEL_CARD.md", "contract.hpp", "r2s_runtime.py"} <= there
+    assert {f"model/arm.{kind}" for kind in ("xml", "urdf", "sdf")} <= there
+    model = mujoco.MjModel.from_xml_path(str(exported.folder / "model" / "arm.xml"))
+    assert np.allclose(model.body_mass[1:].sum(), exported.robot.mass.sum())
+    assert contract["observation"]["size"] == len(exported.task.observation_scale(exported.robot)[0])
+
+
+def test_the_card_says_where_it_was_measured_and_where_not(exported):
+    card = (exported.folder / "MODEL_CARD.md").read_text()
+    assert "| twin (there) | 100.0 | - | 90.0 |" in card
+    assert "stopped in 2 of 20" in card
+    assert "predicted" not in card
+    untried = next(line for line in card.splitlines() if line.startswith("Not tried:"))
+    assert "panda" in untried
+    assert "twin" not in untried
+
+
+def test_the_runtime_needs_numpy_and_onnxruntime_alone():
+    tree = ast.parse(one_file())
+    names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    names |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    others = {name.split(".")[0] for name in names} - set(sys.stdlib_module_names)
+    assert others == {"numpy", "onnxruntime"}
+
+
+def swap(values: list) -> None:
+    values[0], values[1] = values[1], values[0]
+
+
+def limit(contract: dict, name: str, joint: int, value: float) -> None:
+    """Change a limit of a joint wherever the contract says it."""
+    own, rows = contract["law"]["joint"], {**contract["torque"], **contract["limits"]}
+    in_law = {"max_Nm": "tau_max", "max_rate_Nm_per_s": "step", "asked_for_Nm": "asked", "dq_max_rad_per_s": "dq_max"}
+    rows[name][joint - 1] = value
+    own[in_law[name]][joint - 1] = value * (contract["law"]["number"]["cycle_s"] if in_law[name] == "step" else 1)
+
+
+MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
+    "a joint too many": (lambda c: c["joints"].append("joint8"), "of 7 joints, the arm has 8"),
+    "another order": (lambda c: swap(c["joints"]), "joint 1 of the arm is 'joint1', of the bundle 'joint2'"),
+    "another policy rate": (lambda c: c["rates"].update(policy_hz=100), "says policy_hz '100', policy.onnx '50'"),
+    "another cycle": (lambda c: c["rates"].update(cycle_hz=500), "in a cycle of 500 Hz"),
+    "a torque limit": (lambda c: limit(c, "max_Nm", 5, 87.0), "tau_max of joint 5"),
+    "a limit of the law alone": (lambda c: c["law"]["joint"]["tau_max"].__setitem__(4, 87.0), "law.joint.tau_max is"),
+    "a lower torque limit": (lambda c: limit(c, "max_Nm", 1, 50.0), "says torque_max_Nm"),
+    "a torque rate": (lambda c: limit(c, "max_rate_Nm_per_s", 3, 2e3), "dtau_max of joint 3"),
+    "a speed limit": (lambda c: limit(c, "dq_max_rad_per_s", 2, 9.0), "dq_max of joint 2"),
+    "a position limit": (lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0), "q_min of joint 4 is -3.07"),
+    "what an action asks for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "torque_scale_Nm"),
+    "the convention": (lambda c: c["torque"].update(convention="with gravity"), "torque 'with gravity'"),
+    "a missing link": (lambda c: c["model"]["links"].pop(), "model.links is of 6 joints"),
+    "a missing row of the law": (lambda c: c["law"]["joint"].pop("most"), "damaged: KeyError 'most'"),
+    "a missing number of the law": (lambda c: c["law"]["number"].pop("rate"), "law.number.rate is missing"),
+    "the low-pass": (lambda c: c["rates"].update(low_pass_hz=30.0), "low_pass_hz '30.0'"),
+    "a history": (lambda c: c["observation"].update(history=3), "observations of history 3"),
+    "a preview": (lambda c: c["observation"].update(preview=5), "observations of preview 5"),
+    "another order of observations": (lambda c: swap(c["observation"]["entries"]), "observation 'dq'"),
+    "an observation of something else": (lambda c: c["observation"]["entries"][0].update(of="x"), "'q' is x at"),
+    "too few observations": (lambda c: c["observation"]["entries"].pop(), "40 observations in all, and 47"),
+    "another size": (lambda c: c["observation"].update(size=46), "47 observations in all, and 46"),
+    "a later format": (lambda c: c.update(format=2), "is of format 2"),
+}
+
+
+def edited(exported: Exported, to: Path, change: Callable[[dict], object], runtime: ModuleType | None) -> Path:
+    """Return a copy of the bundle with another contract; sealed anew where `runtime` does it."""
+    shutil.copytree(exported.folder, to)
+    contract = json.loads((to / "contract.json").read_text())
+    change(contract)
+    if runtime is not None:
+        contract["seal"] = runtime.seal_of(contract)
+    (to / "contract.json").write_text(json.dumps(contract))
+    return to
+
+
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_a_contract_that_says_another_thing_is_refused(exported, runtime, tmp_path, kind):
+    """In one line, also where somebody sealed it anew."""
+    change, words = MUTATIONS[kind]
+    folder = edited(exported, tmp_path / "b", change, runtime)
+    with pytest.raises(runtime.BundleError) as refused:
+        runtime.Runtime(folder, runtime.Arm(**arm_of(exported)))
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_number_of_the_law_that_was_changed_is_refused(exported, runtime, tmp_path):
+    """What could be is told by the seal."""
+    folder = edited(exported, tmp_path / "b", lambda c: c["law"]["joint"]["most"].__setitem__(0, 2.0), None)
+    with pytest.raises(runtime.BundleError, match="its seal is another"):
+        runtime.load(folder)
+
+
+@pytest.mark.parametrize("name", ["policy.onnx", "r2s_runtime.py", "model/arm.urdf", "MODEL_CARD.md", "contract.hpp"])
+@pytest.mark.parametrize("damage", ["missing", "changed"])
+def test_a_file_that_is_missing_or_was_changed_is_refused(exported, runtime, tmp_path, name, damage):
+    folder = shutil.copytree(exported.folder, tmp_path / "b")
+    content = (folder / name).read_bytes()
+    (folder / name).unlink()
+    if damage == "changed":
+        (folder / name).write_bytes(content[:-1] + b"?")
+    with pytest.raises(runtime.BundleError, match=name) as refused:
+        runtime.load(folder)
+    assert ("is missing" if damage == "missing" else "its sha256 is another") in str(refused.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b'{"format": 1}', b"\xff"])
+def test_a_damaged_contract_is_refused(runtime, tmp_path, content):
+    (tmp_path / "contract.json").write_bytes(content)
+    with pytest.raises(runtime.BundleError) as refused:
+        runtime.load(tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+OTHER_ARMS = {
+    "joints": ([f"joint{j}" for j in range(1, 7)], "the arm has 6 joints, the bundle is of 7"),
+    "cycle_hz": (500, "the arm's cycle is of 500 Hz, the bundle's of 1000 Hz"),
+    "torque": ("with gravity", "the arm takes torque 'with gravity', the bundle gives 'without gravity'"),
+    "tau_max": ([87.0, 87.0, 50.0, 87.0, 12.0, 12.0, 12.0], "tau_max of joint 3 is 50 Nm at the arm"),
+    "dtau_max": ([999.0] * 7, "dtau_max of joint 1 is 999 Nm/s at the arm"),
+    "dq_max": ([2.175] * 7, "dq_max of joint 5 is 2.175 rad/s at the arm"),
+    "q_max": ([2.8] * 7, "q_max of joint 1 is 2.8 rad at the arm"),
+    "q_min": ([-2.0] * 6, "q_min of the arm has 6 values"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_ARMS)
+def test_another_arm_is_refused(exported, runtime, name):
+    value, words = OTHER_ARMS[name]
+    with pytest.raises(runtime.BundleError) as refused:
+        runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported, **{name: value})))
+    assert words in str(refused.value)
+
+
+def test_states_of_another_size_are_refused(exported, runtime):
+    other = runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported)))
+    with pytest.raises(runtime.BundleError, match="7 joints and 3 are allowed"):
+        other(np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(3))
+
+
+def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
+    """A bundle that is there, a run that is none, a controller, another policy.onnx, a task without words."""
+
+    def refused(words: str, run: Path, *more: str) -> None:
+        with pytest.raises(UserError, match=words):
+            commands.run_command(["export", str(run), *more])
+
+    refused("bundle is there already", exported.run)
+    refused("is no finished run folder of stage=train", tmp_path / "nothing")
+    run = shutil.copytree(exported.run, tmp_path / "run", ignore=shutil.ignore_patterns("bundle"))
+    (run / "policy.onnx").write_bytes(b"no")
+    refused("policy.onnx is damaged|policy.onnx", run, f"to={tmp_path / 'to'}")
+    shutil.copy(exported.run / "policy.onnx", run)
+    with torch.no_grad():
+        other = make_policy(exported.robot, exported.task, (16, 16))
+    save_policy(run, other)
+    refused("is not its policy.pt", run, f"to={tmp_path / 'to'}")
+    monkeypatch.delattr(ReachTask, "layout")
+    refused("ReachTask does not say how its observations are made", run)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["algo"] = {"_target_": "r2s.learning.computed_torque.Oracle", **conf("algo/oracle")}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    refused("algo=oracle, which is no network", run)
+    assert {p.name for p in tmp_path.iterdir()} == {"run"}
+    assert not [p for p in run.iterdir() if "part" in p.name]
+
+
+LEAN = """
+import sys
+import numpy as np
+from r2s_runtime import Arm, Runtime
+data = np.load(sys.argv[1])
+arm = {k[4:]: data[k] for k in data.files if k.startswith("arm_")}
+arm |= {"joints": arm["joints"].tolist(), "cycle_hz": 1000, "torque": "without gravity"}
+runtime, worst = Runtime(sys.argv[2], Arm(**arm)), 0.0
+for k in range(len(data["tau"])):
+    if data["begin"][k]:
+        runtime.reset()
+    tau = runtime(data["q"][k], data["dq"][k], data["last"][k], data["goal"][k])
+    worst = max(worst, float((np.abs(tau - data["tau"][k]) / data["torque"]).max()))
+print(worst, sorted(m for m in sys.modules if m.split(".")[0] in ("r2s", "torch", "mujoco", "scipy", "numba")))
+"""
+
+
+@pytest.mark.slow
+def test_it_runs_where_there_is_nothing_but_numpy_and_onnxruntime(exported, tmp_path):
+    """A virtual environment of its own; the torques are those that r2s wrote down, over 10,000 cycles."""
+    pins = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    wanted = [line for line in pins if line.split("==")[0] in ("numpy", "onnxruntime")]
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wanted]
+    installed = subprocess.run(pip, capture_output=True, text=True)
+    if installed.returncode:
+        pytest.skip(f"pip cannot install {' '.join(wanted)} here: {installed.stderr.strip().splitlines()[-1]}")
+    cycles, robot, task = 10_000, exported.robot, exported.task
+    motion = hostile(robot, task, cycles)
+    driver, kinematics = episode_driver(robot, task, 0.0, exported.friction), Kinematics(robot)
+    tau, last = np.zeros((2, cycles, robot.n))
+    for k in range(cycles):
+        begin, target = motion["begin"][k], None
+        if begin:
+            driver.reset()
+            since = k
+        last[k] = np.where(np.isnan(motion["applied"][k]), 0.0 if begin else tau[k - 1], motion["applied"][k])
+        state = ArmState(1e-3 * k, motion["q"][k], motion["dq"][k], np.zeros(robot.n), last[k])
+        if (k - since) % task.substeps == 0:
+            told = as_state(kinematics, state, driver.effort, False, 0.0)
+            with torch.no_grad():
+                seen = torch.from_numpy(task.observe(told, motion["goal"][k][None], task.torque(robot)))
+                target = exported.policy(seen).numpy()[0].astype(float)
+        tau[k] = driver(state, target)
+    arm = {f"arm_{k}": np.array(v) for k, v in arm_of(exported).items() if k not in ("cycle_hz", "torque")}
+    kept = {k: motion[k] for k in ("q", "dq", "goal", "begin")}
+    np.savez(tmp_path / "data.npz", **kept, **arm, tau=tau, last=last, torque=task.torque(robot))
+    (tmp_path / "lean.py").write_text(LEAN)
+    words = [str(python), str(tmp_path / "lean.py"), str(tmp_path / "data.npz"), str(exported.folder)]
+    here = {"PYTHONPATH": str(exported.folder), "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(words, capture_output=True, text=True, env=here)
+    assert done.returncode == 0, done.stderr
+    worst, modules = done.stdout.split(maxsplit=1)
+    assert float(worst) < POLICY
+    assert modules.strip() == "[]"
