@@ -12,7 +12,18 @@ ROOT = Path(__file__).parent.parent
 # in the order in which data flows; a file of r2s/ itself is a room of its own
 ROOMS = [
     *("errors", "files", "progress", "provenance", "runs"),
-    *("physics", "recordings", "excitation", "identification", "adaptation", "tasks", "learning", "engines", "arm", "reporting"),
+    *(
+        "physics",
+        "recordings",
+        "excitation",
+        "identification",
+        "adaptation",
+        "tasks",
+        "learning",
+        "engines",
+        "arm",
+        "reporting",
+    ),
     *("stages", "commands", "cli", "notebook", "__main__"),
 ]
 SEES_A_CONFIG = ("stages", "commands", "cli", "__main__")

@@ -38,6 +38,7 @@ class Noise(NamedTuple):
         loaded: share of a payload's torque that friction may grow by.
         warming: 1/sqrt(s), of friction's share. drifting: (n,) Nm/sqrt(s), of the offsets.
         resting: kg^2/s, what may be put into the hand while nothing is seen of it.
+        creeping: 1/sqrt(s), share of the payload's prior by which it is never known for good.
         prior: (N,) standard deviations before anything is seen.
     """
 
@@ -54,6 +55,7 @@ class Noise(NamedTuple):
     warming: float
     drifting: np.ndarray
     resting: float
+    creeping: float
     prior: np.ndarray
 
 
@@ -86,6 +88,7 @@ class Filter(NamedTuple):
 
 
 SLOW = 5.0  # times as long as the model's error lasts that of the momentum
+AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
 REST_S = 0.25  # of what friction hides at rest: how long it stays the same
 RESTS = 5  # spans without sliding, from which an arm rests
 
@@ -109,6 +112,8 @@ def update(filter, noise, b):
         for i in range(BODY):
             share = noise.prior[i] / noise.prior[0]
             P[i, i] = min(P[i, i] + noise.resting * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
+    for c in range(BODY):
+        P[c, c] += (noise.creeping * noise.prior[c]) ** 2 * T
     fade = np.exp(-T / noise.lasting)
     for j in range(n):
         e, used, load = E0 + j, slides[j] > 0.0, 0.0
@@ -265,7 +270,7 @@ def jump(filter, noise):
         for k2 in range(N):
             for m in range(JUMP):
                 filter.P[i, k2] += spread[i, m] * spread[k2, m]
-    for c in range(JUMP, BODY):
-        filter.P[c, c] += noise.prior[c] ** 2
+    for c in range(BODY):  # it may have been within the span: what is found now is a beginning
+        filter.P[c, c] += (noise.prior[c] * (AFRESH if c < JUMP else 1.0)) ** 2
     filter.count[1] = 0
     filter.count[3] = 0

@@ -20,6 +20,7 @@ WARMED = 0.1  # share of friction that warmth may have changed since the identif
 WARMING = 0.02  # 1/sqrt(s): a fifth in 100 s
 DRIFTED, DRIFTING = 0.05, 0.005  # of friction's level; per sqrt(s)
 RESTING = 0.1  # kg^2/s
+CREEPING = 0.01  # 1/sqrt(s)
 LASTING = 0.3  # s
 # where no motion without a payload says how wrong the model is: shares of friction's level
 WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
@@ -70,6 +71,7 @@ def noise_of(arm: Believed, prior: Prior | None = None) -> Noise:
         warming=WARMING,
         drifting=DRIFTING * arm.level,
         resting=RESTING,
+        creeping=CREEPING,
         prior=np.concatenate([payload, friction, offset, MODEL * arm.level, zero + MOVING]),
     )
 
