@@ -14,8 +14,9 @@ ROOT = Path(__file__).parent.parent
 # in the order in which data flows; a file of r2s/ itself is a room of its own
 ROOMS = [
     *("errors", "files", "progress", "provenance", "runs", "compiled"),
-    *("physics", "recordings", "excitation", "identification", "tasks", "learning", "engines", "arm", "reporting"),
-    *("export", "stages", "commands", "cli", "notebook", "__main__"),
+    *("physics", "recordings", "excitation", "identification", "adaptation"),
+    *("tasks", "learning", "engines", "arm", "reporting", "export"),
+    *("stages", "commands", "cli", "notebook", "__main__"),
 ]
 SEES_A_CONFIG = ("stages", "commands", "cli", "__main__")
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))

@@ -10,6 +10,8 @@ One cycle of 1 ms: the box adds its compensations to the command, elastic_joints
 in steps of at most 0.05 ms, and the sensors look at the motors up to half a millisecond before its end.
 """
 
+from typing import Any
+
 import numpy as np
 
 from r2s.arm.elastic_joints import (
@@ -60,9 +62,10 @@ from r2s.arm.elastic_joints import (
     level,
     sense,
 )
-from r2s.arm.hidden_arm import NOISE_BLOCK, HiddenArm, carry, drag, draw_links, draw_surroundings, magnitudes
+from r2s.arm.hidden_arm import NOISE_BLOCK, HiddenArm, drag, draw_links, draw_surroundings, magnitudes
 from r2s.errors import UserError
 from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import Payload, carrying
 from r2s.physics.robot import SIM_DT, Robot
 
 STEPS = 20  # per cycle, at least: 1 s of open loop is then within 1e-5 rad of what finer steps give
@@ -86,11 +89,19 @@ class ElasticTwin(HiddenArm):
         UserError: gears so stiff, or rotors and links so light, that their swing is too fast to be computed.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None, noise: int = 0):
-        super().__init__(robot, seed, payload, stiffness, noise)
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        payload: Any = 0.0,
+        stiffness: float | None = None,
+        noise: int = 0,
+        load: Any = None,
+    ):
+        super().__init__(robot, seed, payload, stiffness, noise, load)
         rng = np.random.default_rng([self._seed, 2])
         self._believed = links_of(robot, robot.mass, robot.com, robot.inertia)
-        links = draw_links(robot, rng)
+        self._bare = links = draw_links(robot, rng)
         self._links = links_of(robot, *links)
         self._mass, self._bias = np.empty((robot.n, robot.n)), np.empty(robot.n)
         self._work = np.empty((robot.n, WORK))
@@ -104,14 +115,19 @@ class ElasticTwin(HiddenArm):
         self._hidden[GEAR] = whole * rng.uniform(0.02, 0.06, robot.n)
         self._hidden[LOOP] = whole * rng.uniform(0.45, 0.7, robot.n)
         self._steps = _steps(self._hidden, inertia)
-        if payload:
-            self._links = links_of(robot, *carry(robot, payload, *links))
+        if self._load is not None:
+            told = carrying(robot, self._load, (robot.mass, robot.com, robot.inertia))
+            self._believed = links_of(robot, *told)
+        self._grasp()
         self._dq_filter = -np.expm1(-2 * np.pi * rng.uniform(60.0, 120.0) * SIM_DT)
         self._jitter = rng.uniform(0.2, 0.5)  # cycles, of sensors and of commands
         self._lost = rng.uniform(5e-4, 3e-3)  # share of the commands that miss their cycle
         self._line, self._sent = np.zeros((LATEST, robot.n)), np.zeros(LATEST)
         self._state, self._help = np.zeros((STATES, robot.n)), np.zeros(robot.n)
         self._start(robot.q_home)
+
+    def _hold(self, payload: Payload | None) -> None:
+        self._links = links_of(self.robot, *carrying(self.robot, payload, self._bare))
 
     def _gravity(self, links: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return (n,) Nm that holds these links at q (n,) rad."""

@@ -4,18 +4,18 @@ Each make (twin.py, elastic_twin.py) draws a robot from its seed around the one 
 and friction of its own. Nothing but the make itself reads what was drawn.
 """
 
+from typing import Any
+
 import numpy as np
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.compiled import njit
 from r2s.errors import check_number
-from r2s.physics.description import Bodies
+from r2s.physics.payload import Links, Payload, payload_of
 from r2s.physics.robot import SIM_DT, Robot
 
 ENCODER = 2e-5  # rad
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
-
-Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (n,) kg, centres (n, 3) m, tensors (n, 3, 3) kg m^2
 
 
 class HiddenArm:
@@ -24,22 +24,26 @@ class HiddenArm:
     The same seed, noise and calls give bit-identical states. Noise restarts at every `move_to`, from a stream of its
     own for each episode: the k-th episode of a twin has the same noise whatever the episodes before it did.
 
-    A make has `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command, `_seen()`, the sensors'
-    q, dq and tau_J, `_q` and `_dq`, which the reflexes watch, `_cycle` and `_tau_J_d`.
+    A make has `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command, `_hold(payload)`, which
+    changes what is in its hand, `_seen()`, the sensors' q, dq and tau_J, `_q` and `_dq`, which the reflexes watch,
+    `_cycle` and `_tau_J_d`.
 
     Args:
         robot: what it is believed to be. seed: of the robot drawn around that.
-        payload: kg in the hand, a point mass that the gravity compensation does not know of.
+        payload: what is in the hand, as of r2s/physics/payload.py: kg of a point mass, or a mapping.
+        load: what its gravity compensation was told of that, as libfranka's setLoad; the same kinds of value. None:
+            nothing.
         stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque.
         noise: of the sensors, another stream for each: two recordings of one robot have not the same noise.
 
     Raises:
-        UserError: a payload that is negative, a stiffness that is not above 0, or either not finite.
+        UserError: a payload or load that cannot be, a stiffness that is not above 0 and finite.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: float, stiffness: float | None, noise: int):
+    def __init__(self, robot: Robot, seed: int, payload: Any, stiffness: float | None, noise: int, load: Any = None):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
-        check_number("arm.payload", payload, "[0, inf)")
+        self._payload, self._load = payload_of(payload), payload_of(load, "arm.load")
+        self._holds = False
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")
         check_number("arm.noise", noise, "[0, inf)", whole=True)
@@ -57,6 +61,8 @@ class HiddenArm:
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to needs {self.robot.n} finite joint angles; it got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
+        self._cycle = 0
+        self._grasp()
         self._start(q)
         self._episode += 1
         self._stopped = None
@@ -74,6 +80,7 @@ class HiddenArm:
         tau = np.array(tau, dtype=float)
         try:
             self._reflexes.command(tau, self._tau_J_d)
+            self._grasp()
             self._advance(tau)
             self._reflexes.state(self._q, self._dq)
         except ArmStopped as reason:
@@ -84,6 +91,22 @@ class HiddenArm:
         """End the motion; `command` is refused until the next `move_to`."""
         if self._stopped is None:
             self._stopped = "stop was called"
+
+    def carry(self, payload: Payload | None) -> None:
+        """Change what is in the hand, now and in all motions to come."""
+        self._payload = payload
+        self._hold(payload if payload is not None and payload.there(self._cycle * SIM_DT) else None)
+        self._holds = payload is not None and bool(payload.there(self._cycle * SIM_DT))
+
+    def _grasp(self) -> None:
+        """Put the payload on or take it off where it is time."""
+        payload = self._payload
+        if payload is not None and self._holds != (now := bool(payload.there(self._cycle * SIM_DT))):
+            self._hold(payload if now else None)
+            self._holds = now
+
+    def _hold(self, payload: Payload | None) -> None:
+        raise NotImplementedError
 
     def _start(self, q: np.ndarray) -> None:
         raise NotImplementedError
@@ -104,21 +127,6 @@ def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
     coms = model.body_ipos[bodies] + small * rng.uniform(-2e-3, 2e-3, (n, 3))  # U(-2, 2) mm
     scale = rng.uniform(0.73, 1.37, n)  # the range of the paper's NEW / OLD; a scaled tensor stays physical
     return masses, coms, robot.inertia * scale[:, None, None]
-
-
-def carry(robot: Robot, payload: float, masses: np.ndarray, coms: np.ndarray, inertias: np.ndarray) -> Links:
-    """Return the links with a point mass of `payload` kg at the end effector."""
-    model = robot.model(gravity=True)
-    site = model.site(robot.ee_site).id
-    _, pose = Bodies(model).moving_parent(model.site_bodyid[site])
-    hand = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
-    total = masses[-1] + payload
-    centre = (masses[-1] * coms[-1] + payload * hand) / total
-    arms = (masses[-1], coms[-1] - centre), (payload, hand - centre)
-    added = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
-    last = np.arange(robot.n) == robot.n - 1
-    inertias = inertias + np.where(last[:, None, None], added, 0.0)
-    return np.where(last, total, masses), np.where(last[:, None], centre, coms), inertias
 
 
 def magnitudes(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

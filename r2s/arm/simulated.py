@@ -5,6 +5,7 @@ import numpy as np
 from r2s.arm.interface import ArmState, Reflexes
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.payload import Payload, loaded
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.simulator import Simulator
 
@@ -19,13 +20,24 @@ class SimulatedArm:
         robot, dynamics: the arm and its truth.
         position_noise, velocity_noise: standard deviation of q, rad, and dq, rad/s, white.
         seed: of the noise.
+        payload: what is in the hand, and when. load: what the arm's gravity compensation was told of it.
     """
 
     def __init__(
-        self, robot: Robot, dynamics: Dynamics, *, position_noise: float, velocity_noise: float, seed: int = 0
+        self,
+        robot: Robot,
+        dynamics: Dynamics,
+        *,
+        position_noise: float,
+        velocity_noise: float,
+        seed: int = 0,
+        payload: Payload | None = None,
+        load: Payload | None = None,
     ):
         self.robot = robot
-        self._sim = Simulator(robot, dynamics, 1, 1)
+        bare, full = loaded(robot, dynamics, None, load), loaded(robot, dynamics, payload, load)
+        self._payload, self._holds, self._hands = payload, False, {False: bare, True: full}
+        self._sim = Simulator(robot, bare, 1, 1)
         self._motors = Motors(1, robot.n, dynamics.delay, dynamics.lag)
         self._noise = position_noise, velocity_noise
         self._rng = np.random.default_rng(seed)
@@ -39,6 +51,7 @@ class SimulatedArm:
         self._sim.reset(np.asarray(q, dtype=float)[None], np.zeros((1, self.robot.n)))
         self._motors.reset()
         self._cycle, self._last = 0, np.zeros(self.robot.n)
+        self._grasp()
         return self._sense()
 
     def read(self) -> ArmState:
@@ -48,6 +61,7 @@ class SimulatedArm:
     def command(self, tau: np.ndarray) -> None:
         """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as the real arm's reflexes would."""
         self._reflexes.command(tau, self._last)
+        self._grasp()
         self._last = np.array(tau, dtype=float)
         self._sim.rollout(self._motors(self._last[None, None]) + self.external)
         self._reflexes.state(self._sim.q[0], self._sim.dq[0])
@@ -60,6 +74,13 @@ class SimulatedArm:
         self._motors.reset()
         self._last = np.zeros(self.robot.n)
         self._sense()
+
+    def _grasp(self) -> None:
+        """Put the payload on or take it off where it is time."""
+        now = self._payload is not None and bool(self._payload.there(self._cycle * SIM_DT))
+        if now != self._holds:
+            self._sim.set_dynamics(self._hands[now])
+            self._holds = now
 
     def _sense(self) -> ArmState:
         n = self.robot.n

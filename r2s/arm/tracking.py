@@ -11,6 +11,8 @@ from r2s.arm.interface import Arm, ArmState, ArmStopped
 from r2s.errors import UserError
 from r2s.excitation.motion import Excitation
 from r2s.excitation.safety import TABLE_M, TOOL_M, check_limits, check_space, friction_margin
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import MOST_KG, Payload, ball, carrying
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
 
@@ -23,6 +25,8 @@ UNBALANCED = (
 )
 CORRECTION = 0.3  # of tau_max, what tracking may add to the planned torque, all in all
 ASTRAY = 0.2  # rad off the plan: something is in the way, or the arm is not the one that the plan was made for
+LADEN = 2.0  # times what may be added to the plan for an arm that carries something
+LADEN_ASTRAY = 0.5  # rad
 FRICTION_DQ = 0.03  # rad/s, over which the friction estimate changes sign
 PROGRESS_EVERY = 500  # cycles
 LEAST = 100  # cycles that are worth keeping of a recording that was stopped
@@ -37,6 +41,7 @@ def record(
     table: float = TABLE_M,
     z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
+    laden: bool = False,
 ) -> Recording:
     """Follow the excitation at 1 kHz and return what the arm did.
 
@@ -50,6 +55,7 @@ def record(
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, contains gravity).
         table, z_min: m, as in `r2s.excitation.safety.check_motion`.
         progress: called now and then with (cycles done, cycles in all).
+        laden: the arm may carry what its model does not know of: it is followed loosely (`LadenTracker`).
 
     Raises:
         ArmStopped: the arm ended the motion, or the driver did, or the arm went astray; what was recorded until then
@@ -60,7 +66,7 @@ def record(
     declared_torque(torque)
     _check(arm.robot, excitation)
     check_space(arm.robot, excitation, table=table, z_min=z_min)
-    controller = Tracker(arm.robot, excitation)
+    controller = (LadenTracker if laden else Tracker)(arm.robot, excitation)
     rows = len(excitation.t)
     t = np.empty(rows)
     q, dq, tau = (np.empty((rows, arm.robot.n)) for _ in range(3))
@@ -140,6 +146,26 @@ class Tracker:
             f"joint {i + 1} is {off[i]:.3f} rad off its way, allowed are {self._far:g} rad: something is in the way, "
             "or it cannot follow"
         )
+
+
+class LadenTracker(Tracker):
+    """The same of an arm that may carry up to 1.5 kg nobody announced.
+
+    Its gains reckon with half of that, or the sag of a strong joint would throw the wrist about; it may lag more, and
+    be corrected more.
+    """
+
+    def __init__(self, robot: Robot, excitation: Excitation):
+        super().__init__(robot, excitation, LADEN_ASTRAY)
+        half = np.array(0.5 * MOST_KG)
+        links = carrying(robot, Payload(half, np.zeros(3), ball(half)), (robot.mass, robot.com, robot.inertia))
+        mass, bias, work = np.empty((robot.n, robot.n)), np.empty(robot.n), np.empty((robot.n, WORK))
+        arm = links_of(robot, *links)
+        for k, q in enumerate(excitation.q[::MASS_EVERY]):
+            equations(arm, robot.gravity, q, np.zeros(robot.n), mass, bias, work)
+            self._mass[k] = mass + np.diag(robot.armature)
+        self._most[0] *= LADEN
+        self._correction = LADEN * self._correction
 
 
 def _nominal(robot: Robot, e: Excitation) -> tuple[np.ndarray, np.ndarray]:

@@ -14,14 +14,14 @@ Friction, per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), bristle z rad
     g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c one value per direction
 """
 
+from typing import Any
+
 import numpy as np
 
 from r2s.arm.hidden_arm import (
     ENCODER,
     NOISE_BLOCK,
     HiddenArm,
-    Links,
-    carry,
     drag,
     draw_links,
     draw_surroundings,
@@ -29,6 +29,7 @@ from r2s.arm.hidden_arm import (
 )
 from r2s.compiled import njit
 from r2s.engines.dart import DartEngine
+from r2s.physics.payload import Links, Payload, carrying
 from r2s.physics.robot import SIM_DT, Robot
 
 # Rows of the parameters (rows, n) ...
@@ -52,10 +53,18 @@ class Twin(HiddenArm):
             the gears do not swing.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: float = 0.0, stiffness: float | None = None, noise: int = 0):
-        super().__init__(robot, seed, payload, stiffness, noise)
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        payload: Any = 0.0,
+        stiffness: float | None = None,
+        noise: int = 0,
+        load: Any = None,
+    ):
+        super().__init__(robot, seed, payload, stiffness, noise, load)
         rng = np.random.default_rng([self._seed, 0])
-        links = draw_links(robot, rng)
+        self._links = links = draw_links(robot, rng)
         self._engine = _engine(robot, links)
         self._nominal = DartEngine(robot, gravity=True)
         at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
@@ -63,8 +72,10 @@ class Twin(HiddenArm):
         self._hidden = _draw_joints(robot, rng, inertia, at_home[0] - at_home[1])
         if stiffness:
             self._hidden[COMPLIANCE] = robot.tau_max.max() / (robot.tau_max * stiffness)
-        if payload:
-            self._engine = _engine(robot, carry(robot, payload, *links))
+        if self._load is not None:
+            told = carrying(robot, self._load, (robot.mass, robot.com, robot.inertia))
+            self._nominal.relink(*(a[-1] for a in told))
+        self._grasp()
         delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles
         lag = rng.uniform(1e-3, 3e-3)  # s
         filter_hz = rng.uniform(60.0, 120.0)
@@ -86,6 +97,10 @@ class Twin(HiddenArm):
         gravity = self._nominal.gravity_torque(q)
         _rest(self._hidden, self._state, q, gravity, self._engine.gravity_torque(q))
         self._sense(before=self._dq)
+
+    def _hold(self, payload: Payload | None) -> None:
+        self._engine.relink(*(a[-1] for a in carrying(self.robot, payload, self._links)))
+        self._mass = self._engine.mass_matrix(self._q)
 
     def _advance(self, tau: np.ndarray) -> None:
         if self._cycle % MASS_EVERY == 0:

@@ -1,5 +1,7 @@
 """The hidden twins by their make: `arm=twin arm.make=...`."""
 
+from typing import Any
+
 from r2s.arm.elastic_twin import ElasticTwin
 from r2s.arm.hidden_arm import HiddenArm
 from r2s.arm.twin import Twin
@@ -14,9 +16,10 @@ def twin(
     *,
     make: int = 1,
     seed: int = 0,
-    payload: float = 0.0,
+    payload: Any = 0.0,
     stiffness: float | None = None,
     noise: int = 0,
+    load: Any = None,
 ) -> HiddenArm:
     """Return a hidden twin; the other arguments are those of `HiddenArm`.
 
@@ -29,4 +32,4 @@ def twin(
     check_number("arm.make", make, "[1, inf)", whole=True)
     if make not in MAKES:
         raise UserError(f"arm.make: {make} is not allowed; there are {' and '.join(map(str, MAKES))}")
-    return MAKES[make](robot, seed, payload, stiffness, noise)
+    return MAKES[make](robot, seed, payload, stiffness, noise, load)

@@ -71,7 +71,7 @@ class DartEngine:
         anchor, pose = links.moving_parent(model.site_bodyid[site])
         if anchor != bodies[-1]:
             raise UserError(f"robot.ee: '{robot.ee_site}' does not sit on the arm's last link")
-        self._tip = parent
+        self._tip, self._links, self._last = parent, links, int(bodies[-1])
         self._ee = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
         self._world = dart.simulation.World()
         self._world.setTimeStep(dt)
@@ -103,6 +103,12 @@ class DartEngine:
         joint.setRestPosition(0, float(model.qpos_spring[i]))
         joint.setLimitEnforcement(True)  # dartpy leaves it off
         return joint, link
+
+    def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
+        """Give the last link another mass kg, centre (3,) m and tensor about it (3, 3) kg m^2, now; it moves on."""
+        at = self._last
+        self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
+        self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Put the arm at q, dq (n,) rad, rad/s."""

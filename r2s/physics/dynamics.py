@@ -1,7 +1,7 @@
 """What an arm's dynamics are: friction, offsets, breakaway, links, rotors, delay and lag."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class Dynamics:
             other joints' motion included, is within the edges (r2s/physics/stick_slip.py).
         delay, lag: (...) s, of the actuation: pure, and first order. The simulator does not apply them: whoever
             makes the commands does (`Motors` of r2s/physics/actuation.py).
+        told: (..., 4) kg and kg m, mass and first moment in the last link's frame of the load that the arm's own
+            gravity compensation was told of (r2s/physics/payload.py); what is there in truth is in the last link.
     """
 
     phi: np.ndarray
@@ -54,6 +56,7 @@ class Dynamics:
     hold: str = "command"
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
+    told: np.ndarray = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
         if self.hold not in HOLDS:
@@ -98,7 +101,7 @@ class Dynamics:
 
 # of an array that one arm has
 AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "armature": 1}
-AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0}
+AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "told": 1}
 
 
 def nominal_dynamics(

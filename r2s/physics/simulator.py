@@ -166,8 +166,13 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     """Return the columns of `jnt_user` that say what the arm is, (..., n, LIMITS)."""
     f = native
     moment, nominal = d.mass[..., None] * d.com, robot.mass[:, None] * robot.com
-    errors = d.mass - robot.mass, moment - nominal
-    arrays = (d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
+    # what gravity compensation lacks: it believes the nominal links, and whatever load it was told of
+    last = np.arange(robot.n) == robot.n - 1
+    errors = (
+        d.mass - robot.mass - last * d.told[..., :1],
+        moment - nominal - last[:, None] * d.told[..., None, 1:],
+    )
+    arrays = (errors[0], d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
     delay, lag = (late[..., None] for late in steps_late(d.delay, d.lag))
     rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in (*arrays, delay, lag))), f.LIMITS))
     rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family, d.hold)

@@ -15,7 +15,7 @@ from r2s.errors import UserError, check_number, choices, nearest
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
 BESIDE = ("soft_start_s", "live")  # of conf/arm, how it is driven
-STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune")
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "watch")
 COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads", "tracker")
 GROUP = "R2S_GROUP"  # in the environment of the jobs of a sweep: what they are called together
 

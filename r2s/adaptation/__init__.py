@@ -1,0 +1,1 @@
+"""What is estimated while an arm works: what it carries, how its friction drifts, when that changes."""

@@ -1,0 +1,135 @@
+"""The balance of momentum over a few milliseconds: what commands, friction and links do not explain; compiled.
+
+Over a span of T s the change of momentum is the integral of all torques, so that nothing is differentiated and no
+filter is in the way: y = (integral of what is known - change of the momentum that is known) / T, in Nm, is linear in
+what is not known, y = H x + noise.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from r2s.adaptation.believed import friction
+from r2s.adaptation.momentum import BODY, WIDE, momentum
+from r2s.physics.actuation import SLOTS, turn
+from r2s.physics.robot import SIM_DT
+
+SPAN = 20  # cycles of a balance
+BENT = 0.9  # of the bristles, beyond which a joint slides
+MOVES = 0.02  # rad/s, below which it may be held
+
+
+class Kept(NamedTuple):
+    """What is remembered of n joints from cycle to cycle; a payload's ten numbers have columns of their own."""
+
+    count: np.ndarray  # (2,), cycles of the span, and of the line of commands
+    line: np.ndarray  # (SLOTS, n) Nm
+    motor: np.ndarray  # (n,) Nm
+    felt: np.ndarray  # (n,) Nm, mean torque of the motors in the coming step
+    bristle: np.ndarray  # (n,)
+    known: np.ndarray  # (2, n) Nm, of the cycle before; Nm s, its integral
+    rubbed: np.ndarray  # (2, n), friction likewise
+    start: np.ndarray  # (n,) Nm s, momentum where the span began
+    began: np.ndarray  # (2, n), speed and motors' torque there
+    moment: np.ndarray  # (4, n), of this cycle: momentum, push, pull, weight
+    payload_start: np.ndarray  # (n, 10)
+    payload_now: np.ndarray  # (n, 10)
+    payload_push: np.ndarray  # (3, n, 10): of this cycle, of the one before, its integral
+    work: np.ndarray
+
+    @staticmethod
+    def fresh(n: int) -> "Kept":
+        """Return that of an arm that has not moved yet."""
+        count = np.array([0, SLOTS])
+        vectors = [np.zeros(n) for _ in range(3)]
+        return Kept(
+            count, np.zeros((SLOTS, n)), *vectors, np.zeros((2, n)), np.zeros((2, n)), np.zeros(n), np.zeros((2, n)),
+            np.zeros((4, n)), np.zeros((n, BODY)), np.zeros((n, BODY)), np.zeros((3, n, BODY)), np.zeros((n, WIDE)),
+        )  # fmt: skip
+
+
+class Balance(NamedTuple):
+    """What `observe` writes at the end of a span of n joints.
+
+    Attributes:
+        y: (n,) Nm, what is not explained. payload: (n, 10), what the payload's ten numbers make of it.
+        rub: (n,) Nm, mean friction. path: (n,) Nm, how far friction went. slides: (n,), 1 where a joint slid all
+            along. change: (n,) Nm, rate of the momentum. faster: (n,) rad/s^2, mean acceleration. firmer: (n,) Nm/s,
+            rate of the motors' torque.
+    """
+
+    y: np.ndarray
+    payload: np.ndarray
+    rub: np.ndarray
+    path: np.ndarray
+    slides: np.ndarray
+    change: np.ndarray
+    faster: np.ndarray
+    firmer: np.ndarray
+
+    @staticmethod
+    def empty(n: int) -> "Balance":
+        """Return arrays for it."""
+        return Balance(np.zeros(n), np.zeros((n, BODY)), np.zeros(n), np.zeros(n), np.ones(n), *np.zeros((3, n)))
+
+
+@njit(cache=True, error_model="numpy")
+def observe(arm, kept, q, dq, tau, out):
+    """Take one cycle's state and command; return whether a span has ended, whose balance is then in `out`.
+
+    Args:
+        arm: `Believed`. kept: `Kept`. q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity, the
+            command that is sent in it.
+        out: `Balance`.
+    """
+    n, h = len(q), SIM_DT
+    begun, T = kept.count[0] > 0, SPAN * h
+    momentum(
+        arm.links, arm.moments, arm.hand, arm.gravity, arm.armature, q, dq, kept.work, kept.moment[0], kept.moment[1],
+        kept.moment[2], kept.moment[3], kept.payload_now, kept.payload_push[0],
+    )  # fmt: skip
+    if kept.count[0] <= 1:
+        for j in range(n):
+            out.path[j], out.slides[j] = 0.0, 1.0
+    for j in range(n):
+        v = dq[j]
+        side = 1.0 if v > 0.0 else -1.0
+        z = side + (kept.bristle[j] - side) * np.exp(-abs(v) * h / arm.presliding[j])
+        kept.bristle[j] = z
+        f = friction(arm.table[j], arm.fastest[j], v, z) + arm.load[j] * abs(kept.moment[3, j]) * z
+        pulled = arm.drag[j, 0] * np.sin(q[j]) + arm.drag[j, 1] * np.cos(q[j])
+        known = arm.offset[j] + pulled + kept.moment[1, j] - kept.moment[2, j] - f
+        if abs(z) < BENT or abs(v) < MOVES:
+            out.slides[j] = 0.0
+        if begun:
+            kept.known[1, j] += h * (0.5 * (kept.known[0, j] + known) + kept.felt[j])
+            kept.rubbed[1, j] += 0.5 * h * (kept.rubbed[0, j] + f)
+            out.path[j] += abs(f - kept.rubbed[0, j])
+            for c in range(BODY):
+                kept.payload_push[2, j, c] += 0.5 * h * (kept.payload_push[0, j, c] + kept.payload_push[1, j, c])
+        kept.known[0, j], kept.rubbed[0, j] = known, f
+        for c in range(BODY):
+            kept.payload_push[1, j, c] = kept.payload_push[0, j, c]
+    ended = kept.count[0] == SPAN
+    if ended or not begun:
+        for j in range(n):
+            if ended:
+                out.y[j] = (kept.known[1, j] - (kept.moment[0, j] - kept.start[j])) / T
+                out.rub[j] = kept.rubbed[1, j] / T
+                out.change[j] = (kept.moment[0, j] - kept.start[j]) / T
+                out.faster[j] = (dq[j] - kept.began[0, j]) / T
+                out.firmer[j] = (kept.felt[j] - kept.began[1, j]) / T
+                for c in range(BODY):
+                    change = kept.payload_now[j, c] - kept.payload_start[j, c]
+                    out.payload[j, c] = (change - kept.payload_push[2, j, c]) / T
+            kept.known[1, j], kept.rubbed[1, j], kept.start[j] = 0.0, 0.0, kept.moment[0, j]
+            kept.began[0, j], kept.began[1, j] = dq[j], kept.felt[j]
+            for c in range(BODY):
+                kept.payload_start[j, c], kept.payload_push[2, j, c] = kept.payload_now[j, c], 0.0
+        kept.count[0] = 0
+    kept.count[0] += 1
+    kept.line[kept.count[1] % SLOTS] = tau
+    turn(kept.line, kept.motor, kept.count[1], arm.late[0], arm.late[1], kept.felt)
+    kept.count[1] += 1
+    return ended

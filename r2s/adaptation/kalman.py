@@ -1,0 +1,276 @@
+"""The recursive estimate, compiled: a Kalman filter of payload, friction and offsets, and a test for sudden changes.
+
+State of n joints, N = 10 + 4 n: the payload's mass, first moments and tensor about the hand (kg, kg m, kg m^2); of
+each joint the share by which friction is above what is believed, a torque offset that goes slowly (Nm), and the
+model's own error (Nm), which comes and goes (Ornstein and Uhlenbeck) and with every change of the friction, and the
+share by which its momentum changes less than is believed, which comes and goes too.
+
+The test is Willsky and Jones' (IEEE TAC 21(1), 1976): for each of the last LATEST spans the filter's signature of a
+jump of the payload that began there, and with a prior of that jump the odds that there was one. Under the model the
+mean of these odds has expectation 1 without a jump, so that by Markov's inequality odds of x have a probability of
+1 / x at most: a threshold of as many as there are tests in an hour allows for one false alarm in that time.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from r2s.adaptation.balance import SPAN
+from r2s.adaptation.momentum import BODY
+from r2s.physics.robot import SIM_DT
+
+T = SPAN * SIM_DT
+LATEST = 10  # onsets that are tried: 0.2 s
+JUMP = 4  # numbers of a payload that a jump has: mass and first moments
+THRESHOLD = np.log(3600.0 / T)  # tests in an hour
+
+
+class Noise(NamedTuple):
+    """What is known of the errors of n joints.
+
+    Attributes:
+        white: (n,) Nm of a balance. moving: (n,), share of the momentum's change. model: (n,) Nm, of the model's
+            error, whose correlation lasts `lasting` s. turning: (n,), share of friction's level that a change of
+            friction by that level leaves in doubt. level, edge: (n,) Nm, as of `Believed`.
+        inertia: (n, n) kg m^2, late: (n, n) s: what motion without a payload says that the model lacks of inertia, of
+            rotors above all, and of delay.
+        loaded: share of a payload's torque that friction may grow by.
+        warming: 1/sqrt(s), of friction's share. drifting: (n,) Nm/sqrt(s), of the offsets.
+        resting: kg^2/s, what may be put into the hand while nothing is seen of it.
+        creeping: 1/sqrt(s), share of the payload's prior by which it is never known for good.
+        prior: (N,) standard deviations before anything is seen.
+    """
+
+    white: np.ndarray
+    moving: np.ndarray
+    model: np.ndarray
+    lasting: float
+    turning: np.ndarray
+    level: np.ndarray
+    edge: np.ndarray
+    inertia: np.ndarray
+    late: np.ndarray
+    loaded: float
+    warming: float
+    drifting: np.ndarray
+    resting: float
+    creeping: float
+    prior: np.ndarray
+
+
+class Filter(NamedTuple):
+    """x (N,), P (N, N); of each onset f (LATEST, N, 4), information (LATEST, 4, 4) and vector (LATEST, 4).
+
+    count: (4,): spans, onsets in use, spans at rest in a row, the next onset. odds: (3,): log of the mean odds of a
+    jump, that of the likeliest onset, its number. seen: (2, n): innovations and their variances.
+    """
+
+    x: np.ndarray
+    P: np.ndarray
+    f: np.ndarray
+    information: np.ndarray
+    vector: np.ndarray
+    count: np.ndarray
+    odds: np.ndarray
+    seen: np.ndarray
+    work: np.ndarray
+
+    @staticmethod
+    def fresh(prior: np.ndarray) -> "Filter":
+        """Return the filter before anything is seen; prior (N,) standard deviations."""
+        N = len(prior)
+        n = (N - BODY) // 4
+        return Filter(
+            np.zeros(N), np.diag(prior**2), np.zeros((LATEST, N, JUMP)), np.zeros((LATEST, JUMP, JUMP)),
+            np.zeros((LATEST, JUMP)), np.zeros(4, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.zeros((2, N)),
+        )  # fmt: skip
+
+
+SLOW = 5.0  # times as long as the model's error lasts that of the momentum
+AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
+REST_S = 0.25  # of what friction hides at rest: how long it stays the same
+RESTS = 5  # spans without sliding, from which an arm rests
+
+
+@njit(cache=True, error_model="numpy")
+def update(filter, noise, b):
+    """Take a balance into the estimate.
+
+    Args:
+        filter: `Filter`. noise: `Noise`. b: `Balance`.
+    """
+    x, P, count = filter.x, filter.P, filter.count
+    N, n = len(x), len(b.y)
+    payload, rub, path, slides = b.payload, b.rub, b.path, b.slides
+    S0, O0, E0, A0 = BODY, BODY + n, BODY + 2 * n, BODY + 3 * n
+    moves = False
+    for j in range(n):
+        moves |= slides[j] > 0.0
+    count[2] = 0 if moves else count[2] + 1
+    if count[2] >= RESTS:  # what is in the hand may become other unseen
+        for i in range(BODY):
+            share = noise.prior[i] / noise.prior[0]
+            P[i, i] = min(P[i, i] + noise.resting * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
+    for c in range(BODY):
+        P[c, c] += (noise.creeping * noise.prior[c]) ** 2 * T
+    fade = np.exp(-T / noise.lasting)
+    for j in range(n):
+        e, used, load = E0 + j, slides[j] > 0.0, 0.0
+        for c in range(BODY):
+            load += payload[j, c] * x[c]
+        model = np.sqrt(noise.model[j] ** 2 + (noise.loaded * load) ** 2)
+        if used:
+            x[e] *= fade
+            for i in range(N):
+                P[e, i] *= fade
+                P[i, e] *= fade
+            P[e, e] += model**2 * (1.0 - fade * fade)
+        P[e, e] += noise.turning[j] ** 2 * noise.level[j] * path[j]
+        most = model**2 + (2.0 * noise.turning[j] * noise.level[j]) ** 2
+        if P[e, e] > most:  # it has come to where nothing is known of it
+            for i in range(N):
+                if i != e:
+                    P[e, i] *= np.sqrt(most / P[e, e])
+                    P[i, e] = P[e, i]
+            P[e, e] = most
+        a, slow = A0 + j, np.exp(-T / (SLOW * noise.lasting))
+        x[a] *= slow
+        for i in range(N):
+            P[a, i] *= slow
+            P[i, a] *= slow
+        P[a, a] += noise.moving[j] ** 2 * (1.0 - slow * slow)
+        P[S0 + j, S0 + j] += noise.warming**2 * T
+        P[O0 + j, O0 + j] += noise.drifting[j] ** 2 * T
+        for k in range(count[1]):
+            for c in range(JUMP):
+                filter.f[k, e, c] *= fade if used else 1.0
+                filter.f[k, a, c] *= slow
+    if moves:
+        _begin_onset(filter)
+    h, g = filter.work[0], filter.work[1]
+    for j in range(n):
+        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2
+        if slides[j] == 0.0:
+            R += noise.edge[j] ** 2 / 3.0 * REST_S / T
+        for i in range(N):
+            s = P[i, S0 + j] * rub[j] + P[i, O0 + j] + P[i, E0 + j] + P[i, A0 + j] * b.change[j]
+            for c in range(BODY):
+                s += P[i, c] * payload[j, c]
+            h[i] = s
+        S = R + h[S0 + j] * rub[j] + h[O0 + j] + h[E0 + j] + h[A0 + j] * b.change[j]
+        v = b.y[j] - x[S0 + j] * rub[j] - x[O0 + j] - x[E0 + j] - x[A0 + j] * b.change[j]
+        for i in range(n):
+            v -= noise.inertia[j, i] * b.faster[i] + noise.late[j, i] * b.firmer[i]
+        for c in range(BODY):
+            S += h[c] * payload[j, c]
+            v -= x[c] * payload[j, c]
+        filter.seen[0, j], filter.seen[1, j] = v, S
+        for k in range(count[1]):
+            f, C, d = filter.f[k], filter.information[k], filter.vector[k]
+            for c in range(JUMP):
+                s = payload[j, c] - f[S0 + j, c] * rub[j] - f[O0 + j, c] - f[E0 + j, c] - f[A0 + j, c] * b.change[j]
+                for i in range(BODY):
+                    s -= payload[j, i] * f[i, c]
+                g[c] = s
+            for c in range(JUMP):
+                d[c] += g[c] * v / S
+                for i in range(JUMP):
+                    C[c, i] += g[c] * g[i] / S
+                for i in range(N):
+                    f[i, c] += h[i] / S * g[c]
+        for i in range(N):
+            gain = h[i] / S
+            x[i] += gain * v
+            for k in range(N):
+                P[i, k] -= gain * h[k]
+    count[0] += 1
+    _weigh(filter, noise)
+
+
+@njit(cache=True)
+def _begin_onset(filter):
+    """Let a jump that begins with this span take the place of the oldest."""
+    at = filter.count[3]
+    filter.f[at] = 0.0
+    filter.information[at] = 0.0
+    filter.vector[at] = 0.0
+    filter.count[3] = (at + 1) % LATEST
+    filter.count[1] = min(filter.count[1] + 1, LATEST)
+
+
+@njit(cache=True, error_model="numpy")
+def _weigh(filter, noise):
+    """Write the odds of a jump: of each onset exp(d (C + P0^-1)^-1 d / 2) / sqrt(det(1 + P0 C))."""
+    best, at, most, total = -np.inf, -1, -np.inf, 0.0
+    A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
+    logs = np.empty(LATEST)
+    for k in range(filter.count[1]):
+        logs[k] = _solve(filter.information[k], filter.vector[k], noise.prior, A, b)
+        if logs[k] > best:
+            best, at = logs[k], k
+    if at >= 0:
+        most = best
+        for k in range(filter.count[1]):
+            total += np.exp(logs[k] - most)
+        most += np.log(total / filter.count[1])
+    filter.odds[0], filter.odds[1], filter.odds[2] = most, best, at
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(C, d, prior, A, b):
+    """Return the log odds; leave Cholesky's root of C + P0^-1 in A, its diagonal inverted, and its solution in b."""
+    log = 0.0
+    for i in range(JUMP):
+        for k in range(i + 1):
+            s = C[i, k] + (1.0 / prior[i] ** 2 if i == k else 0.0)
+            for c in range(k):
+                s -= A[i, c] * A[k, c]
+            A[i, k] = s * A[k, k] if k < i else 1.0 / np.sqrt(s)
+        log += np.log(A[i, i]) - np.log(prior[i])
+    for i in range(JUMP):
+        s = d[i]
+        for c in range(i):
+            s -= A[i, c] * b[c]
+        b[i] = s * A[i, i]
+        log += 0.5 * b[i] * b[i]
+    for i in range(JUMP - 1, -1, -1):
+        s = b[i]
+        for c in range(i + 1, JUMP):
+            s -= A[c, i] * b[c]
+        b[i] = s * A[i, i]
+    return log
+
+
+@njit(cache=True, error_model="numpy")
+def jump(filter, noise):
+    """Take the likeliest jump into the estimate; forget the onsets."""
+    k, N = int(filter.odds[2]), len(filter.x)
+    A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
+    _solve(filter.information[k], filter.vector[k], noise.prior, A, b)
+    B = -filter.f[k]
+    for c in range(JUMP):
+        B[c, c] += 1.0
+    inverse = np.zeros((JUMP, JUMP))  # of the root
+    for c in range(JUMP):
+        inverse[c, c] = A[c, c]
+        for i in range(c + 1, JUMP):
+            s = 0.0
+            for m in range(c, i):
+                s -= A[i, m] * inverse[m, c]
+            inverse[i, c] = s * A[i, i]
+    spread = np.zeros((N, JUMP))  # B (C + P0^-1)^-1 B^T = spread spread^T
+    for i in range(N):
+        for m in range(JUMP):
+            for c in range(m + 1):
+                spread[i, m] += B[i, c] * inverse[m, c]
+        for c in range(JUMP):
+            filter.x[i] += B[i, c] * b[c]
+    for i in range(N):
+        for k2 in range(N):
+            for m in range(JUMP):
+                filter.P[i, k2] += spread[i, m] * spread[k2, m]
+    for c in range(BODY):  # it may have been within the span: what is found now is a beginning
+        filter.P[c, c] += (noise.prior[c] * (AFRESH if c < JUMP else 1.0)) ** 2
+    filter.count[1] = 0
+    filter.count[3] = 0

@@ -1,0 +1,169 @@
+"""How wrong what is believed of an arm may be: from its identification, and from motion without a payload."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from r2s.adaptation.balance import Balance, Kept, observe
+from r2s.adaptation.believed import FIRM, Believed
+from r2s.adaptation.kalman import Filter, Noise, T, update
+from r2s.adaptation.momentum import BODY
+from r2s.identification.parameters import ParameterSpace
+from r2s.physics.payload import FARTHEST_M, MOST_KG
+from r2s.recordings.recording import Recording
+
+MASS = MOST_KG / np.sqrt(3)  # kg, root mean square of what is uniform up to the most
+MOMENT = MASS * FARTHEST_M / np.sqrt(5)  # kg m, of each axis, for centres uniform in the ball
+TENSOR = 4e-3  # kg m^2: 0.87 kg, 5 cm from the hand and 5 cm thick
+WARMED = 0.1  # share of friction that warmth may have changed since the identification
+WARMING = 0.02  # 1/sqrt(s): a fifth in 100 s
+DRIFTED, DRIFTING = 0.05, 0.005  # of friction's level; per sqrt(s)
+RESTING = 0.1  # kg^2/s
+CREEPING = 0.01  # 1/sqrt(s)
+LASTING = 0.3  # s
+# where no motion without a payload says how wrong the model is: shares of friction's level
+WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
+LAGS = range(3, 16)  # spans, between which the errors of a balance have forgotten the noise of the speeds
+LEAST = 50  # spans of sliding that say something
+FINEST = 0.03  # of the level: better nobody knows friction
+RIDGE = 1e-3
+LEAST_SCALE = 0.5
+LOADED = 0.015  # Nm of friction per Nm of a payload
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Standard deviations of friction's share (n,) and of the offsets (n,) Nm, as an identification left them."""
+
+    friction: np.ndarray
+    offset: np.ndarray
+
+
+def prior_of(space: ParameterSpace, samples: np.ndarray) -> Prior:
+    """Return what the draws (S, P) of an identification say."""
+    d = space.dynamics(samples)
+    firm = np.full(space.n, FIRM)
+    levels = 0.5 * (d.friction(firm) - d.friction(-firm))
+    middle = np.maximum(np.abs(np.median(levels, 0)), 1e-9)
+    return Prior(levels.std(0) / middle, np.broadcast_to(d.offset, levels.shape).std(0))
+
+
+def noise_of(arm: Believed, prior: Prior | None = None) -> Noise:
+    """Return the noise of an arm of which no motion is known, or the draws of an identification alone."""
+    n = len(arm.level)
+    zero = np.zeros(n)
+    known = prior or Prior(zero + 0.3, 0.3 * arm.level)
+    friction = np.hypot(known.friction, WARMED)
+    offset = np.hypot(known.offset, DRIFTED * arm.level)
+    payload = np.array([MASS, *[MOMENT] * 3, *[TENSOR] * 3, *[0.5 * TENSOR] * 3])
+    return Noise(
+        white=WHITE * arm.level,
+        moving=zero + MOVING,
+        model=MODEL * arm.level,
+        lasting=LASTING,
+        turning=zero + TURNING,
+        level=arm.level,
+        edge=arm.edge,
+        inertia=np.zeros((n, n)),
+        late=np.zeros((n, n)),
+        loaded=LOADED,
+        warming=WARMING,
+        drifting=DRIFTING * arm.level,
+        resting=RESTING,
+        creeping=CREEPING,
+        prior=np.concatenate([payload, friction, offset, MODEL * arm.level, zero + MOVING]),
+    )
+
+
+def balances(arm: Believed, recording: Recording) -> list[Balance]:
+    """Return the balances of a recording of commanded torque, of every span in it."""
+    n, out = recording.n_joints, []
+    for stretch in recording.stretches:
+        kept, b = Kept.fresh(n), Balance.empty(n)
+        for k in range(stretch.start, stretch.stop):
+            if observe(arm, kept, recording.q[k], recording.dq[k], recording.tau[k], b):
+                out.append(Balance(*(a.copy() for a in b)))
+    return out
+
+
+def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: list[Balance]) -> Noise:
+    """Return the noise that motion without a payload has, such as the two motions of an identification.
+
+    `train` says what the model lacks of inertia and delay. `unloaded`, which should be other motion, says the rest.
+    Per joint: the model's error from covariances at lags of 60 to 300 ms, white noise and its growth with the
+    momentum's rate from what is left. Then all of a joint's are scaled so that the filter's innovations on that
+    motion have the variances that it believes, in the 99th percentile too, where there is more of that.
+    """
+    noise, n = noise_of(arm, prior), len(arm.level)
+    inertia, late = np.zeros((n, n)), np.zeros((n, n))
+    for j in range(n):
+        columns, y, used = _lacking(train, j)
+        if used.sum() >= LEAST:
+            columns, y = columns[used], y[used]
+            size = np.sqrt((columns**2).mean(0)) + 1e-12
+            normal = (columns / size).T @ (columns / size) + RIDGE * len(y) * np.eye(columns.shape[1])
+            found = np.linalg.solve(normal, (columns / size).T @ y) / size
+            inertia[j], late[j] = found[:n], found[n : 2 * n]
+    noise = noise._replace(inertia=inertia, late=late)
+    change = np.array([b.change for b in unloaded])
+    white, moving, model = (getattr(noise, name).copy() for name in ("white", "moving", "model"))
+    for j in range(n):
+        columns, y, used = _lacking(unloaded, j)
+        if used.sum() < LEAST:
+            continue
+        y = y - columns[:, :n] @ inertia[j] - columns[:, n : 2 * n] @ late[j]
+        own = columns[:, 2 * n :]
+        error = np.where(used, y - own @ np.linalg.lstsq(own[used], y[used], rcond=None)[0], 0.0)
+        alike = []
+        for lag in LAGS:
+            both = used[lag:] & used[:-lag]
+            if both.sum() > LEAST:
+                alike.append((error[lag:] * error[:-lag])[both].mean() / np.exp(-lag * T / LASTING))
+        most = error[used].std()
+        model[j] = np.sqrt(max(np.mean(alike), 0.0)) if alike else model[j]
+        model[j] = max(min(model[j], most), FINEST * arm.level[j])
+        square = error[used] ** 2
+        weight = 1 / (square.mean() + change[used, j] ** 2 * 1e-2)
+        both = np.column_stack([np.ones(used.sum()), change[used, j] ** 2]) * weight[:, None]
+        (floor, grows), _ = nnls(both, square * weight)
+        white[j] = np.sqrt(max(floor - model[j] ** 2, (0.1 * most) ** 2, (FINEST * arm.level[j]) ** 2))
+        moving[j] = np.sqrt(grows)
+    noise = noise._replace(white=white, moving=moving, model=model, prior=_with_model(noise.prior, model, moving))
+    for _ in range(2):
+        scale = np.maximum(_surprise(noise, unloaded), LEAST_SCALE)
+        parts = {name: getattr(noise, name) * scale for name in ("white", "moving", "model", "turning")}
+        noise = noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["moving"]))
+    return noise
+
+
+def _lacking(rows: list[Balance], j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what joint j's balances may be made of (M, 2 n + 2), the balances (M,), and where it slid (M,)."""
+    faster, firmer = np.array([b.faster for b in rows]), np.array([b.firmer for b in rows])
+    own = np.array([[b.rub[j], 1.0] for b in rows])
+    y = np.array([b.y[j] for b in rows])
+    return np.column_stack([faster, firmer, own]), y, np.array([b.slides[j] > 0 for b in rows])
+
+
+def _with_model(prior: np.ndarray, model: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    out = prior.copy()
+    out[-2 * len(model) :] = np.concatenate([model, moving])
+    return out
+
+
+def _surprise(noise: Noise, unloaded: list[Balance]) -> np.ndarray:
+    """Return (n,), by how much the innovations are larger than the filter believes, where it knows of no payload."""
+    bare = noise.prior.copy()
+    bare[:BODY] = 1e-6
+    known = noise._replace(prior=bare, resting=0.0)
+    filter, seen = Filter.fresh(bare), []
+    for b in unloaded:
+        update(filter, known, b)
+        seen.append(np.where(b.slides > 0, filter.seen[0] / np.sqrt(filter.seen[1]), np.nan))
+    surprise = np.array(seen)[len(seen) // 10 :]  # offsets are being found
+    scale = np.ones(surprise.shape[1])
+    for j in range(len(scale)):
+        own = surprise[np.isfinite(surprise[:, j]), j]
+        if len(own) >= LEAST:
+            scale[j] = max(np.sqrt(np.mean(own**2)), np.quantile(np.abs(own), 0.99) / 2.576)
+    return scale

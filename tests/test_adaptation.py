@@ -1,0 +1,221 @@
+"""Identification at work: balance and estimate are exact, intervals widen at rest, sudden changes are seen."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from conftest import conf
+
+from r2s.adaptation.balance import SPAN
+from r2s.adaptation.believed import believed
+from r2s.adaptation.estimator import Estimator, body
+from r2s.adaptation.kalman import BODY
+from r2s.adaptation.listen import at_rate, listen, table
+from r2s.adaptation.momentum import WIDE, momentum
+from r2s.adaptation.noise import balances, learnt, noise_of
+from r2s.errors import UserError
+from r2s.identification.link_inertia import pseudo_inertia
+from r2s.physics.actuation import Motors
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import carrying, loaded, payload_of
+from r2s.physics.rigid_body import LinkInertia
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.physics.simulator import Simulator
+from r2s.recordings.recording import Recording
+
+THING = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
+DELAY = 3e-3
+
+
+@cache
+def robot():
+    return load_robot(**conf("robot/panda"))
+
+
+@cache
+def truth():
+    """Return friction without a dead zone, which no model hides anything behind, and a delay."""
+    found = nominal_dynamics(robot(), **conf("friction/paper"))
+    return replace(found, delay=DELAY, breakaway=np.zeros((7, 2)), offset=np.zeros(7))
+
+
+@cache
+def recording(on=None, off=None, seconds=3.0, noise=0.0):
+    """Return what an arm of known truth does under swinging torques and a spring to home; payload from on to off."""
+    rng = np.random.default_rng(1)
+    sims = {False: truth(), True: loaded(robot(), truth(), THING)}
+    sim, motors = Simulator(robot(), sims[False], 1, 1), Motors(1, 7, DELAY)
+    sim.reset(robot().q_home[None], np.zeros((1, 7)))
+    spring = np.array([60, 120, 60, 60, 10, 10, 5.0])
+    phase, rate = rng.uniform(0, 6, 7), rng.uniform(3, 6, 7)
+    rows, holds = [], False
+    for k in range(round(seconds / SIM_DT)):
+        t = k * SIM_DT
+        now = on is not None and on <= t < (np.inf if off is None else off)
+        if now != holds:
+            sim.set_dynamics(sims[now])
+            holds = now
+        q, dq = sim.q[0].copy(), sim.dq[0].copy()
+        goal = robot().q_home + 0.5 * np.sin(rate * t + phase) * min(1.0, t)
+        tau = spring * (goal - q) - 0.15 * spring * dq
+        seen = dq + noise * rng.normal(size=7)
+        rows.append((q, seen, tau))
+        sim.rollout(motors(tau[None, None]), record=())
+    q, dq, tau = (np.array(x) for x in zip(*rows, strict=True))
+    return Recording(t=SIM_DT * np.arange(len(q)), q=q, dq=dq, tau=tau, torque="commanded")
+
+
+def standard(thing):
+    return LinkInertia(thing.mass, thing.centre, thing.inertia).standard()
+
+
+def held(arm, q):
+    """Return (7,) Nm that hold an arm with the payload at q."""
+    out = [np.empty(7) for _ in range(4)] + [np.empty((7, BODY)) for _ in range(2)]
+    momentum(arm.links, arm.moments, arm.hand, arm.gravity, arm.armature, q, 0 * q, np.empty((7, WIDE)), *out)
+    return -out[-1] @ standard(THING)
+
+
+def quiet():
+    """Return the noise of a model that is nearly right."""
+    arm = believed(robot(), truth())._replace(edge=np.array([1.0, 1, 1, 1, 0.5, 0.5, 0.5]))
+    none = noise_of(arm)
+    small = {name: 0.01 * arm.level for name in ("white", "model")}
+    zero = np.zeros(7)
+    prior = none.prior.copy()
+    prior[BODY:] *= 0.1
+    return arm, none._replace(
+        **small, moving=zero + 1e-3, turning=zero + 0.01, loaded=1e-3, creeping=0.0, prior=prior
+    )
+
+
+def test_momentum_is_mass_times_speed_and_linear_in_the_payload():
+    """It is p = M dq; push = C^T dq = dM/dt dq - C dq; the payload's columns add what the arm with it has more."""
+    r, rng = robot(), np.random.default_rng(0)
+    arm = believed(r, truth())
+    alone = links_of(r, r.mass, r.com, r.inertia)
+    full = links_of(r, *carrying(r, THING, (r.mass, r.com, r.inertia)))
+    q, dq = r.q_home + 0.3 * rng.normal(size=7), rng.normal(size=7)
+
+    def of(links, q):
+        mass, bias = np.empty((7, 7)), np.empty(7)
+        equations(links, r.gravity, q, dq, mass, bias, np.empty((7, WORK)))
+        still = np.empty(7)
+        equations(links, r.gravity, q, 0 * dq, np.empty((7, 7)), still, np.empty((7, WORK)))
+        return mass, bias - still, still
+
+    def moved(links):
+        out = [np.empty(7) for _ in range(4)] + [np.empty((7, BODY)) for _ in range(2)]
+        momentum(links, arm.moments, arm.hand, arm.gravity, np.zeros(7), q, dq, np.empty((7, WIDE)), *out)
+        return out
+
+    p, push, pull, weight, payload_p, payload_push = moved(alone)
+    p_full, push_full, pull_full, _, _, _ = moved(full)
+    mass, coriolis, still = of(full, q)
+    step = 1e-6
+    rate = (of(full, q + step * dq)[0] - of(full, q - step * dq)[0]) / (2 * step)
+    np.testing.assert_allclose(p_full, mass @ dq, atol=1e-12)
+    np.testing.assert_allclose(push_full, rate @ dq - coriolis, atol=1e-7)  # of the difference: step^2
+    np.testing.assert_allclose(pull, 0.0, atol=1e-12)
+    np.testing.assert_allclose(weight + pull_full, still, atol=1e-12)
+    np.testing.assert_allclose(p + payload_p @ standard(THING), p_full, atol=1e-12)
+    np.testing.assert_allclose(push - pull + payload_push @ standard(THING), push_full - pull_full, atol=1e-12)
+
+
+def test_the_estimate_from_data_of_known_truth_is_exact():
+    """A step's error is that of half a step, h / 2 of the torques' rate (30 Nm/s): 0.015 Nm, 4 g at 0.4 m."""
+    arm, noise = quiet()
+    data, y = recording(on=0.0), 0.5 * SIM_DT * 30
+    rows = balances(arm, data)
+    slid = np.array([b.slides > 0 for b in rows])
+    error = np.array([b.y - b.payload @ standard(THING) for b in rows])
+    assert np.sqrt((error[slid] ** 2).mean()) < y
+    estimator = Estimator(arm, noise)
+    last = listen(robot(), estimator, data)[-1]
+    assert abs(last.mass - 1.0) < y / (9.81 * 0.4)
+    np.testing.assert_allclose(last.centre, THING.centre, atol=y / 9.81 + 1e-3)
+    assert (np.abs(last.friction - 1.0) < last.friction_half).all()
+    assert estimator.changes == []
+
+
+def test_no_payload_is_no_alarm_and_no_mass():
+    arm, noise = quiet()
+    estimator = Estimator(arm, noise)
+    known = listen(robot(), estimator, recording())
+    assert estimator.changes == []
+    assert known[-1].mass < 4e-3
+    assert np.isnan(known[-1].centre).all()
+
+
+def test_a_payload_put_on_or_taken_off_is_seen_within_a_fifth_of_a_second():
+    """With the noise of real speeds, and what that motion without a payload says of the noise."""
+    arm = believed(robot(), truth())
+    free = balances(arm, recording(noise=2e-3))
+    estimator = Estimator(arm, learnt(arm, None, free, free))
+    known = listen(robot(), estimator, recording(on=1.0, off=2.0, noise=2e-3))
+    assert len(estimator.changes) == 2
+    for at, event in zip(estimator.changes, (1.0, 2.0), strict=True):
+        assert event <= at <= event + 0.2
+    before = known[round(1.9 / (SPAN * SIM_DT))]
+    assert abs(before.mass - 1.0) < before.mass_half < 0.1
+    assert abs(known[-1].mass) < known[-1].mass_half + 1e-9
+
+
+def test_an_interval_is_wide_at_rest_and_narrow_in_motion():
+    """At rest breakaway b at the lever r hides b / (r g): no interval is below the best joint's."""
+    arm, noise = quiet()
+    estimator, data = Estimator(arm, noise), recording(on=0.0)
+    moving = listen(robot(), estimator, data)[-1]
+    for _ in range(1500):  # held where it is, against the payload's weight
+        estimator(data.q[-1], np.zeros(7), held(arm, data.q[-1]))
+    resting = estimator.now
+    assert resting.rests
+    assert not moving.rests
+    lever = 0.55  # m of joint 2, and of joint 4 to the hand at home
+    hidden = min(arm.edge[1], arm.edge[3]) / (lever * 9.81)
+    assert moving.mass_half < 0.25 * hidden < 0.5 * hidden < resting.mass_half
+    assert abs(resting.mass - 1.0) < resting.mass_half
+
+
+def test_what_is_told_is_a_body_that_exists():
+    """Whatever the filter believes, the pseudo-inertia of what is told is not negative."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        mass, centre, tensor = body(rng.normal(size=10) * [1, *[0.1] * 3, *[0.01] * 6])
+        assert mass >= 0
+        if mass > 0:
+            square = (centre @ centre) * np.eye(3) - np.outer(centre, centre)
+            second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
+            assert np.linalg.eigvalsh(second).min() > -1e-12
+            about = tensor + mass * square
+            j = np.block([[0.5 * np.trace(about) * np.eye(3) - about, mass * centre[:, None]], [mass * centre, mass]])
+            assert np.linalg.eigvalsh(j).min() > -1e-9
+    thing = standard(THING)
+    np.testing.assert_allclose(body(thing)[2], THING.inertia, atol=1e-12)
+    assert np.linalg.eigvalsh(pseudo_inertia(THING.mass, THING.centre, THING.inertia)).min() > 0
+
+
+def test_the_same_data_give_the_same_estimate():
+    arm, noise = quiet()
+    first, second = (table(listen(robot(), Estimator(arm, noise), recording(on=0.0))) for _ in range(2))
+    assert first.equals(second)
+
+
+def test_what_cannot_be_listened_to_is_said():
+    data = recording()
+    with pytest.raises(UserError, match="'measured' is not allowed here; commanded is"):
+        at_rate(robot(), replace(data, torque="measured"))
+    slow = Recording(t=data.t[::10], q=data.q[::10], dq=data.dq[::10], tau=data.tau[::10], torque="commanded")
+    with pytest.raises(UserError, match="100 Hz is too slow"):
+        at_rate(robot(), slow)
+    with pytest.raises(UserError, match="6 joints"):
+        at_rate(
+            robot(), Recording(t=data.t, q=data.q[:, :6], dq=data.dq[:, :6], tau=data.tau[:, :6], torque="commanded")
+        )
+    arm, noise = quiet()
+    estimator = Estimator(arm, noise)
+    with pytest.raises(UserError, match="7 joints"):
+        estimator(np.zeros(6), np.zeros(6), np.zeros(6))
+    assert not estimator(np.full(7, np.nan), np.zeros(7), np.zeros(7))

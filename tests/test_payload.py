@@ -1,0 +1,112 @@
+"""Payloads: one body with the last link, in every engine, on and off at their time; what a wrong one is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import conf
+
+from r2s.arm.simulated import SimulatedArm
+from r2s.arm.twins import twin
+from r2s.engines.dart import DartEngine
+from r2s.errors import UserError
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import carrying, loaded, payload_of
+from r2s.physics.rigid_body import mass_matrix
+
+THING = {"mass": 1.2, "centre": [0.02, -0.03, 0.05], "inertia": [2e-3, 3e-3, 2.5e-3, 1e-4, 0.0, 2e-4]}
+SWING = np.array([6, 6, 6, 6, 1, 1, 0.5])
+
+
+def bare(robot):
+    return robot.mass, robot.com, robot.inertia
+
+
+def swung(arm, cycles=60):
+    """Return where an arm gets to under the same commands."""
+    arm.move_to(arm.robot.q_home)
+    for k in range(cycles):
+        arm.command(np.sin(0.02 * k) * SWING)
+    return arm.read().q
+
+
+def test_arm_and_payload_are_one_body(panda):
+    """Kinetic energy and weight are those of the bare arm and of the body, each by itself, at any posture."""
+    rng, thing = np.random.default_rng(0), payload_of(THING)
+    arm = links_of(panda, *carrying(panda, thing, bare(panda)))
+    alone = links_of(panda, *bare(panda))
+    engine = DartEngine(panda, gravity=True)
+    engine.relink(*(a[-1] for a in carrying(panda, thing, bare(panda))))
+    for _ in range(5):
+        q = panda.q_home + rng.normal(size=7) * 0.3
+        results = []
+        for links in (arm, alone):
+            mass, bias = np.empty((7, 7)), np.empty(7)
+            equations(links, panda.gravity, q, np.zeros(7), mass, bias, np.empty((7, WORK)))
+            results.append((mass, bias))
+        (mass, weight), (own, own_weight) = results
+        np.testing.assert_allclose(engine.mass_matrix(q), mass + np.diag(panda.armature), atol=1e-12)
+        np.testing.assert_allclose(engine.gravity_torque(q), weight, atol=1e-11)
+        np.testing.assert_allclose(mass_matrix(panda, q[None])[0], own + np.diag(panda.armature), atol=1e-12)
+        added = np.linalg.eigvalsh(mass - own)
+        assert added.min() > -1e-12 < added.max()  # a body takes kinetic energy from no motion
+        assert np.abs(weight - own_weight).max() > 1
+
+
+def test_a_payload_is_there_from_on_to_off(panda):
+    """Before it is put on nothing differs, bit for bit; one that comes and goes leaves less than one that stays."""
+    for make in (1, 2):
+        ends = {}
+        for name, payload in (
+            ("none", 0.0),
+            ("later", {**THING, "on_s": 0.06}),
+            ("brief", {**THING, "on_s": 0.02, "off_s": 0.03}),
+            ("always", THING),
+        ):
+            ends[name] = swung(twin(panda, make=make, seed=3, payload=payload))
+        np.testing.assert_array_equal(ends["later"], ends["none"])
+        far = {name: np.abs(q - ends["none"]).max() for name, q in ends.items()}
+        assert 0 < far["brief"] < far["always"]
+
+
+def test_training_physics_takes_a_payload_and_what_the_arm_was_told(panda):
+    """A load told rightly leaves only its inertia: at rest the arm stays; a load told of nothing throws it up."""
+    nominal = nominal_dynamics(panda, **conf("friction/gaz2019"))
+    free = replace(nominal, phi=np.zeros((7, 3)))
+    thing, still = payload_of(THING), {"position_noise": 0.0, "velocity_noise": 0.0}
+
+    def after(payload, load):
+        arm = SimulatedArm(panda, free, payload=payload, load=load, **still)
+        arm.move_to(panda.q_home)
+        for _ in range(50):
+            arm.command(np.zeros(7))
+        return arm.read().q - panda.q_home
+
+    np.testing.assert_allclose(after(thing, thing), 0.0, atol=1e-12)
+    down, up = after(thing, None), after(None, thing)
+    assert np.abs(down).max() > 1e-3
+    assert (np.sign(down[[1, 3]]) == -np.sign(up[[1, 3]])).all()
+    both = loaded(panda, free, thing)
+    assert both.mass[-1] == pytest.approx(free.mass[-1] + 1.2)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (-0.1, r"arm.payload: -0.1 is not allowed; a number in \[0, 1.5\]"),
+        (1.6, r"arm.payload: 1.6 is not allowed"),
+        ({"mass": 2}, r"arm.payload.mass: 2 is not allowed"),
+        ({"centre": [0, 0, 0]}, "it has no mass"),
+        ({"mass": 1, "center": [0, 0, 0]}, "no 'center'.*did you mean 'centre'"),
+        ({"mass": 1, "centre": [0, 0.06, 0.06]}, "0.0849 m from the hand; allowed are 0.075"),
+        ({"mass": 1, "centre": [0, float("nan"), 0]}, "3 finite numbers"),
+        ({"mass": 1, "inertia": [1e-3, 1e-3, 3e-3]}, "are of no body"),
+        ({"mass": 1, "inertia": [1e-3, 1e-3, 1e-3, 2e-3, 0, 0]}, "all must be above 0"),
+        ({"mass": 1, "inertia": [1, 1, 1]}, "too much"),
+        ({"mass": 1, "on_s": 2, "off_s": 1}, "off_s: 1 is not after on_s"),
+    ],
+)
+def test_a_payload_that_cannot_be_is_said(value, said):
+    with pytest.raises(UserError, match=said):
+        payload_of(value)
