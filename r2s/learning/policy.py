@@ -19,7 +19,7 @@ from r2s.tasks.task import Task
 def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
     """Return an untrained policy of this arm and task."""
     mean, std = (torch.from_numpy(x) for x in task.observation_scale(robot))
-    torque = torch.from_numpy(task.torque(robot)).float()
+    torque = torch.from_numpy(task.share * task.torque(robot)).float()
     return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
 
 

@@ -79,9 +79,12 @@ def transfer(cfg, overrides):
 
     source, trained = trained_config(cfg)
     check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
-    robot, task = make_robot(trained), make_task(trained)
+    robot = make_robot(trained)
+    center = make_dynamics(trained, robot)
+    task = make_task(trained, robot, center)
     set_threads(cfg)
-    policy = load_policy(source, robot, task) if is_learner(trained) else make_controller(trained, robot, task)
+    learned = is_learner(trained)
+    policy = load_policy(source, robot, task) if learned else make_controller(trained, robot, task, center)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
@@ -91,7 +94,6 @@ def transfer(cfg, overrides):
             check_path(robot, np.array([robot.q_home, start]), what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
-    center = make_dynamics(trained, robot)
     friction, dynamics, draw = center.level, None, None
     if cfg.simulator.name != "none":
         dynamics = center
@@ -111,7 +113,7 @@ def transfer(cfg, overrides):
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         on_twin = None
         if twin:  # first: it forks, and then there are no threads yet
-            progress, shown = counted(f"reach on {cfg.arm.name}")
+            progress, shown = counted(f"on {cfg.arm.name}")
             opens = partial(opened_arms, cfg, robot, task, friction)
             on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
             progress.close()
@@ -119,7 +121,7 @@ def transfer(cfg, overrides):
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = task.measures(done), done
             if engine is not None:
-                progress, shown = counted(f"reach in {cfg.simulator.name}")
+                progress, shown = counted(f"in {cfg.simulator.name}")
                 arms = EngineArms(engine, robot, task, draw, len(goals))
                 done = rollout(policy, arms, task, starts, goals, shown)
                 progress.close()
@@ -135,7 +137,7 @@ def transfer(cfg, overrides):
             if on_twin is not None:
                 done, stops, timing = on_twin
             elif driven is not None:
-                progress, shown = counted(f"reach on {cfg.arm.name}")
+                progress, shown = counted(f"on {cfg.arm.name}")
                 done = rollout(policy, driven, task, starts, goals, shown)
                 stops, timing, halted, count = driven.stops, driven.timing, driven.halted, driven.done
                 progress.close()
