@@ -93,5 +93,6 @@ def _facts(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
         "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),
         "torque_scale_Nm": " ".join(f"{t:g}" for t in policy.torque_scale.tolist()),
         "low_pass_hz": str(task.cutoff_hz),
-        "torque": "without gravity, before low-pass, clip and rate limit",
+        "torque": "without gravity, before low-pass, clip and rate limit"
+        + ("" if task.share == 1.0 else "; to be added to the task's base"),
     }

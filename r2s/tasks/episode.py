@@ -111,8 +111,8 @@ def rollout(
     t = (1 + np.arange(task.steps)) / task.ctrl_hz
     q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
     return Episodes(
-        t=t, q=q, dq=dq, ee=ee, goal=task.places(goals), tau=tau, distance=distance, reward=reward, reward_smooth=smooth,
-        q_left=q_left, limited=limited,
+        t=t, q=q, dq=dq, ee=ee, goal=task.places(goals), tau=tau, distance=distance, reward=reward,
+        reward_smooth=smooth, q_left=q_left, limited=limited,
     )  # fmt: skip
 
 

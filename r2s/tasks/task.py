@@ -50,8 +50,8 @@ class Episodes:
 
     Attributes:
         t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves, as of
-        `Task.places`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m. reward: (E, T), under
-        `Task.paper_weights`: of reaching, eq. (2).
+        `Task.places`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m. reward: (E, T),
+        under `Task.paper_weights`: of reaching, eq. (2).
         reward_smooth: (E, T), the same with the noise of the speeds taken out, where an arm measured them.
         q_left: (E,) rad, how close any joint came to a position limit.
         limited: (E,), in which share of the cycles the driver's law changed what was asked for.
@@ -120,7 +120,7 @@ class Task(Protocol):
         ...
 
     def places(self, goals: np.ndarray) -> np.ndarray:
-        """Return what is asked, to look at: points (m, 3) m, or (m, steps, 3) where the hand is to be after each step."""
+        """Return what is asked, to look at: points (m, 3) m, or (m, steps, 3) where the hand belongs after a step."""
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,9 @@
 """Timed paths of a hand: curves at any tilt, the postures that follow them, and a pace that the arm can keep.
 
-A curve is x(u) m, u in metres at its fastest. Postures q(u) come from inverse kinematics on a grid and a cubic spline
-through it. The clock u(t) ramps in from rest and out to rest with minimum-jerk speed, at a pace of v m/s. So position,
-velocity and acceleration of hand and joints are continuous, and one number, the pace, is made smaller until torque,
-speed and the acceleration that the driver's law lets through have room left.
+A curve is x(u) m, u in metres at its fastest. Postures q(u) come from inverse kinematics on a grid and a cubic
+spline through it. The clock u(t) ramps in from rest and out to rest with minimum-jerk speed, at a pace of v m/s. So
+position, velocity and acceleration of hand and joints are continuous, and one number, the pace, is made smaller until
+torque, speed and the acceleration that the driver's law lets through have room left.
 """
 
 from collections.abc import Callable
@@ -43,9 +43,7 @@ def curve(kind: str, rng: np.random.Generator, size: float) -> Curve:
             return lambda u: size * (np.outer(np.cos(u / size) - 1, a) + way * np.outer(np.sin(u / size), b))
         case "eight":
             pace = 1 / (np.sqrt(2) * size)  # of the lemniscate of Gerono, fastest where it crosses itself
-            return lambda u: size * (
-                np.outer(np.sin(pace * u), a) + 0.5 * way * np.outer(np.sin(2 * pace * u), b)
-            )
+            return lambda u: size * (np.outer(np.sin(pace * u), a) + 0.5 * way * np.outer(np.sin(2 * pace * u), b))
         case "waypoints":
             return _waypoints(rng, size)
     order = np.arange(1, HARMONICS + 1)

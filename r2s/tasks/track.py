@@ -1,4 +1,4 @@
-"""Follow a timed path with the hand: which paths, what a policy observes, what it changes, and what a step is worth."""
+"""Follow a timed path with the hand: which paths, what a policy observes and changes, and what a step is worth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -32,7 +32,7 @@ CALMED = 0.45  # of a loop that is late by T: its rate x T. 1 / e does not overs
 class TrackTask(Usual):
     """Follow a path on time; a `Task` (r2s/tasks/task.py) from conf/task/track.yaml.
 
-    A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/timed_path.py, a row each control step from the start.
+    A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/timed_path.py, a row for each control step.
 
     Attributes:
         ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: of its beginning and of its end.
@@ -191,8 +191,8 @@ class TrackTask(Usual):
         centre, scale = self._region.observation_scale(robot)
         based = n if self.base == "model" else 0
         ahead = np.repeat(self.speed[1] * np.arange(1, self.preview + 1) / self.ctrl_hz, 3)
-        own = [ahead, np.full(3, 0.3), np.ones(3), [0.3], np.full(n, NEAR_RAD), np.full(n, 0.2), np.full(based, 0.3)]
-        more = np.concatenate(own)
+        widths = (3, 0.3), (3, 1.0), (1, 0.3), (n, NEAR_RAD), (n, 0.2), (based, 0.3)
+        more = np.concatenate([ahead, *(np.full(wide, x) for wide, x in widths)])
         scale = scale.copy()
         scale[2 * n + 6 : 2 * n + 9] = FAR_M  # the error
         scale[3 * n + 12 : 4 * n + 12] = FAR_M  # J'error
@@ -203,7 +203,8 @@ class TrackTask(Usual):
         n = state.q.shape[1]
         rows, k = np.arange(len(goals)), self._at(state.t)
         now = goals[rows, k]
-        first = observe(state.q, state.dq, state.ee, np.ascontiguousarray(now[:, X]), state.jacobian, state.effort, torque)
+        place = np.ascontiguousarray(now[:, X])
+        first = observe(state.q, state.dq, state.ee, place, state.jacobian, state.effort, torque)
         ahead = goals[rows[:, None], k[:, None] + np.arange(1, self.preview + 1), X] - state.ee[:, None]
         own = [ahead.reshape(len(goals), -1), now[:, V], np.tanh((now[:, X] - state.ee) / FINE_M)]
         own += [state.limited[:, None], now[:, 6 : 6 + n] - state.q, now[:, 6 + n : 6 + 2 * n] - state.dq]
@@ -217,7 +218,7 @@ class TrackTask(Usual):
         return own + self.computed(state, goals) if self.base == "model" else own
 
     def late(self, dynamics: Dynamics) -> float:
-        """Return s, by which a command acts late: half a control period, the low-pass, and what the model believes."""
+        """Return s, by which a command acts late: half a control period, the low-pass, what the model believes."""
         return 0.5 / self.ctrl_hz + 1 / (2 * np.pi * self.cutoff_hz) + float(dynamics.delay) + float(dynamics.lag)
 
     def stiffness(self) -> float:
@@ -262,11 +263,11 @@ class TrackTask(Usual):
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv.
 
-        path_rmse_mm: of the hand's distance from where it is to be, over all steps of all paths that were not stopped.
-        path_max_mm: the largest of a path, mean over them. within_x: share of the steps, those of stopped paths are
-        not. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: over joints and time.
-        jerk: m/s^3, RMS of the hand's, by a cubic through JERK_S. stopped: share of the paths. q_left_rad, limited:
-        as of reaching.
+        path_rmse_mm: of the hand's distance from where it is to be, over all steps of all paths that were not
+        stopped. path_max_mm: the largest of a path, mean over them. within_x: share of the steps, of which those of
+        stopped paths count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm:
+        over joints and time. jerk: m/s^3, RMS of the hand's, by a cubic through JERK_S. stopped: share of the paths.
+        q_left_rad, limited: as of reaching.
         """
         ended = ~np.isfinite(episodes.distance).all(1)
         error = 1e3 * episodes.distance[~ended]
