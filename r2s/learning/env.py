@@ -15,6 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s.learning.batch import ArmBatch, check_finite
+from r2s.learning.randomization import Pushes
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task
@@ -30,7 +31,8 @@ class TaskEnv(EnvBase):
 
     Args:
         robot, task: the arm and what is asked of it.
-        draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator.
+        draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator. One that
+            `Pushes` is asked for torques at every step as well.
         nsim: arms. nthread: 0 is all.
         seed: of goals, starts and draws.
         stagger: let the first episodes of eight groups of arms end at different times, not those of all at once.
@@ -145,6 +147,8 @@ class TaskEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].numpy().astype(np.float64)
+        if isinstance(self.draw, Pushes):
+            self.arms.push(self.draw.forces(self.rng, self.nsim))
         state = self.arms.step(self.task.target(action, self._now, self.goal, self._torque))
         self._now = state
         self._count += 1
