@@ -115,8 +115,7 @@ class Simulator:
 
     def _arrays(self) -> dict[str, np.ndarray]:
         names = ("q", "dq", "_memory", "_damping", "_user", "_armature", "_inertia", "_iquat", "_mass", "_com")
-        names += ("_offset",)
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in (*names, "_offset")}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
         """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""
