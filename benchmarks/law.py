@@ -118,8 +118,10 @@ def main(folder: str) -> None:
     """Write docs/law.md."""
     cfg = OmegaConf.create({"policy": folder})
     source, trained = trained_config(cfg)
-    robot, task = make_robot(trained), make_task(trained)
-    policy, dynamics = load_policy(source, robot, task), make_dynamics(trained, robot)
+    robot = make_robot(trained)
+    dynamics = make_dynamics(trained, robot)
+    task = make_task(trained, robot, dynamics)
+    policy = load_policy(source, robot, task)
     starts, goals = fixed_episodes(robot, task, GOALS)
     rows = {}
     for ms in DELAYS_MS:

@@ -395,8 +395,8 @@ def _config(folder: Path, task) -> str:
         cfg.policy = str(folder)
         _, trained = trained_config(cfg)
         robot = build.make_robot(trained)
-        build.make_task(trained)
         dynamics = build.make_dynamics(trained, robot)
+        build.make_task(trained, robot, dynamics)
         build.make_draw(trained, robot, dynamics)
         said.append(plausible(dynamics))
 

@@ -91,10 +91,12 @@ def export(typed: Namespace) -> None:
     source, trained = trained_config(Namespace(policy=typed.run))
     if not is_learner(trained):
         raise UserError(f"export: {source} is of algo={trained.algo.name}, which is no network that could travel")
-    robot, task = make_robot(trained), make_task(trained)
+    robot = make_robot(trained)
+    center = make_dynamics(trained, robot)
+    task = make_task(trained, robot, center)
     policy, to = load_policy(source, robot, task), typed.to or source / "bundle"
     places = [path.stem for group in ("simulator", "arm") for path in (CONF / group).glob("*.yaml")]
-    write_bundle(to, source, robot, task, make_dynamics(trained, robot), policy, plain(trained), places)
+    write_bundle(to, source, robot, task, center, policy, plain(trained), places)
     print(f"written: {to}")
 
 

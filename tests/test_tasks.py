@@ -18,13 +18,13 @@ from r2s.physics.contacts import touching
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.tasks.episode import measures, rollout
-from r2s.tasks.task import Task
+from r2s.tasks.task import Task, Usual
 
 PANDA = load_robot(**conf("robot/panda"))
 NEW = nominal_dynamics(PANDA, **conf("friction/paper"))
 
 
-class Line:
+class Line(Usual):
     """Follow a point that moves on a line; its place 0.2 s ahead is in the observation. Goals are (m, 2, 3), ends."""
 
     ctrl_hz, cutoff_hz, steps, substeps = 50, 100.0, 10, 20

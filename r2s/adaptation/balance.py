@@ -8,10 +8,10 @@ what is not known, y = H x + noise.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from r2s.adaptation.believed import friction
 from r2s.adaptation.momentum import BODY, WIDE, momentum
+from r2s.compiled import njit
 from r2s.physics.actuation import SLOTS, turn
 from r2s.physics.robot import SIM_DT
 

@@ -7,8 +7,8 @@ direction, and what goes with the velocity alone.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics.actuation import steps_late
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING

@@ -14,10 +14,10 @@ mean of these odds has expectation 1 without a jump, so that by Markov's inequal
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from r2s.adaptation.balance import SPAN
 from r2s.adaptation.momentum import BODY
+from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT
 
 T = SPAN * SIM_DT

@@ -5,8 +5,7 @@ S_j a joint's screw about the base's origin and h_j the momentum of everything b
 (C^T dq)_j = dS_j/dt . h_j; all of it is linear in each body's mass m, first moments h and tensor about its frame.
 """
 
-from numba import njit
-
+from r2s.compiled import njit
 from r2s.physics.newton_euler import AXIS, COM, MASS, PLACE, product, spun, turned
 from r2s.physics.newton_euler import FRAME as TURN
 from r2s.physics.newton_euler import TENSOR as INERTIA

@@ -44,6 +44,10 @@ class ArmBatch:
         """Give the arms `ids` new dynamics, delay and lag."""
         self.sim.set_dynamics(dynamics, ids)
 
+    def push(self, tau: np.ndarray) -> None:
+        """Let something else push the joints with tau (width, n) Nm from now on."""
+        self.sim.push(tau)
+
     def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
         """Put the arms `ids` (all by default) at rest at starts (m, n) rad; return the state of all."""
         self.sim.reset(starts, np.zeros_like(starts), ids)

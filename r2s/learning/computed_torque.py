@@ -9,12 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2s.errors import UserError
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import ALLOWED
 from r2s.physics.rigid_body import put_links
 from r2s.physics.robot import Robot
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.task import Task
+from r2s.tasks.track import TrackTask
 
 STIFF = 12.0  # rad/s, bandwidth of the feedback, critically damped: 50 Hz and the delays of an arm bear no more
 POSTURE = 1e-3  # weight of staying near the start in the inverse kinematics, against metres of the end effector
@@ -82,3 +85,35 @@ class Oracle:
             step = np.linalg.solve(h, jacobian.T @ error)
             q = np.clip(q + step * min(1.0, 0.3 / np.abs(step).max()), low, high)
         return q
+
+
+class Still:
+    """Asks for nothing beyond a task's base; `action` as of r2s.learning.networks.Policy.
+
+    Args:
+        joints: how many an action has.
+    """
+
+    def __init__(self, joints: int):
+        self._joints = joints
+
+    def action(self, observation: Tensor) -> Tensor:
+        """Return actions (B, n) of zero."""
+        return torch.zeros(len(observation), self._joints)
+
+
+def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Still:
+    """Return what follows a plan by inverse dynamics with feedback, no learning: `algo=computed_torque`.
+
+    A task that has such a base needs nothing more. Of reaching the plan is a minimum-jerk motion, which is `Oracle`.
+
+    Raises:
+        UserError: the task has neither.
+    """
+    if isinstance(task, TrackTask):
+        if task.base != "model":
+            raise UserError(f"task.base: {task.base} leaves algo=computed_torque nothing to do; model is allowed")
+        return Still(robot.n)
+    if isinstance(task, ReachTask):
+        return Oracle(robot, task, dynamics)
+    raise UserError(f"algo=computed_torque: it knows of no plan for {type(task).__name__}; reach and track have one")

@@ -15,12 +15,12 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s.learning.batch import ArmBatch, check_finite
+from r2s.learning.randomization import Pushes
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task
 
 GROUPS = 8  # of arms that are reset together: a reset of four costs hardly more than one of one
-POOL = 2048  # goals that episodes draw from
 
 
 class TaskEnv(EnvBase):
@@ -31,7 +31,8 @@ class TaskEnv(EnvBase):
 
     Args:
         robot, task: the arm and what is asked of it.
-        draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator.
+        draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator. One that
+            `Pushes` is asked for torques at every step as well.
         nsim: arms. nthread: 0 is all.
         seed: of goals, starts and draws.
         stagger: let the first episodes of eight groups of arms end at different times, not those of all at once.
@@ -58,10 +59,10 @@ class TaskEnv(EnvBase):
         self.weights = task.paper_weights
         self._torque = task.torque(robot)
         self._stagger = stagger
-        self._pool = task.goals(robot, np.random.default_rng(of_goals), POOL)
+        self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
-        self._reference = np.ones(nsim)
+        self._reference, self._now = np.ones(nsim), self.arms.read()
         shape, wide = (nsim,), len(task.observation_scale(robot)[0])
         self.observation_spec = Composite(
             observation=Unbounded((nsim, wide), dtype=torch.float32),
@@ -80,6 +81,7 @@ class TaskEnv(EnvBase):
         at = slice(None) if ids is None else ids
         self.goal[at], self._dq[at], self._count[at] = goal, 0.0, 0
         self._reference[at] = self.task.reference(state, self.goal)[at]
+        self._now = state
         return state
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -93,7 +95,8 @@ class TaskEnv(EnvBase):
         """Draw arms, starts and goals for `ids`; return the state of all arms."""
         self.arms.set_dynamics(self.draw(self.rng, len(ids)), ids)
         q = self.task.starts(self.robot, self.rng, len(ids))
-        state = self.place(q, self._pool[self.rng.integers(len(self._pool), size=len(ids))], ids)
+        goals = self._pool[self.rng.integers(len(self._pool), size=len(ids))]
+        state = self.place(self.task.begin(q, goals), goals, ids)
         if self._stagger:
             self._count[ids] = ids * GROUPS // self.nsim * self.task.steps // GROUPS
             self._stagger = False
@@ -140,9 +143,14 @@ class TaskEnv(EnvBase):
         self.arms.set_state(state["arms"])
         self.rng.bit_generator.state = state["rng"]
         self._stagger = state["_stagger"]
+        self._now = self.arms.read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        state = self.arms.step(tensordict["action"].numpy().astype(np.float64) * self._torque)
+        action = tensordict["action"].numpy().astype(np.float64)
+        if isinstance(self.draw, Pushes):
+            self.arms.push(self.draw.forces(self.rng, self.nsim))
+        state = self.arms.step(self.task.target(action, self._now, self.goal, self._torque))
+        self._now = state
         self._count += 1
         ddq = (state.dq - self._dq) * self.task.ctrl_hz
         self._dq[:] = state.dq

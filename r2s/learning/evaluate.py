@@ -4,7 +4,7 @@ Two sets of goals, starts and draws: a training is watched, and its best policy 
 of a policy comes from JUDGED, on which nothing was chosen, neither policies nor hyper-parameters.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -25,7 +25,8 @@ def streams(seed: int) -> list[np.random.Generator]:
 def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = JUDGED) -> tuple[np.ndarray, np.ndarray]:
     """Return starts (count, n) rad and goals (count, ...): the same for every policy, simulator and arm."""
     of_starts, of_goals, _ = streams(seed)
-    return task.starts(robot, of_starts, count), task.goals(robot, of_goals, count)
+    goals = task.goals(robot, of_goals, count)
+    return task.begin(task.starts(robot, of_starts, count), goals), goals
 
 
 def fixed_draws(draw: Callable[[np.random.Generator, int], Dynamics], count: int, seed: int = JUDGED) -> Dynamics:
@@ -57,8 +58,3 @@ def make_evaluation(
         return done
 
     return evaluate
-
-
-def selection_score(row: Mapping[str, float]) -> float:
-    """Return what makes one evaluation better than another: 1 % more within 1 cm is worth 1 of the return."""
-    return 100 * row["success_1cm"] + row["return_paper"]

@@ -19,7 +19,7 @@ from r2s.tasks.task import Task
 def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
     """Return an untrained policy of this arm and task."""
     mean, std = (torch.from_numpy(x) for x in task.observation_scale(robot))
-    torque = torch.from_numpy(task.torque(robot)).float()
+    torque = torch.from_numpy(task.share * task.torque(robot)).float()
     return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
 
 
@@ -93,5 +93,6 @@ def _facts(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
         "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),
         "torque_scale_Nm": " ".join(f"{t:g}" for t in policy.torque_scale.tolist()),
         "low_pass_hz": str(task.cutoff_hz),
-        "torque": "without gravity, before low-pass, clip and rate limit",
+        "torque": "without gravity, before low-pass, clip and rate limit"
+        + ("" if task.share == 1.0 else "; to be added to the task's base"),
     }

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -80,6 +81,46 @@ class Identified:
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return m drawn dynamics."""
         return self.space.dynamics(self.samples[rng.integers(len(self.samples), size=m)])
+
+
+@runtime_checkable
+class Pushes(Protocol):
+    """Draws that push the joints at every control step of a training; evaluations are not pushed."""
+
+    def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
+        """Return (m, n) Nm for the next step of m arms."""
+        ...
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Every arm is the centre, and random torques push its joints: Valassakis et al. 2020, arXiv 2008.06686.
+
+    Torques are drawn anew at every control step, U(-1, 1) x share x what friction holds each joint with. They act
+    behind the driver's law, as friction does.
+
+    Attributes:
+        robot: the arm. center: its dynamics, without a batch shape.
+        share: of `Dynamics.level`.
+
+    Raises:
+        UserError: a negative share.
+    """
+
+    robot: Robot
+    center: Dynamics
+    share: float
+
+    def __post_init__(self):
+        check_number("dr.share", self.share, "[0, inf)")
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return the centre, for all."""
+        return self.center
+
+    def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
+        """Return (m, n) Nm."""
+        return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
 
 
 def identified(robot: Robot, center: Dynamics, calibration: str | Path | None) -> Identified:

@@ -39,6 +39,7 @@ class Simulator:
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
         self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
+        self._offset = np.zeros((nsim, robot.n))  # as the dynamics have it, without what `push` adds
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
@@ -59,6 +60,7 @@ class Simulator:
 
         at = arms[:, None], self._bodies
         self._user[arms, :, : native.LIMITS] = spread(_law_columns(self.robot, self.model, dynamics), 2)
+        self._offset[arms] = self._user[arms, :, native.OFFSET]
         self._damping[arms] = self.model.dof_damping
         self._armature[arms] = spread(dynamics.armature, 1)
         self._inertia[at] = spread(moments, 2)
@@ -76,6 +78,10 @@ class Simulator:
             limits: (n, COLUMNS), of r2s.physics.limits.limits.
         """
         self._user[:, :, native.LIMITS :] = limits
+
+    def push(self, tau: np.ndarray) -> None:
+        """Let something else push the joints with tau (nsim, n) Nm from now on, beside the arms' own offsets."""
+        self._user[:, :, native.OFFSET] = self._offset + tau
 
     def reset(
         self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, bristle: np.ndarray | float = 0.0
@@ -99,7 +105,7 @@ class Simulator:
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Go back to what `state` returned; what the arms do next is the same, bit for bit."""
-        for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com"):
+        for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -109,7 +115,7 @@ class Simulator:
 
     def _arrays(self) -> dict[str, np.ndarray]:
         names = ("q", "dq", "_memory", "_damping", "_user", "_armature", "_inertia", "_iquat", "_mass", "_com")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in (*names, "_offset")}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
         """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""

@@ -9,10 +9,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
+from r2s.reporting.measures import ALL, Shown, shown
 from r2s.reporting.statistics import improvement, interquartile_mean, interval
-from r2s.reporting.trainings import MEASURES, Trained
+from r2s.reporting.trainings import Trained
 
-LOWER_IS_BETTER = ("distance_median_m",)
+
+def shown_of(grouped: Mapping[str, Sequence[Trained]]) -> Shown:
+    """Return what is shown of these runs, which are of one task."""
+    return shown(next(iter(grouped.values()))[0].last)
 
 
 def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
@@ -24,7 +28,7 @@ def summary_table(grouped: Mapping[str, Sequence[Trained]]) -> pd.DataFrame:
     """Return one row per group and measure: seeds, mean, interquartile mean and its 95 % interval."""
     rows = []
     for label, group in grouped.items():
-        for measure in MEASURES:
+        for measure in shown_of(grouped).compared:
             x = scores(group, measure)
             low, high = interval([x], lambda d: interquartile_mean(d[0]))
             row = {"group": label, "measure": measure, "seeds": len(x), "mean": x.mean()}
@@ -39,26 +43,29 @@ def improvement_table(grouped: Mapping[str, Sequence[Trained]]) -> pd.DataFrame:
         for second, b in grouped.items():
             if first == second:
                 continue
-            for measure in ("success_1cm", "return_paper"):
-                pair = [scores(a, measure), scores(b, measure)]
+            for measure in shown_of(grouped).judged:
+                sign = -1.0 if ALL[measure].lower else 1.0
+                pair = [sign * scores(a, measure), sign * scores(b, measure)]
                 low, high = interval(pair, lambda d: improvement(*d))
                 row = {"better": first, "than": second, "measure": measure}
                 rows.append(row | {"probability": float(improvement(*pair)), "low": low, "high": high})
     return pd.DataFrame(rows)
 
 
-def sensitivity_table(grouped: Mapping[str, Sequence[Trained]], measure: str = "return_paper") -> pd.DataFrame:
+def sensitivity_table(grouped: Mapping[str, Sequence[Trained]], measure: str | None = None) -> pd.DataFrame:
     """Return, per algorithm, how much its score depends on its settings; empty where none has two settings.
+
+    The measure is the second that trainings are judged by, the return of reaching, where none is given.
 
     best, median and worst are over settings, each the interquartile mean of its seeds; spread is best minus median,
     with a 95 % interval that draws seeds within each setting: the smaller, the less tuning it needs.
     """
-    rows = []
+    rows, measure = [], measure or shown_of(grouped).judged[1]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
         strata = [scores(g, measure) for g in grouped.values() if g[0].algo == algo]
         if len(strata) < 2:
             continue
-        sign = -1.0 if measure in LOWER_IS_BETTER else 1.0
+        sign = -1.0 if ALL[measure].lower else 1.0
         each = sign * np.array([interquartile_mean(x) for x in strata])
 
         def spread(drawn: list[np.ndarray], sign: float = sign) -> np.ndarray:

@@ -16,7 +16,13 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
-from r2s.reporting.comparison import improvement_matrix, improvement_table, sensitivity_table, summary_table
+from r2s.reporting.comparison import (
+    improvement_matrix,
+    improvement_table,
+    sensitivity_table,
+    shown_of,
+    summary_table,
+)
 from r2s.reporting.document import report_html, report_markdown
 from r2s.reporting.grouping import Groups
 from r2s.reporting.identification_figures import (
@@ -194,12 +200,17 @@ def _comparison(
         ]
     if others:
         sections["No finished trainings"] = [[f"{k}: {v}" for k, v in others.items()]]
-    for measure, title in {"success_1cm": "success within 1 cm", "return_paper": "return"}.items():
+    titles = {"success_1cm": "success within 1 cm", "return_paper": "return", "within_5mm": "time within 5 mm"}
+    titles["path_rmse_mm"] = "RMSE of the path"
+    judged = shown_of(grouped.members).judged
+    for measure in judged:
         if len(tables["improvement"]):
-            heading = f"Probability that a run of one group is better than a run of another: {title}, last evaluation"
+            heading = "Probability that a run of one group is better than a run of another: "
+            heading += f"{titles[measure]}, last evaluation"
             sections[heading] = [improvement_matrix(tables["improvement"], measure)]
     if len(tables["sensitivity"]):
-        sections["How much the last return depends on the settings (smaller spread: less to tune)"] = [
+        what = titles[judged[1]]
+        sections[f"How much the last {what} depends on the settings (smaller spread: less to tune)"] = [
             tables["sensitivity"].round(2).astype(str).set_index("algo")
         ]
     return sections

@@ -12,31 +12,42 @@ from r2s.tasks.episode import Episodes
 
 
 def reach_figure(path: Path, episodes: Mapping[str, Sequence[Episode]]) -> Path:
-    """Draw the distance to up to four goals over time, one line per label: MuJoCo against the arm."""
+    """Draw the distance to up to four goals, or from as many paths, over time, one line per label."""
     colour = colours(episodes)
     count = max(1, min(4, max((len(e) for e in episodes.values()), default=0)))
-    with panels(path, count, min(count, 2), "distance to the goal", height=3.0) as axes:
+    moving = any(e.goal.ndim == 2 for sequence in episodes.values() for e in sequence)
+    title, scale, unit, levels = "distance to the goal", 100, "cm", (5, 2, 1)
+    if moving:
+        title, scale, unit, levels = "error of the path", 1000, "mm", (10, 5, 2)
+    with panels(path, count, min(count, 2), title, height=3.0) as axes:
         for k, axis in enumerate(axes):
             shown = {label: sequence[k] for label, sequence in episodes.items() if k < len(sequence)}
             for label, episode in shown.items():
-                distance = 100 * np.maximum(episode.distance, 1e-5)
+                distance = scale * np.maximum(episode.distance, 1e-5)
                 axis.plot(episode.t - episode.t[0], distance, color=colour[label], label=label)
-            for level in (5, 2, 1):
+            for level in levels:
                 axis.axhline(level, color="#555555", linewidth=0.7, linestyle=":")
             log_axis(axis)
+            if moving:
+                axis.set_title(f"path {k + 1}", loc="left")
+                axis.set(xlabel="time, s", ylabel=f"error, {unit}")
+                continue
             goal = next((f" at ({', '.join(f'{x:.2f}' for x in e.goal)}) m" for e in shown.values()), "")
             axis.set_title(f"goal {k + 1}{goal}", loc="left")
-            axis.set(xlabel="time, s", ylabel="distance, cm")
+            axis.set(xlabel="time, s", ylabel=f"distance, {unit}")
     return path
 
 
 def traces_figure(path: Path, episodes: Mapping[str, Episodes], goals: int = 4) -> Path:
-    """Draw the reward of eq. (2) and the torque of joints 1 and 2 over time: a column per goal, a line per label."""
+    """Draw the reward, of reaching eq. (2), and the torque of joints 1 and 2 over time: a column per goal."""
     colour = colours(episodes)
     count = min(goals, *(len(e.goal) for e in episodes.values()))
     n = next(iter(episodes.values())).q.shape[-1]
-    rows = ["reward, eq. (2)", *(f"torque of joint {j + 1}, Nm" for j in range(min(2, n)))]
-    with panels(path, len(rows) * count, count, "the same policy and goals", height=2.4) as axes:
+    moving = next(iter(episodes.values())).goal.ndim == 3
+    rows = ["reward" if moving else "reward, eq. (2)", *(f"torque of joint {j + 1}, Nm" for j in range(min(2, n)))]
+    with panels(
+        path, len(rows) * count, count, f"the same policy and {'paths' if moving else 'goals'}", height=2.4
+    ) as axes:
         for i, name in enumerate(rows):
             for k in range(count):
                 axis = axes[i * count + k]
@@ -44,7 +55,7 @@ def traces_figure(path: Path, episodes: Mapping[str, Episodes], goals: int = 4) 
                     axis.plot(e.t, e.tau[k, :, i - 1] if i else e.reward[k], color=colour[label], label=label, lw=1.2)
                 axis.set(xlabel="time, s" if i == len(rows) - 1 else "", ylabel=name if k == 0 else "")
                 if i == 0:
-                    axis.set_title(f"goal {k + 1}", loc="left")
+                    axis.set_title(f"{'path' if moving else 'goal'} {k + 1}", loc="left")
     return path
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.reporting.tables import number
+from r2s.reporting.measures import in_short
 from r2s.runs import status_of
 
 LOST = ("failed", "killed")
@@ -77,8 +77,10 @@ def _last_word(stage: str, document: Mapping[str, Any]) -> str:
         groups = {row["group"] for row in document["scores"]}
         return f"{len(groups)} group{'s' * (len(groups) != 1)} of runs"
     rows = document["reach"] if stage == "pipeline" else document
+    if any("path_rmse_mm" in row for row in rows.values()):
+        return "RMSE " + "; ".join(f"{where} {row['path_rmse_mm']:.2f}" for where, row in rows.items()) + " mm"
     return "; ".join(f"{where} {100 * row['success_1cm']:.0f} %" for where, row in rows.items()) + " < 1 cm"
 
 
 def _success(row: Mapping[str, Any]) -> str:
-    return f"{100 * float(row['success_1cm']):.0f} % < 1 cm, return {number(float(row['return_paper']), '{:.0f}')}"
+    return ", ".join(in_short(row))

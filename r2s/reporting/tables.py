@@ -14,13 +14,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from r2s.reporting.document import doubtful
+from r2s.reporting.measures import REACH, shown
 
-SUCCESS = {
-    "success_5cm": "5 cm, %",
-    "success_2cm": "2 cm, %",
-    "success_1cm": "1 cm, %",
-    "success_5mm": "5 mm, %",
-}
+SUCCESS = {key: REACH.known[key].short for key in REACH.row if key.startswith("success")}
 
 
 def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
@@ -28,17 +24,14 @@ def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
 
     One seed has no interval.
     """
-    names = {m: title for m, title in SUCCESS.items() if m in set(table["measure"])}
-    names |= {"distance_median_m": "median\ndistance, mm", "return_paper": "return"}
+    known = shown(set(table["measure"]))
     out: dict[str, dict[str, str]] = {}
     for r in table.to_dict("records"):
-        scale = 100 if r["measure"] in SUCCESS else 1e3 if r["measure"] == "distance_median_m" else 1
-        digits = 0 if r["measure"] in SUCCESS else 1
+        measure = known.known[r["measure"]]
         cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
-        middle, low, high = (scale * r[k] for k in ("iqm", "low", "high"))
-        interval = f"\n[{low:.{digits}f}, {high:.{digits}f}]" if r["seeds"] > 1 else ""
-        cells[names[r["measure"]]] = f"{middle:.1f}{interval}"
-    return pd.DataFrame.from_dict(out, orient="index").rename_axis("success within")
+        interval = f"\n[{measure.cell(r['low'])}, {measure.cell(r['high'])}]" if r["seeds"] > 1 else ""
+        cells[measure.short] = f"{measure.cell(r['iqm'], max(1, measure.digits))}{interval}"
+    return pd.DataFrame.from_dict(out, orient="index").rename_axis(known.corner)
 
 
 def number(value: float | None, form: str = "{:.3g}") -> str:
@@ -47,25 +40,26 @@ def number(value: float | None, form: str = "{:.3g}") -> str:
 
 
 def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return one row per label from dicts with the keys of evaluations.csv (success from 0 to 1)."""
-    table = {}
+    """Return one row per label from dicts with the keys of evaluations.csv (shares from 0 to 1)."""
+    table, known = {}, shown(key for row in rows.values() for key in row)
     for label, row in rows.items():
-        cells = {
-            title: number(100 * row[key] if row.get(key) is not None else None, "{:.1f}")
-            for key, title in SUCCESS.items()
-        }
-        distance = row.get("distance_median_m")
-        cells["median\ndistance, mm"] = number(None if distance is None else 1e3 * distance, "{:.1f}")
-        cells["return"] = number(row.get("return_smooth", row.get("return_paper")), "{:.1f}")
-        cells["at rest, %"] = number(None if row.get("rest") is None else 100 * row["rest"], "{:.1f}")
+        cells = {}
+        for key in known.row:
+            measure = known.known[key]
+            value = row.get("return_smooth", row.get(key)) if key == "return_paper" else row.get(key)
+            scaled = None if value is None else measure.scale * value
+            cells[measure.short] = number(scaled, f"{{:.{max(1, measure.digits)}f}}")
         table[_counted(label, row)] = cells
-    return pd.DataFrame.from_dict(table, orient="index").rename_axis("success within")
+    return pd.DataFrame.from_dict(table, orient="index").rename_axis(known.corner)
 
 
 def _counted(label: str, row: Mapping) -> str:
     """Return the label, with how many of the goals it is about where an arm was stopped before all were done."""
     done, asked = row.get("episodes"), row.get("asked")
     return label if done == asked else f"{label}, {done} of {asked} goals done"
+
+
+REACHING = ("time_to_reach_s", "overshoot_m")
 
 
 def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
@@ -80,6 +74,8 @@ def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
         "collisions, %": ("collision", 100, "{:.1f}"),
         "stops": ("stops", 1, "{:.0f}"),
     }
+    if shown(key for row in rows.values() for key in row) is not REACH:  # which a path has no use for
+        columns = {title: column for title, column in columns.items() if column[0] not in REACHING}
     table = {
         _counted(label, row): {
             title: number(None if row.get(key) is None else scale * row[key], form)

@@ -11,13 +11,14 @@ import pandas as pd
 import yaml
 
 from r2s.errors import UserError
+from r2s.reporting.measures import shown
 
 # parts of a config that a training reads, beside its seed: runs that agree in them are seeds of one group
 READ = ("algo", "budget", "calibration", "dr", "friction", "inertia", "reward")
 ALIKE = ("robot", "task")  # parts without whose agreement nothing can be compared
-MEASURES = ("success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_paper")
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
 BUDGETS_APART = 2.0  # how many times the smaller budget the larger one may be
+CONTROLLERS = ("oracle", "computed_torque")  # which are not trained
 UNFINISHED = {"running": "unfinished", "stopped": "stopped", "failed": "failed"}
 
 
@@ -91,7 +92,7 @@ def _read(folder: Path) -> Trained:
     read = set(READ)
     if config.get("calibration"):
         read -= {"friction", "inertia"}  # identified values stand over them
-    if name == "oracle":
+    if name in CONTROLLERS:
         read -= {"budget", "reward"}
     typed = {}
     for word in yaml.safe_load((folder / "overrides.yaml").read_text()) or []:
@@ -102,7 +103,8 @@ def _read(folder: Path) -> Trained:
     curve = pd.read_csv(folder / "evaluations.csv")
     if curve.empty:
         raise ValueError("no evaluation")
-    if not np.isfinite(curve[["env_steps", "wall_clock_s", *MEASURES]].astype(float).to_numpy()).all():
+    measures = shown(curve.columns).compared
+    if not np.isfinite(curve[["env_steps", "wall_clock_s", *measures]].astype(float).to_numpy()).all():
         raise ValueError("an evaluation that is not finite")
     return Trained(
         folder,

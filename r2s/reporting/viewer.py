@@ -34,6 +34,7 @@ OVERLAY_HZ = 100.0
 WIDTH = 1.6  # of a plot's line
 GOAL_RADIUS = 0.025  # m
 GOAL = "#ff5252"
+WORST_M = 0.01  # m, an error of the path that is shown red
 
 
 def write_recording(
@@ -155,14 +156,57 @@ def _motion(
         columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
         stream.send_columns(_link(base, model, body), indexes=[index], columns=columns)
 
+    changes = rr.TimeColumn("time", duration=starts[: len(episodes)])
+    if episodes[0].goal.ndim == 2:
+        _paths(stream, base, episodes, frames, index, changes)
+        return
     trail = [e.ee[[*f[:k:3], row]] for e, f in zip(episodes, frames, strict=True) for k, row in enumerate(f)]
     stream.log(f"{base}/trail", rr.LineStrips3D.from_fields(colors=rgb, radii=0.005), static=True)
     stream.send_columns(f"{base}/trail", indexes=[index], columns=rr.LineStrips3D.columns(strips=trail))
-
-    changes = rr.TimeColumn("time", duration=starts[: len(episodes)])
     goals = rr.Points3D.columns(positions=np.stack([e.goal for e in episodes]))
     stream.log(f"{base}/goal", rr.Points3D.from_fields(colors=_rgb(GOAL), radii=GOAL_RADIUS), static=True)
     stream.send_columns(f"{base}/goal", indexes=[changes], columns=goals)
+
+
+def _paths(
+    stream: rr.RecordingStream,
+    base: str,
+    episodes: Sequence[Episode],
+    frames: Sequence[np.ndarray],
+    index: rr.TimeColumn,
+    changes: rr.TimeColumn,
+) -> None:
+    """Send the path of each episode, where the hand is to be on it, and the hand's trace, coloured by its error."""
+    stream.log(f"{base}/path", rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015), static=True)
+    whole_paths = rr.LineStrips3D.columns(strips=[e.goal for e in episodes])
+    stream.send_columns(f"{base}/path", indexes=[changes], columns=whole_paths)
+    stream.log(f"{base}/goal", rr.Points3D.from_fields(colors=_rgb(GOAL), radii=0.4 * GOAL_RADIUS), static=True)
+    wanted = np.concatenate([e.goal[f] for e, f in zip(episodes, frames, strict=True)])
+    stream.send_columns(f"{base}/goal", indexes=[index], columns=rr.Points3D.columns(positions=wanted))
+    pieces: list[np.ndarray] = []
+    shades: list[np.ndarray] = []
+    lengths: list[int] = []
+    for e, f in zip(episodes, frames, strict=True):
+        rows = f[::3]
+        of_piece = _shades(e.distance[rows[1:]])
+        for k in range(len(f)):
+            past = k // 3
+            pieces += [e.ee[rows[i : i + 2]] for i in range(past)]
+            shades += list(of_piece[:past])
+            lengths.append(past)
+    if not pieces:
+        return
+    stream.log(f"{base}/trail", rr.LineStrips3D.from_fields(radii=0.004), static=True)
+    columns = rr.LineStrips3D.columns(strips=pieces, colors=np.array(shades)).partition(lengths)
+    stream.send_columns(f"{base}/trail", indexes=[index], columns=columns)
+
+
+def _shades(error: np.ndarray) -> np.ndarray:
+    """Return (T, 3) colours of errors (T,) m: green for none, yellow at half of WORST_M, red from there on."""
+    share = np.clip(error / WORST_M, 0.0, 1.0)[:, None]
+    low, middle, high = np.array([[61, 170, 109], [235, 200, 60], [255, 60, 60]], dtype=float)
+    warm = np.where(share < 0.5, low + 2 * share * (middle - low), middle + (2 * share - 1) * (high - middle))
+    return warm.astype(np.uint8)
 
 
 def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:

@@ -22,6 +22,10 @@ CURVES = {
     "success_5mm": "success at 5 mm",
     "distance_median_m": "median distance, m",
     "return_paper": "return (paper)",
+    "path_rmse_mm": "RMSE of the path, mm",
+    "path_max_mm": "largest error, mm",
+    "within_5mm": "time within 5 mm",
+    "return_track": "return",
 }
 OVERLAY_OPENS = 15.0  # s of an overlay that its plots open on: more is a solid band
 
@@ -37,13 +41,13 @@ class Episode:
     ee: np.ndarray
     """(T, 3) m."""
     goal: np.ndarray
-    """(3,) m."""
+    """(3,) m, or (T, 3) where it moves."""
     tau: np.ndarray
     """(T, n) Nm, the command."""
 
     @property
     def distance(self) -> np.ndarray:
-        """(T,) m from the end effector to the goal."""
+        """(T,) m from the end effector to the goal, or to where it is at that time."""
         return np.linalg.norm(self.ee - self.goal, axis=-1)
 
     @property
@@ -84,7 +88,8 @@ def blueprint(
     joints = [f"joint {j + 1}" for j in range(robot.n)]
     tabs: list[rrb.View | rrb.Container] = []
     if episodes:
-        tabs.append(_arms_tab(len(episodes), joints, float(starts_of(episodes)[-1])))
+        moving = any(e.goal.ndim == 2 for sequence in episodes.values() for e in sequence)
+        tabs.append(_arms_tab(len(episodes), joints, float(starts_of(episodes)[-1]), moving))
     if curves:
         tabs.append(_learning_tab(curves, LEARNING in figures))
     for label, overlay in overlays.items():
@@ -121,14 +126,15 @@ def _learning_tab(curves: Mapping[str, pd.DataFrame], pictured: bool) -> rrb.Con
     return rrb.Tabs(*first, live, active_tab=0, name="learning")
 
 
-def _arms_tab(count: int, joints: Sequence[str], seconds: float) -> rrb.Container:
+def _arms_tab(count: int, joints: Sequence[str], seconds: float, moving: bool) -> rrb.Container:
     """Return the 3D view beside its plots; from four arms on, above them."""
     width = SPACING * count
     away = 0.3 + 0.4 * width if count > 3 else max(1.5, 0.4 + 0.85 * width)
     eye = rrb.EyeControls3D(position=[away, -0.2 * away, 0.5 + 0.3 * away], look_target=[0.15, 0, 0.48])
     scene = rrb.Spatial3DView(origin="arms", name="arms", eye_controls=eye)
-    distance = _plot("distance to goal, cm", "distance", rrb.Corner2D.RightTop, until=seconds)
-    near = _plot("the last 5 cm", "distance", y=(0.0, 5.0), until=seconds)
+    title, near_title, most = ("error of the path, cm", "the last 1 cm", 1.0) if moving else ("", "", 5.0)
+    distance = _plot(title or "distance to goal, cm", "distance", rrb.Corner2D.RightTop, until=seconds)
+    near = _plot(near_title or "the last 5 cm", "distance", y=(0.0, most), until=seconds)
     torques = [_plot(f"{joint}, Nm", entity("command", joint), until=seconds) for joint in joints]
     commands = rrb.Tabs(*torques, name="command")
     if count > 3:

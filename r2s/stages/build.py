@@ -157,11 +157,11 @@ def dynamics_of(robot, friction, inertia):
     return called(nominal_dynamics, "friction", {**friction, "inertia_scale": inertia["scale"]}, robot)
 
 
-def make_task(cfg):
-    """Return conf/task; its lists are tuples there, a task is a fixed thing."""
+def make_task(cfg, robot, dynamics):
+    """Return conf/task, told of the model; its lists are tuples there, a task is a fixed thing."""
     make = target(cfg.task, "task")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
-    return called(make, "task", settings)
+    return called(make, "task", settings).believing(robot, dynamics)
 
 
 def make_draw(cfg, robot, center):
@@ -277,12 +277,12 @@ def is_learner(cfg):
     return inspect.isclass(kind) and issubclass(kind, Learner)
 
 
-def make_controller(cfg, robot, task):
+def make_controller(cfg, robot, task, dynamics):
     """Return the controller of conf/algo, with the model that it believes in."""
     from r2s.learning.train import Loop
 
     trained = ("n_envs", "hidden", *(f.name for f in fields(Loop)))  # an experiment may say how to train
-    return part(cfg.algo, "algo", robot, task, make_dynamics(cfg, robot), beside=trained)
+    return part(cfg.algo, "algo", robot, task, dynamics, beside=trained)
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):

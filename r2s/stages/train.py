@@ -54,12 +54,13 @@ def train(cfg, overrides):
 
     from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.env import TaskEnv
-    from r2s.learning.evaluate import SELECTED, make_evaluation, selection_score
+    from r2s.learning.evaluate import SELECTED, make_evaluation
     from r2s.learning.policy import export_onnx, load_policy, save_policy
     from r2s.learning.train import Listeners
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
     from r2s.reporting import pages
+    from r2s.reporting.measures import in_short
     from r2s.reporting.tables import reach_table
     from r2s.tasks.rewards import Curriculum
 
@@ -68,14 +69,15 @@ def train(cfg, overrides):
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     n_envs, loop, settings = split(cfg)
     budget = make_budget(cfg)
-    robot, task, model = make_robot(cfg), make_task(cfg), own_model(cfg)
-    draw = make_draw(model, robot, make_dynamics(model, robot))
+    robot, model = make_robot(cfg), own_model(cfg)
+    center = make_dynamics(model, robot)
+    task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     words = {"episodes": evaluation.episodes, "nthread": cfg.threads}
     evaluate = make_evaluation(robot, task, draw, **words, seed=SELECTED)
-    torque = torch.from_numpy(task.torque(robot))
+    torque = torch.from_numpy(task.share * task.torque(robot))
     scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
     algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
     best: dict = {}
@@ -84,7 +86,7 @@ def train(cfg, overrides):
     def is_best(row):
         nonlocal best, last
         last = row
-        better = not best or selection_score(row) >= selection_score(best)
+        better = not best or task.score(row) >= task.score(best)
         best = row if better else best
         return better
 
@@ -104,9 +106,7 @@ def train(cfg, overrides):
 
         def show(share, row):
             text = f"{row['env_steps'] / 1e3:.0f}k env steps, {row['updates']} updates"
-            if "success_1cm" in row:
-                text += f", {100 * row['success_1cm']:.0f} % < 1 cm, return {row['return_paper']:.0f}"
-            progress(share, text)
+            progress(share, ", ".join([text, *in_short(row)]))
 
         run_train(
             env,
@@ -191,9 +191,10 @@ def reference(cfg, overrides):
     from r2s.reporting.tables import reach_table
 
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
-    robot, task = make_robot(cfg), make_task(cfg)
-    draw = make_draw(cfg, robot, make_dynamics(cfg, robot))
-    controller, name = make_controller(cfg, robot, task), cfg.algo.name
+    robot = make_robot(cfg)
+    center = make_dynamics(cfg, robot)
+    task, draw, name = make_task(cfg, robot, center), make_draw(cfg, robot, center), cfg.algo.name
+    controller = make_controller(cfg, robot, task, center)
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         keep_calibration(cfg, run.folder)
         evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)

@@ -79,9 +79,12 @@ def transfer(cfg, overrides):
 
     source, trained = trained_config(cfg)
     check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
-    robot, task = make_robot(trained), make_task(trained)
+    robot = make_robot(trained)
+    center = make_dynamics(trained, robot)
+    task = make_task(trained, robot, center)
     set_threads(cfg)
-    policy = load_policy(source, robot, task) if is_learner(trained) else make_controller(trained, robot, task)
+    learned = is_learner(trained)
+    policy = load_policy(source, robot, task) if learned else make_controller(trained, robot, task, center)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
@@ -91,7 +94,6 @@ def transfer(cfg, overrides):
             approach(robot, robot.q_home, start, what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
-    center = make_dynamics(trained, robot)
     friction, dynamics, draw = center.level, None, None
     if cfg.simulator.name != "none":
         dynamics = center
@@ -111,7 +113,7 @@ def transfer(cfg, overrides):
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         on_twin = None
         if twin:  # first: it forks, and then there are no threads yet
-            progress, shown = counted(f"reach on {cfg.arm.name}")
+            progress, shown = counted(f"on {cfg.arm.name}")
             opens = partial(opened_arms, cfg, robot, task, friction)
             on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
             progress.close()
@@ -119,7 +121,7 @@ def transfer(cfg, overrides):
             done = make_evaluation(robot, task, draw, episodes=len(goals), nthread=cfg.threads)(policy)
             rows["mujoco"], episodes["mujoco"] = task.measures(done), done
             if engine is not None:
-                progress, shown = counted(f"reach in {cfg.simulator.name}")
+                progress, shown = counted(f"in {cfg.simulator.name}")
                 arms = EngineArms(engine, robot, task, draw, len(goals))
                 done = rollout(policy, arms, task, starts, goals, shown)
                 progress.close()
@@ -137,10 +139,11 @@ def transfer(cfg, overrides):
                 done, stops, timing = on_twin
             elif driven is not None:
                 tried = np.flatnonzero(predicted.collision == "")
-                for k in np.flatnonzero(predicted.collision != ""):
-                    print(f"episode {k + 1} is left out: the arm would touch something, {predicted.collision[k]}")
+                for left_out in np.flatnonzero(predicted.collision != ""):
+                    touched = predicted.collision[left_out]
+                    print(f"episode {left_out + 1} is left out: the arm would touch something, {touched}")
             if driven is not None and len(tried):
-                progress, shown = counted(f"reach on {cfg.arm.name}")
+                progress, shown = counted(f"on {cfg.arm.name}")
                 done = rollout(policy, driven, task, starts[tried], goals[tried], shown)
                 stops = [replace(stop, episode=int(tried[stop.episode])) for stop in driven.stops]
                 timing, halted, tried = driven.timing, driven.halted, tried[: driven.done]

@@ -16,7 +16,7 @@ from r2s.stages.build import called, console, open_run, plain
 from r2s.stages.pipeline import front_door, handed_on
 
 MEASURES = {"return_paper": "maximize", "success_1cm": "maximize", "success_5mm": "maximize"}
-MEASURES |= {"distance_median_m": "minimize"}
+MEASURES |= {"distance_median_m": "minimize", "path_rmse_mm": "minimize", "within_5mm": "maximize"}
 PATIENCE = 3  # times that a training is begun which the system ended
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 

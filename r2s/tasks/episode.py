@@ -86,7 +86,7 @@ def rollout(
 
     # what is compiled or loaded at its first call must not be so while an arm waits
     still = State.still(robot)
-    ask(still, goals[:1])
+    task.target(ask(still, goals[:1]), still, goals[:1], torque)
     task.judge(still, still.dq, goals[:1], task.reference(still, goals[:1]))
     for first in range(0, count, width):
         now = slice(first, first + width)
@@ -95,7 +95,7 @@ def rollout(
         over = np.zeros(width, dtype=bool)  # it has touched something
         for k in range(task.steps):
             if not (state.stopped | over).all():
-                state = arms.step(ask(state, goals[now]) * torque)
+                state = arms.step(task.target(ask(state, goals[now]), state, goals[now], torque))
             if over.any():
                 state = _kept(state, over, q[now, k - 1], dq[now, k - 1], ee[now, k - 1], tau[now, k - 1])
             ddq = (state.dq - before) * task.ctrl_hz
@@ -113,15 +113,16 @@ def rollout(
         if arms.speeds is not None:
             rate = np.diff(arms.speeds, axis=1, prepend=0.0) * task.ctrl_hz
             for k in range(task.steps):
-                then = replace(state, q=q[now, k], dq=arms.speeds[:, k], ee=ee[now, k], tau=tau[now, k])
+                t_then = np.full(width, (k + 1) / task.ctrl_hz)
+                then = replace(state, t=t_then, q=q[now, k], dq=arms.speeds[:, k], ee=ee[now, k], tau=tau[now, k])
                 smooth[now, k] = task.judge(then, rate[:, k], goals[now], reference)[1] @ weights
         distance[now, -1][stopped] = np.inf  # reached means reached and held by an arm that still runs
         progress(min(first + width, count), count)
     t = (1 + np.arange(task.steps)) / task.ctrl_hz
     q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
     return Episodes(
-        t=t, q=q, dq=dq, ee=ee, goal=goals, tau=tau, distance=distance, reward=reward, reward_smooth=smooth,
-        q_left=q_left, limited=limited, collision=np.array(collision),
+        t=t, q=q, dq=dq, ee=ee, goal=task.places(goals), tau=tau, distance=distance, reward=reward,
+        reward_smooth=smooth, q_left=q_left, limited=limited, collision=np.array(collision),
     )  # fmt: skip
 
 

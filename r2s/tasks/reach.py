@@ -11,7 +11,7 @@ from r2s.errors import UserError, check_number
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks import rewards
 from r2s.tasks.episode import measures
-from r2s.tasks.task import Entry, Episodes, State
+from r2s.tasks.task import Entry, Episodes, State, Usual
 
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
@@ -22,7 +22,7 @@ POSTURES = 500  # that those are told from
 
 
 @dataclass(frozen=True)
-class ReachTask:
+class ReachTask(Usual):
     """Reach a point; a `Task` (r2s/tasks/task.py) from conf/task/reach.yaml.
 
     Attributes:

@@ -4,11 +4,13 @@ A new task is one file beside reach.py and one yaml: where episodes start, what 
 and what that is worth.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
 
@@ -47,8 +49,9 @@ class Episodes:
     """E finished episodes of T control steps; row k is the state after step k.
 
     Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m. tau: (E, T, n) Nm, the command at the end of
-        the step. distance: (E, T) m. reward: (E, T), eq. (2).
+        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves, as of
+        `Task.places`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m. reward: (E, T),
+        under `Task.paper_weights`: of reaching, eq. (2).
         reward_smooth: (E, T), the same with the noise of the speeds taken out, where an arm measured them.
         q_left: (E,) rad, how close any joint came to a position limit.
         limited: (E,), in which share of the cycles the driver's law changed what was asked for.
@@ -94,6 +97,7 @@ class Task(Protocol):
         substeps: physics steps of a control step.
         observed: what is in an observation, in words and units, for whoever deploys the policy.
         paper_weights: (k,), of the reward terms in `Episodes.reward`.
+        share: of `torque`, what an action of 1 changes a target by. pool: how many goals a training draws from.
     """
 
     @property
@@ -109,8 +113,17 @@ class Task(Protocol):
     @property
     def paper_weights(self) -> np.ndarray: ...  # noqa: D102
 
+    @property
+    def share(self) -> float: ...  # noqa: D102
+    @property
+    def pool(self) -> int: ...  # noqa: D102
+
     def torque(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm that an action of 1 asks for."""
+        """Return (n,) Nm, the most that a target asks for."""
+        ...
+
+    def believing(self, robot: Robot, dynamics: Dynamics) -> "Task":
+        """Return the task, told what the arm is believed to be: for targets that a model has a part in."""
         ...
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -121,12 +134,24 @@ class Task(Protocol):
         """Return (count, ...), what is asked in that many episodes: a point, or a path with its times."""
         ...
 
+    def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, n) rad, where the episodes with these goals start, of what `starts` said."""
+        ...
+
+    def places(self, goals: np.ndarray) -> np.ndarray:
+        """Return what is asked, to look at: points (m, 3) m, or (m, steps, 3) where the hand belongs after a step."""
+        ...
+
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (d,) to normalise observations by."""
         ...
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32; `torque` (n,) Nm is what an action of 1 asks for."""
+        """Return the observations (m, d) float32; `torque` as of `Task.torque`."""
+        ...
+
+    def target(self, action: np.ndarray, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return (m, n) Nm, what actions (m, n) in [-1, 1] ask for at this state; `torque` as of `Task.torque`."""
         ...
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
@@ -147,3 +172,34 @@ class Task(Protocol):
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
         ...
+
+    def score(self, row: Mapping[str, float]) -> float:
+        """Return what makes one row of `measures` better than another."""
+        ...
+
+
+class Usual:
+    """What most tasks have in common: an action is a share of the torque, and a goal is what there is to look at."""
+
+    share = 1.0
+    pool = 2048
+
+    def believing(self, robot: Robot, dynamics: Dynamics) -> "Usual":
+        """Return the task: it has no use for a model."""
+        return self
+
+    def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the starts: they do not depend on the goals."""
+        return starts
+
+    def places(self, goals: np.ndarray) -> np.ndarray:
+        """Return the goals."""
+        return goals
+
+    def target(self, action: np.ndarray, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return (m, n) Nm, action x torque."""
+        return action * torque
+
+    def score(self, row: Mapping[str, float]) -> float:
+        """Return what makes one evaluation better than another: 1 % more within 1 cm is worth 1 of the return."""
+        return 100 * row["success_1cm"] + row["return_paper"]
