@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROOT, STEADY, markdown, side_by_side
+from common import MACHINE, ROOT, markdown, side_by_side
 
 RUNS = ROOT / "runs"
 DRIVER = RUNS / "bench" / "driver.csv"
@@ -372,7 +372,7 @@ if __name__ == "__main__":
         seeds = seeds or [seed for judging in MAKES.values() for seed in judging]
     steps = ["budget.minutes=null", f"budget.env_steps={OF_A_TWIN if part == 'twins' else ENV_STEPS}"]
     if part == "twins":
-        twins("judge", seeds, ["identified, no DR", "nominal, no DR"], 0, [*STEADY, *steps], [])
+        twins("judge", seeds, ["identified, no DR", "nominal, no DR"], 0, steps, [])
     elif part == "ablation":
         for k in TRAININGS:
             twins("ablation", seeds, list(CONDITIONS), k, steps, [f"evaluation.episodes={GOALS}"])

@@ -65,7 +65,9 @@ def exported(tmp_path_factory) -> Exported:
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         config = compose("config", ["algo.hidden=[16,16]"])
     OmegaConf.save(config, run / "config.yaml")
-    robot, task = make_robot(config), make_task(config)
+    robot = make_robot(config)
+    center = make_dynamics(config, robot)
+    task = make_task(config, robot, center)
     torch.manual_seed(0)
     policy = make_policy(robot, task, (16, 16)).eval()
     save_policy(run, policy)
@@ -79,7 +81,7 @@ def exported(tmp_path_factory) -> Exported:
     (transfer / "summary.json").write_text(json.dumps({"twin": row, "predicted": row}))
     (transfer / "meta.json").write_text(json.dumps({"status": "done", "parents": [str(run)]}))
     commands.run_command(["export", str(run)])
-    return Exported(run, run / "bundle", robot, task, policy, make_dynamics(config, robot).level)
+    return Exported(run, run / "bundle", robot, task, policy, center.level)
 
 
 @pytest.fixture(scope="module")
@@ -350,8 +352,8 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a preview": (lambda c: c["observation"].update(preview=5), "observations of preview 5"),
     "another order of observations": (lambda c: swap(c["observation"]["entries"]), "observation 'dq'"),
     "an observation of something else": (lambda c: c["observation"]["entries"][0].update(of="x"), "'q' is x at"),
-    "too few observations": (lambda c: c["observation"]["entries"].pop(), "40 observations in all, and 47"),
-    "another size": (lambda c: c["observation"].update(size=46), "47 observations in all, and 46"),
+    "too few observations": (lambda c: c["observation"]["entries"].pop(), "47 observations in all, and 54"),
+    "another size": (lambda c: c["observation"].update(size=46), "54 observations in all, and 46"),
     "a later format": (lambda c: c.update(format=2), "is of format 2"),
 }
 

@@ -143,6 +143,7 @@ class ReachTask(Usual):
             Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
             Entry("J'error", "m^2/rad", "pull"),
             Entry(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
+            Entry(f"tanh(dq / {FINE_DQ:g} rad/s)", "1", "dq", divided_by=FINE_DQ, tanh=True),
         ]
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:

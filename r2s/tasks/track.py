@@ -120,8 +120,8 @@ class TrackTask(Usual):
     @property
     def observed(self) -> str:
         """What is in an observation."""
-        own = f"q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015) {self.preview} x ahead - ee"
-        own += f" velocity tanh(error/{FINE_M:g}) limited plan q - q plan dq - dq"
+        own = f"q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015) tanh(dq/0.1) {self.preview} x"
+        own += f" ahead - ee velocity tanh(error/{FINE_M:g}) limited plan q - q plan dq - dq"
         return f"{own}{' base' if self.base == 'model' else ''}; rad, rad/s, m, m/s"
 
     @property
