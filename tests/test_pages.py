@@ -90,29 +90,37 @@ def test_the_site_leads_to_every_page():
     assert sorted(found) == sorted(["index.md", *(p.name for p in DOCS.glob("*.md"))])
 
 
-def console(browser: str, page: Path, picture: Path, folder: Path) -> list[str]:
-    """Return what a page says to the browser's console; picture: where its first screen is drawn."""
-    words = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}"]
-    words += ["--enable-logging=stderr"]
-    words += ["--virtual-time-budget=4000", "--window-size=1300,900", f"--screenshot={picture}", page.as_uri()]
-    done = subprocess.run([browser, *words], capture_output=True, text=True, timeout=180)
-    assert picture.stat().st_size > 10_000, done.stderr
-    return [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
+def opened(browser: str, page: str, picture: Path, folder: Path) -> tuple[str, list[str]]:
+    """Return what a page is in a browser, its scripts having run, and what it says to the console; draw it too."""
+    words = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}", "--window-size=1300,900"]
+    words += ["--enable-logging=stderr", "--virtual-time-budget=8000", f"--screenshot={picture}", "--dump-dom", page]
+    done = subprocess.run([browser, *words], capture_output=True, text=True, timeout=300)
+    return done.stdout, [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
 
 
 @pytest.mark.slow
 def test_the_site_and_a_report_open_without_a_word_on_the_console(tmp_path):
-    """Built strictly, without a warning; then home, a how-to, the gallery, a room and a report in a real browser."""
+    """Built strictly, without a warning; home, a how-to, the gallery, a room and a report open; the search finds."""
     pytest.importorskip("mkdocs", reason="pip install 'r2s[docs]' builds the site")
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     env = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr
+    assert not [
+        p
+        for p in (tmp_path / "site").glob("**/*.html")
+        if re.search(r'(src|href)="https?:.*\.(js|css)', p.read_text())
+    ]
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         pytest.skip("no Chromium here: the site was built, and not opened")
     succeed("stage=identify", "name=seen", *TOY, at=tmp_path)
     pages = [tmp_path / "site" / f"{name}.html" for name in ("index", "without_arm", "gallery", "api/physics")]
     for page in [*pages, tmp_path / "runs/identify/seen/report.html"]:
-        assert console(browser, page, tmp_path / f"{page.stem}.png", tmp_path / "browser") == []
+        seen, said = opened(browser, page.as_uri(), tmp_path / f"{page.stem}.png", tmp_path / "browser")
+        assert said == [], page
+        assert "<h1" in seen
+    found, said = opened(browser, f"{pages[0].as_uri()}?q=friction", tmp_path / "search.png", tmp_path / "browser")
+    assert said == []
+    assert re.search(r"\d+ matching documents", found)
