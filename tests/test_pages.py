@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 from conftest import ROOT, in_blocks
-from test_cli import TOY, recording, server, succeed  # noqa: F401 (fixtures)
+from test_cli import TOY, recording, succeed  # noqa: F401 (a fixture)
 from test_extending import EXAMPLES
 
 DOCS = ROOT / "docs"
