@@ -94,7 +94,7 @@ def test_an_episode_begins_where_there_is_no_effort(panda, task, dynamics):
 
 @pytest.mark.parametrize("move_s", [float("nan"), 0.0, -1.0])
 def test_a_motion_takes_time(panda, task, dynamics, move_s):
-    with pytest.raises(UserError, match="move_s: .* is not allowed"):
+    with pytest.raises(UserError, match=r"move_s: .* is not allowed"):
         Oracle(panda, task, dynamics, move_s=move_s)
 
 
@@ -102,7 +102,7 @@ def test_what_a_training_reads_is_nothing_to_a_controller():
     """Also where an experiment has set it for all algorithms."""
     target = "r2s.learning.computed_torque.Oracle"
     cfg = OmegaConf.create({"stage": "train", "calibration": None, "algo": {"_target_": target, "name": "oracle"}})
-    cfg.algo |= {"move_s": 0.6, "batch_size": 32, "n_envs": 8}
+    cfg.algo.update({"move_s": 0.6, "batch_size": 32, "n_envs": 8})
     assert unread("algo.move_s", cfg) is None
     assert unread("algo", cfg) is None
     assert str(unread("algo.batch_size", cfg)).startswith("algo.batch_size: nothing is trained with algo=oracle")
