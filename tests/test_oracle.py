@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 import torch
 from conftest import conf
+from omegaconf import OmegaConf
 
+from r2s.errors import UserError
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.learning.computed_torque import Oracle
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
+from r2s.stages.build import unread
 from r2s.tasks.episode import measures
 from r2s.tasks.reach import ReachTask
 
@@ -87,3 +90,19 @@ def test_an_episode_begins_where_there_is_no_effort(panda, task, dynamics):
     oracle.action = watch  # type: ignore[method-assign]
     evaluate(oracle)
     assert torch.equal(inner(seen[0]), Oracle(panda, task, dynamics).action(seen[0]))
+
+
+@pytest.mark.parametrize("move_s", [float("nan"), 0.0, -1.0])
+def test_a_motion_takes_time(panda, task, dynamics, move_s):
+    with pytest.raises(UserError, match=r"move_s: .* is not allowed"):
+        Oracle(panda, task, dynamics, move_s=move_s)
+
+
+def test_what_a_training_reads_is_nothing_to_a_controller():
+    """Also where an experiment has set it for all algorithms."""
+    target = "r2s.learning.computed_torque.Oracle"
+    cfg = OmegaConf.create({"stage": "train", "calibration": None, "algo": {"_target_": target, "name": "oracle"}})
+    cfg.algo.update({"move_s": 0.6, "batch_size": 32, "n_envs": 8})
+    assert unread("algo.move_s", cfg) is None
+    assert unread("algo", cfg) is None
+    assert str(unread("algo.batch_size", cfg)).startswith("algo.batch_size: nothing is trained with algo=oracle")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.limits import ALLOWED
@@ -35,6 +35,7 @@ class Oracle:
     """
 
     def __init__(self, robot: Robot, task: ReachTask, dynamics: Dynamics, move_s: float = 0.6):
+        check_number("move_s", move_s, "(0, inf)")
         self.robot, self.task, self.dynamics, self.move_s = robot, task, dynamics, move_s
         self._model = robot.model(gravity=False)
         put_links(self._model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)

@@ -123,7 +123,10 @@ def unread(name: str, cfg: Any) -> str | None:
     stage = import_module(f"r2s.stages.{cfg.stage}")
     keys = stage.reads(cfg)
     if any(name == key or name.startswith(f"{key}.") or key.startswith(f"{name}.") for key in (*COMMON, *keys)):
-        return None
+        head, _, own = name.partition(".")
+        if head != "algo" or not own or "algo" not in keys or is_learner(cfg) or own not in of_trainings():
+            return None
+        return f"{name}: nothing is trained with algo={cfg.algo.name}; leave it out"
     head = name.split(".")[0]
     why = stage.WHY.get(name) or stage.WHY.get(head) or f"it reads {choices(sorted(keys))}"
     return f"{name}: stage={cfg.stage} does not read it: {why}; leave it out"
@@ -277,12 +280,16 @@ def is_learner(cfg):
     return inspect.isclass(kind) and issubclass(kind, Learner)
 
 
-def make_controller(cfg, robot, task, dynamics):
-    """Return the controller of conf/algo, with the model that it believes in."""
+def of_trainings():
+    """Return the keys of conf/algo that say how to train, which an experiment may set for a controller, too."""
     from r2s.learning.train import Loop
 
-    trained = ("n_envs", "hidden", *(f.name for f in fields(Loop)))  # an experiment may say how to train
-    return part(cfg.algo, "algo", robot, task, dynamics, beside=trained)
+    return ("n_envs", "hidden", *(f.name for f in fields(Loop)))
+
+
+def make_controller(cfg, robot, task, dynamics):
+    """Return the controller of conf/algo, with the model that it believes in."""
+    return part(cfg.algo, "algo", robot, task, dynamics, beside=of_trainings())
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
