@@ -1,0 +1,160 @@
+"""Tracking (docs/tracking.md): computed torque on several models and learned policies, on twins and simulated arms.
+
+Parts, each doing only what is missing:
+    python benchmarks/tracking.py twins MAKE SEED ...      computed torque on the nominal and the identified model
+    python benchmarks/tracking.py simulated SEED ...       the same and the true model, on arms of known truth
+    python benchmarks/tracking.py policy FOLDER MAKE SEED  a training's policy on a twin
+    python benchmarks/tracking.py                          the table of what there is
+Identifications go through run.py into run folders named track_*; rows are added to runs/bench/tracking.csv.
+Seeds 0-3 are for development, 100 and above (make 1) and 200 and above (make 2) for judging.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from common import NEW, OLD, ROBOT, ROOT, conf, markdown
+
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.interface import Arm
+from r2s.arm.simulated import SimulatedArm
+from r2s.arm.twins import twin
+from r2s.identification.parameter_file import load_parameters
+from r2s.learning.computed_torque import Still
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import load_policy
+from r2s.learning.randomization import Around
+from r2s.physics.dynamics import Dynamics
+from r2s.stages.build import make_dynamics, make_robot, make_task
+from r2s.stages.transfer import trained_config
+from r2s.tasks.episode import Acts, rollout
+from r2s.tasks.track import TrackTask
+
+RUNS = Path(os.environ.get("R2S_ROOT", ROOT / "runs"))
+TABLE = RUNS / "bench" / "tracking.csv"
+PATHS = 12  # a row: each costs a second of a core on a twin
+TASK = TrackTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/track").items()})
+
+
+def identified(name: str, *words: str) -> Dynamics:
+    """Return what stage=identify finds of an arm."""
+    folder = RUNS / "identify" / name
+    if not (folder / "parameters.yaml").is_file():
+        command = ["stage=identify", f"name={name}", f"root={RUNS}", "threads=1", "only_missing=true", *words]
+        subprocess.run([sys.executable, "run.py", *command], cwd=ROOT, check=True)
+    space, x = load_parameters(folder, ROBOT)
+    return space.dynamics(x)
+
+
+def judged(arm: Arm, task: TrackTask, friction: np.ndarray, policy: Acts) -> dict:
+    """Return the measures of an arm behind its driver, and the RMSE of each path."""
+    starts, goals = fixed_episodes(ROBOT, task, PATHS)
+    driven = DrivenArm(arm, task, friction)
+    done = rollout(policy, driven, task, starts, goals)
+    each = 1e3 * np.sqrt((done.distance**2).mean(1))
+    return task.measures(done) | {"stops": len(driven.stops), "each": " ".join(f"{x:.3f}" for x in each)}
+
+
+def add(row: dict) -> None:
+    """Add a row to the table."""
+    TABLE.parent.mkdir(parents=True, exist_ok=True)
+    old = pd.read_csv(TABLE) if TABLE.is_file() else pd.DataFrame()
+    pd.concat([old, pd.DataFrame([row])]).to_csv(TABLE, index=False)
+    print(row, flush=True)
+
+
+def known(arm: str, what: str) -> bool:
+    """Return whether a row is there."""
+    if not TABLE.is_file():
+        return False
+    table = pd.read_csv(TABLE)
+    return bool(((table["arm"] == arm) & (table["what"] == what)).any())
+
+
+def twins(make: int, seeds: Sequence[int]) -> None:
+    """Judge computed torque on twins."""
+    for seed in seeds:
+        words = f"arm.make={make}", f"arm.seed={seed}"
+        models = {"nominal": lambda: OLD, "identified": lambda s=seed, w=words: identified(f"track_{make}_{s}", *w)}
+        for what, model in models.items():
+            name = f"twin {seed} of make {make}"
+            if not known(name, f"computed torque, {what}"):
+                dynamics = model()
+                task = TASK.believing(ROBOT, dynamics)
+                row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics.level, Still(ROBOT.n))
+                add({"arm": name, "group": f"make {make}", "what": f"computed torque, {what}"} | row)
+
+
+def simulated(seeds: Sequence[int]) -> None:
+    """Judge computed torque on simulated arms of known truth: the paper's NEW parameters, drawn as dr=paper does."""
+    for seed in seeds:
+        drawn = Around(ROBOT, NEW, 0.1, 0.05)(np.random.default_rng(seed), 1).one(0)
+        truth = replace(drawn, delay=0.003, lag=0.002)
+        for what, dynamics in {"nominal": OLD, "true": truth}.items():
+            name = f"simulated {seed}"
+            if not known(name, f"computed torque, {what}"):
+                arm = SimulatedArm(ROBOT, truth, position_noise=1e-5, velocity_noise=3e-3, seed=seed)
+                row = judged(arm, TASK.believing(ROBOT, dynamics), dynamics.level, Still(ROBOT.n))
+                add({"arm": name, "group": "simulated", "what": f"computed torque, {what}"} | row)
+
+
+def policy(folder: str, make: int, seed: int) -> None:
+    """Judge a training's policy on a twin."""
+    from omegaconf import OmegaConf
+
+    source, trained = trained_config(OmegaConf.create({"policy": folder}))
+    robot = make_robot(trained)
+    dynamics = make_dynamics(trained, robot)
+    task = make_task(trained, robot, dynamics)
+    row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics.level, load_policy(source, robot, task))
+    add({"arm": f"twin {seed} of make {make}", "group": f"make {make}", "what": f"policy {source.name}"} | row)
+
+
+def interval(rows: pd.DataFrame) -> str:
+    """Return the mean RMSE and its 95 % bootstrap interval: arms are drawn, and of each arm its paths."""
+    each = [np.array([float(x) for x in text.split()]) for text in rows["each"]]
+    rng = np.random.default_rng(0)
+    draws = []
+    for _ in range(2000):
+        arms = rng.integers(len(each), size=len(each))
+        paths = [each[i][rng.integers(len(each[i]), size=len(each[i]))] for i in arms]
+        draws.append(np.sqrt(np.mean(np.concatenate(paths) ** 2)))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    middle = np.sqrt(np.mean(np.concatenate(each) ** 2))
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def report() -> None:
+    """Print the table: groups of arms, by what followed the paths."""
+    table = pd.read_csv(TABLE)
+    rows = {}
+    for (group, what), part in table.groupby(["group", "what"], sort=False):
+        cells = {
+            "arms": str(len(part)),
+            "RMSE, mm": interval(part),
+            "worst arm, mm": f"{part['path_rmse_mm'].max():.2f}",
+        }
+        cells |= {"largest, mm": f"{part['path_max_mm'].mean():.1f}"}
+        cells |= {f"< {k} mm, %": f"{100 * part[f'within_{k}mm'].mean():.1f}" for k in (2, 5, 10)}
+        cells |= {"torque, Nm": f"{part['torque_rms_Nm'].mean():.2f}", "jerk, m/s^3": f"{part['jerk'].mean():.0f}"}
+        rows[f"{group}: {what}"] = cells | {"stops": f"{part['stops'].sum():.0f}"}
+    print(markdown(pd.DataFrame.from_dict(rows, orient="index").rename_axis("")))
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["twins", make, *seeds]:
+            twins(int(make), [int(s) for s in seeds])
+        case ["simulated", *seeds]:
+            simulated([int(s) for s in seeds])
+        case ["policy", folder, make, seed]:
+            policy(folder, int(make), int(seed))
+        case []:
+            report()
+        case _:
+            raise SystemExit(__doc__)
