@@ -136,7 +136,8 @@ def test_the_estimate_from_data_of_known_truth_is_exact():
     last = listen(robot(), estimator, data)[-1]
     assert abs(last.mass - 1.0) < y / (9.81 * 0.4)
     np.testing.assert_allclose(last.centre, THING.centre, atol=y / 9.81 + 1e-3)
-    assert (np.abs(last.friction - 1.0) < last.friction_half).all()
+    rubs = np.sqrt(np.mean([b.rub**2 for b in rows], axis=0))
+    assert (np.abs(last.friction - 1.0) < y / rubs).all()
     assert estimator.changes == []
 
 

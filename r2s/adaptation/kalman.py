@@ -35,7 +35,7 @@ class Noise(NamedTuple):
             friction by that level leaves in doubt. level, edge: (n,) Nm, as of `Believed`.
         inertia: (n, n) kg m^2, late: (n, n) s: what motion without a payload says that the model lacks of inertia, of
             rotors above all, and of delay.
-        loaded: share of a payload's torque that friction may grow by.
+        loaded: share of a payload's torque by which friction, and what noisy speeds make of it, are in doubt.
         warming: 1/sqrt(s), of friction's share. drifting: (n,) Nm/sqrt(s), of the offsets.
         resting: kg^2/s, what may be put into the hand while nothing is seen of it.
         creeping: 1/sqrt(s), share of the payload's prior by which it is never known for good.
@@ -114,12 +114,13 @@ def update(filter, noise, b):
             P[i, i] = min(P[i, i] + noise.resting * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
     for c in range(BODY):
         P[c, c] += (noise.creeping * noise.prior[c]) ** 2 * T
-    fade = np.exp(-T / noise.lasting)
+    fade, unsure = np.exp(-T / noise.lasting), filter.work[1]
     for j in range(n):
         e, used, load = E0 + j, slides[j] > 0.0, 0.0
         for c in range(BODY):
-            load += payload[j, c] * x[c]
-        model = np.sqrt(noise.model[j] ** 2 + (noise.loaded * load) ** 2)
+            load += (payload[j, c] * x[c]) ** 2
+        unsure[j] = noise.loaded**2 * load
+        model = np.sqrt(noise.model[j] ** 2 + unsure[j])
         if used:
             x[e] *= fade
             for i in range(N):
@@ -148,9 +149,9 @@ def update(filter, noise, b):
                 filter.f[k, a, c] *= slow
     if moves:
         _begin_onset(filter)
-    h, g = filter.work[0], filter.work[1]
+    h, g = filter.work[0], np.empty(JUMP)
     for j in range(n):
-        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2
+        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2 + unsure[j]
         if slides[j] == 0.0:
             R += noise.edge[j] ** 2 / 3.0 * REST_S / T
         for i in range(N):

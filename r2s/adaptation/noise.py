@@ -29,7 +29,7 @@ LEAST = 50  # spans of sliding that say something
 FINEST = 0.03  # of the level: better nobody knows friction
 RIDGE = 1e-3
 LEAST_SCALE = 0.5
-LOADED = 0.015  # Nm of friction per Nm of a payload
+LOADED = 0.015  # Nm per Nm of a payload: friction that goes with load
 
 
 @dataclass(frozen=True)
