@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import conf
 
@@ -125,7 +126,7 @@ def test_momentum_is_mass_times_speed_and_linear_in_the_payload():
 
 
 def test_the_estimate_from_data_of_known_truth_is_exact():
-    """What a step of h s is wrong by is half a step, h / 2 of each joint's torque rate; no estimate is off by more."""
+    """A step of h s is wrong by half a step, h / 2 of each joint's torque rate; no estimate is off by more."""
     arm, noise = quiet()
     data = recording(on=0.0)
     own = 0.5 * np.sqrt(np.mean(np.diff(data.tau, axis=0) ** 2, axis=0))  # Nm
@@ -221,3 +222,32 @@ def test_what_cannot_be_listened_to_is_said():
     with pytest.raises(UserError, match="7 joints"):
         estimator(np.zeros(6), np.zeros(6), np.zeros(6))
     assert not estimator(np.full(7, np.nan), np.zeros(7), np.zeros(7))
+
+
+@pytest.mark.slow
+def test_the_stage_listens_to_a_recording(tmp_path, capsys):
+    """stage=watch data=recording: lines, watch.csv, figures and a summary that holds the truth; mistakes are said."""
+    from hydra import compose, initialize_config_dir
+
+    from r2s.stages.build import CONF
+    from r2s.stages.watch import watch
+
+    recording(on=1.0, off=2.0, noise=2e-3).save(tmp_path / "heard.npz")
+    words = ["stage=watch", "data=recording", f"data.path={tmp_path / 'heard.npz'}", f"root={tmp_path}", "name=w"]
+
+    def config(*more):
+        with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+            return compose("config", [*words, *more])
+
+    with pytest.raises(UserError, match="data.torque: measured is not allowed for stage=watch"):
+        watch(config("data.torque=measured"), [])
+    with pytest.raises(UserError, match=r"no such file: .*heart.npz; did you mean 'heard.npz'"):
+        watch(config("data.torque=commanded", f"data.path={tmp_path / 'heart.npz'}"), [])
+    assert not (tmp_path / "watch").exists()
+    watch(config("data.torque=commanded"), [])
+    folder, said = tmp_path / "watch" / "w", capsys.readouterr().out
+    assert "kg" in said
+    assert all((folder / name).is_file() for name in ("watch.csv", "recording.rrd", "figures/payload.png"))
+    rows = pd.read_csv(folder / "watch.csv")
+    before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
+    assert abs(before["mass_kg"] - 1.0) < before["mass_kg_half"]
