@@ -23,7 +23,7 @@ MOVES = 0.02  # rad/s, below which it may be held
 class Kept(NamedTuple):
     """What is remembered of n joints from cycle to cycle; a payload's ten numbers have columns of their own."""
 
-    count: np.ndarray  # (2,), cycles of the span, and of the line of commands
+    counts: np.ndarray  # (2,), cycles of the span, and of the line of commands
     line: np.ndarray  # (SLOTS, n) Nm
     motor: np.ndarray  # (n,) Nm
     felt: np.ndarray  # (n,) Nm, mean torque of the motors in the coming step
@@ -41,12 +41,9 @@ class Kept(NamedTuple):
     @staticmethod
     def fresh(n: int) -> "Kept":
         """Return that of an arm that has not moved yet."""
-        count = np.array([0, SLOTS])
-        vectors = [np.zeros(n) for _ in range(3)]
-        return Kept(
-            count, np.zeros((SLOTS, n)), *vectors, np.zeros((2, n)), np.zeros((2, n)), np.zeros(n), np.zeros((2, n)),
-            np.zeros((4, n)), np.zeros((n, BODY)), np.zeros((n, BODY)), np.zeros((3, n, BODY)), np.zeros((n, WIDE)),
-        )  # fmt: skip
+        shapes = [(SLOTS, n), (n,), (n,), (n,), (2, n), (2, n), (n,), (2, n), (4, n)]
+        shapes += [(n, BODY), (n, BODY), (3, n, BODY), (n, WIDE)]
+        return Kept(np.array([0, SLOTS]), *map(np.zeros, shapes))  # type: ignore[arg-type]
 
 
 class Balance(NamedTuple):
@@ -84,12 +81,12 @@ def observe(arm, kept, q, dq, tau, out):
         out: `Balance`.
     """
     n, h = len(q), SIM_DT
-    begun, T = kept.count[0] > 0, SPAN * h
+    begun, T = kept.counts[0] > 0, SPAN * h
     momentum(
         arm.links, arm.moments, arm.hand, arm.gravity, arm.armature, q, dq, kept.work, kept.moment[0], kept.moment[1],
         kept.moment[2], kept.moment[3], kept.payload_now, kept.payload_push[0],
     )  # fmt: skip
-    if kept.count[0] <= 1:
+    if kept.counts[0] <= 1:
         for j in range(n):
             out.path[j], out.slides[j] = 0.0, 1.0
     for j in range(n):
@@ -111,7 +108,7 @@ def observe(arm, kept, q, dq, tau, out):
         kept.known[0, j], kept.rubbed[0, j] = known, f
         for c in range(BODY):
             kept.payload_push[1, j, c] = kept.payload_push[0, j, c]
-    ended = kept.count[0] == SPAN
+    ended = kept.counts[0] == SPAN
     if ended or not begun:
         for j in range(n):
             if ended:
@@ -127,9 +124,9 @@ def observe(arm, kept, q, dq, tau, out):
             kept.began[0, j], kept.began[1, j] = dq[j], kept.felt[j]
             for c in range(BODY):
                 kept.payload_start[j, c], kept.payload_push[2, j, c] = kept.payload_now[j, c], 0.0
-        kept.count[0] = 0
-    kept.count[0] += 1
-    kept.line[kept.count[1] % SLOTS] = tau
-    turn(kept.line, kept.motor, kept.count[1], arm.late[0], arm.late[1], kept.felt)
-    kept.count[1] += 1
+        kept.counts[0] = 0
+    kept.counts[0] += 1
+    kept.line[kept.counts[1] % SLOTS] = tau
+    turn(kept.line, kept.motor, kept.counts[1], arm.late[0], arm.late[1], kept.felt)
+    kept.counts[1] += 1
     return ended

@@ -65,7 +65,7 @@ class Estimator:
     def __init__(self, arm: Believed, noise: Noise):
         self._arm, self._noise, self._n = arm, noise, len(arm.level)
         self.changes: list[float] = []
-        self._filter = Filter.fresh(noise.prior)
+        self._filter = Filter.fresh(noise)
         self._cycle = 0
         self.begin()
         self.now = self._told(False)

@@ -35,11 +35,11 @@ class Noise(NamedTuple):
             friction by that level leaves in doubt. level, edge: (n,) Nm, as of `Believed`.
         inertia: (n, n) kg m^2, late: (n, n) s: what motion without a payload says that the model lacks of inertia, of
             rotors above all, and of delay.
-        loaded: share of a payload's torque that friction may grow by.
+        loaded: share of a payload's torque by which friction, and what noisy speeds make of it, are in doubt.
         warming: 1/sqrt(s), of friction's share. drifting: (n,) Nm/sqrt(s), of the offsets.
         resting: kg^2/s, what may be put into the hand while nothing is seen of it.
         creeping: 1/sqrt(s), share of the payload's prior by which it is never known for good.
-        prior: (N,) standard deviations before anything is seen.
+        prior, start: (N,) standard deviations and means before anything is seen.
     """
 
     white: np.ndarray
@@ -57,12 +57,13 @@ class Noise(NamedTuple):
     resting: float
     creeping: float
     prior: np.ndarray
+    start: np.ndarray
 
 
 class Filter(NamedTuple):
     """x (N,), P (N, N); of each onset f (LATEST, N, 4), information (LATEST, 4, 4) and vector (LATEST, 4).
 
-    count: (4,): spans, onsets in use, spans at rest in a row, the next onset. odds: (3,): log of the mean odds of a
+    counts: (4,): spans, onsets in use, spans at rest in a row, the next onset. odds: (3,): log of the mean odds of a
     jump, that of the likeliest onset, its number. seen: (2, n): innovations and their variances.
     """
 
@@ -71,18 +72,18 @@ class Filter(NamedTuple):
     f: np.ndarray
     information: np.ndarray
     vector: np.ndarray
-    count: np.ndarray
+    counts: np.ndarray
     odds: np.ndarray
     seen: np.ndarray
     work: np.ndarray
 
     @staticmethod
-    def fresh(prior: np.ndarray) -> "Filter":
-        """Return the filter before anything is seen; prior (N,) standard deviations."""
-        N = len(prior)
+    def fresh(noise: Noise) -> "Filter":
+        """Return the filter before anything is seen."""
+        prior, N = noise.prior, len(noise.prior)
         n = (N - BODY) // 4
         return Filter(
-            np.zeros(N), np.diag(prior**2), np.zeros((LATEST, N, JUMP)), np.zeros((LATEST, JUMP, JUMP)),
+            noise.start.copy(), np.diag(prior**2), np.zeros((LATEST, N, JUMP)), np.zeros((LATEST, JUMP, JUMP)),
             np.zeros((LATEST, JUMP)), np.zeros(4, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.zeros((2, N)),
         )  # fmt: skip
 
@@ -100,7 +101,7 @@ def update(filter, noise, b):
     Args:
         filter: `Filter`. noise: `Noise`. b: `Balance`.
     """
-    x, P, count = filter.x, filter.P, filter.count
+    x, P, count = filter.x, filter.P, filter.counts
     N, n = len(x), len(b.y)
     payload, rub, path, slides = b.payload, b.rub, b.path, b.slides
     S0, O0, E0, A0 = BODY, BODY + n, BODY + 2 * n, BODY + 3 * n
@@ -114,12 +115,13 @@ def update(filter, noise, b):
             P[i, i] = min(P[i, i] + noise.resting * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
     for c in range(BODY):
         P[c, c] += (noise.creeping * noise.prior[c]) ** 2 * T
-    fade = np.exp(-T / noise.lasting)
+    fade, unsure = np.exp(-T / noise.lasting), filter.work[1]
     for j in range(n):
         e, used, load = E0 + j, slides[j] > 0.0, 0.0
         for c in range(BODY):
-            load += payload[j, c] * x[c]
-        model = np.sqrt(noise.model[j] ** 2 + (noise.loaded * load) ** 2)
+            load += (payload[j, c] * x[c]) ** 2
+        unsure[j] = noise.loaded**2 * load
+        model = np.sqrt(noise.model[j] ** 2 + unsure[j])
         if used:
             x[e] *= fade
             for i in range(N):
@@ -148,9 +150,9 @@ def update(filter, noise, b):
                 filter.f[k, a, c] *= slow
     if moves:
         _begin_onset(filter)
-    h, g = filter.work[0], filter.work[1]
+    h, g = filter.work[0], np.empty(JUMP)
     for j in range(n):
-        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2
+        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2 + unsure[j]
         if slides[j] == 0.0:
             R += noise.edge[j] ** 2 / 3.0 * REST_S / T
         for i in range(N):
@@ -191,12 +193,12 @@ def update(filter, noise, b):
 @njit(cache=True)
 def _begin_onset(filter):
     """Let a jump that begins with this span take the place of the oldest."""
-    at = filter.count[3]
+    at = filter.counts[3]
     filter.f[at] = 0.0
     filter.information[at] = 0.0
     filter.vector[at] = 0.0
-    filter.count[3] = (at + 1) % LATEST
-    filter.count[1] = min(filter.count[1] + 1, LATEST)
+    filter.counts[3] = (at + 1) % LATEST
+    filter.counts[1] = min(filter.counts[1] + 1, LATEST)
 
 
 @njit(cache=True, error_model="numpy")
@@ -205,15 +207,15 @@ def _weigh(filter, noise):
     best, at, most, total = -np.inf, -1, -np.inf, 0.0
     A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
     logs = np.empty(LATEST)
-    for k in range(filter.count[1]):
+    for k in range(filter.counts[1]):
         logs[k] = _solve(filter.information[k], filter.vector[k], noise.prior, A, b)
         if logs[k] > best:
             best, at = logs[k], k
     if at >= 0:
         most = best
-        for k in range(filter.count[1]):
+        for k in range(filter.counts[1]):
             total += np.exp(logs[k] - most)
-        most += np.log(total / filter.count[1])
+        most += np.log(total / filter.counts[1])
     filter.odds[0], filter.odds[1], filter.odds[2] = most, best, at
 
 
@@ -272,5 +274,5 @@ def jump(filter, noise):
                 filter.P[i, k2] += spread[i, m] * spread[k2, m]
     for c in range(BODY):  # it may have been within the span: what is found now is a beginning
         filter.P[c, c] += (noise.prior[c] * (AFRESH if c < JUMP else 1.0)) ** 2
-    filter.count[1] = 0
-    filter.count[3] = 0
+    filter.counts[1] = 0
+    filter.counts[3] = 0

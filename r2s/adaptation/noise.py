@@ -28,8 +28,8 @@ LAGS = range(3, 16)  # spans, between which the errors of a balance have forgott
 LEAST = 50  # spans of sliding that say something
 FINEST = 0.03  # of the level: better nobody knows friction
 RIDGE = 1e-3
-LEAST_SCALE = 0.5
-LOADED = 0.015  # Nm of friction per Nm of a payload
+LEAST_SCALE, MOST_SCALE, ROUNDS = 0.5, 1.5, 8
+LOADED = 0.015  # Nm per Nm of a payload: friction that goes with load
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def noise_of(arm: Believed, prior: Prior | None = None) -> Noise:
         drifting=DRIFTING * arm.level,
         resting=RESTING,
         creeping=CREEPING,
-        prior=np.concatenate([payload, friction, offset, MODEL * arm.level, zero + MOVING]),
+        prior=(sigma := np.concatenate([payload, friction, offset, MODEL * arm.level, zero + MOVING])),
+        start=np.zeros_like(sigma),
     )
 
 
@@ -93,7 +94,9 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
     `train` says what the model lacks of inertia and delay. `unloaded`, which should be other motion, says the rest.
     Per joint: the model's error from covariances at lags of 60 to 300 ms, white noise and its growth with the
     momentum's rate from what is left. Then all of a joint's are scaled so that the filter's innovations on that
-    motion have the variances that it believes, in the 99th percentile too, where there is more of that.
+    motion have the variances that it believes, in the 99th percentile too, where there is more of that, and all
+    joints' until no odds of a payload are above the number of spans. Friction and offsets begin with what that motion
+    says.
     """
     noise, n = noise_of(arm, prior), len(arm.level)
     inertia, late = np.zeros((n, n)), np.zeros((n, n))
@@ -131,10 +134,25 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
         moving[j] = np.sqrt(grows)
     noise = noise._replace(white=white, moving=moving, model=model, prior=_with_model(noise.prior, model, moving))
     for _ in range(2):
-        scale = np.maximum(_surprise(noise, unloaded), LEAST_SCALE)
-        parts = {name: getattr(noise, name) * scale for name in ("white", "moving", "model", "turning")}
-        noise = noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["moving"]))
-    return noise
+        noise = _scaled(noise, np.maximum(_surprise(noise, unloaded), LEAST_SCALE))
+    allowed = np.log(len(unloaded))
+    for _ in range(ROUNDS):  # odds that no payload there speaks for
+        if (most := _odds(noise, unloaded)) <= allowed:
+            break
+        noise = _scaled(noise, np.full(n, min(np.sqrt(most / allowed), MOST_SCALE)))
+    filter = _run(_bare(noise), [*train, *unloaded])[0]
+    start, prior_now = np.zeros_like(noise.prior), noise.prior.copy()
+    drift = np.concatenate([np.full(n, WARMED), DRIFTED * arm.level])
+    slow = slice(BODY, BODY + 2 * n)
+    start[slow] = filter.x[slow]
+    prior_now[slow] = np.hypot(np.sqrt(np.diag(filter.P)[slow]), drift)
+    return noise._replace(prior=prior_now, start=start)
+
+
+def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
+    """Return the noise with that of each joint times scale (n,)."""
+    parts = {name: getattr(noise, name) * scale for name in ("white", "moving", "model", "turning")}
+    return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["moving"]))
 
 
 def _lacking(rows: list[Balance], j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -151,16 +169,31 @@ def _with_model(prior: np.ndarray, model: np.ndarray, moving: np.ndarray) -> np.
     return out
 
 
+def _bare(noise: Noise) -> Noise:
+    """Return the noise of an arm that is known to carry nothing."""
+    prior = noise.prior.copy()
+    prior[:BODY] = 1e-6
+    return noise._replace(prior=prior, resting=0.0)
+
+
+def _run(noise: Noise, rows: list[Balance]) -> tuple[Filter, np.ndarray, np.ndarray]:
+    """Return the filter after these balances, its surprises (M, n), nan where a joint was held, and log odds (M,)."""
+    filter, seen, odds = Filter.fresh(noise), [], []
+    for b in rows:
+        update(filter, noise, b)
+        seen.append(np.where(b.slides > 0, filter.seen[0] / np.sqrt(filter.seen[1]), np.nan))
+        odds.append(filter.odds[0])
+    return filter, np.array(seen), np.array(odds)
+
+
+def _odds(noise: Noise, unloaded: list[Balance]) -> float:
+    """Return the largest log odds of a payload in motion without one."""
+    return float(_run(noise, unloaded)[2][len(unloaded) // 10 :].max())
+
+
 def _surprise(noise: Noise, unloaded: list[Balance]) -> np.ndarray:
     """Return (n,), by how much the innovations are larger than the filter believes, where it knows of no payload."""
-    bare = noise.prior.copy()
-    bare[:BODY] = 1e-6
-    known = noise._replace(prior=bare, resting=0.0)
-    filter, seen = Filter.fresh(bare), []
-    for b in unloaded:
-        update(filter, known, b)
-        seen.append(np.where(b.slides > 0, filter.seen[0] / np.sqrt(filter.seen[1]), np.nan))
-    surprise = np.array(seen)[len(seen) // 10 :]  # offsets are being found
+    surprise = _run(_bare(noise), unloaded)[1][len(unloaded) // 10 :]  # offsets are being found
     scale = np.ones(surprise.shape[1])
     for j in range(len(scale)):
         own = surprise[np.isfinite(surprise[:, j]), j]

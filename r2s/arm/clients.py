@@ -11,6 +11,7 @@ import termios
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
+from typing import Any
 
 from r2s.arm.emulator.process import Emulator
 from r2s.arm.fr3 import FR3
@@ -61,14 +62,19 @@ def panda_emulated(
     seed: int = 0,
     realtime: bool = False,
     noise: int = 0,
+    payload: Any = 0.0,
+    load: Any = None,
     operator: str = "terminal",
     collision_torque: Sequence[float] = CAUTIOUS.torque,
     collision_force: Sequence[float] = CAUTIOUS.force,
 ) -> AbstractContextManager[Franka]:
-    """Open a Panda that is emulated: libfranka's version 5, the twin `seed` behind it with the stream `noise`."""
+    """Open a Panda that is emulated: libfranka's version 5, the twin `seed` behind it with the stream `noise`.
+
+    What it carries, and what it was told of that: as of `HiddenArm`.
+    """
     collision = Collision(collision_torque, collision_force)
     client = partial(Panda, operator=_operator(operator), collision=collision)
-    return _emulated(client, 5, partial(Twin, robot, seed, noise=noise), realtime)
+    return _emulated(client, 5, partial(Twin, robot, seed, payload=payload, noise=noise, load=load), realtime)
 
 
 def fr3_emulated(
@@ -77,14 +83,19 @@ def fr3_emulated(
     seed: int = 0,
     realtime: bool = False,
     noise: int = 0,
+    payload: Any = 0.0,
+    load: Any = None,
     operator: str = "terminal",
     collision_torque: Sequence[float] = CAUTIOUS.torque,
     collision_force: Sequence[float] = CAUTIOUS.force,
 ) -> AbstractContextManager[Franka]:
-    """Open an FR3 that is emulated: libfranka's version 10, the twin `seed` behind it with the stream `noise`."""
+    """Open an FR3 that is emulated: libfranka's version 10, the twin `seed` behind it with the stream `noise`.
+
+    What it carries, and what it was told of that: as of `HiddenArm`.
+    """
     collision = Collision(collision_torque, collision_force)
     client = partial(FR3, operator=_operator(operator), collision=collision)
-    return _emulated(client, 10, partial(Twin, robot, seed, noise=noise), realtime)
+    return _emulated(client, 10, partial(Twin, robot, seed, payload=payload, noise=noise, load=load), realtime)
 
 
 @contextmanager

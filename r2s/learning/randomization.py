@@ -1,6 +1,6 @@
 """Domain randomization: dynamics drawn around a centre, every link tensor physically valid."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -11,6 +11,7 @@ from r2s.errors import UserError, check_number
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.payload import FARTHEST_M, MOST_KG, Payload, ball, loaded
 from r2s.physics.robot import Robot
 
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (source of the draws, m) -> dynamics of m arms
@@ -133,6 +134,40 @@ def identified(robot: Robot, center: Dynamics, calibration: str | Path | None) -
         raise UserError("dr=identified draws from what was identified: give calibration=RUN_FOLDER as well")
     space, _ = load_parameters(calibration, robot)
     return Identified(space, load_posterior(calibration, space))
+
+
+@dataclass(frozen=True)
+class Carrying:
+    """Dynamics of another draw, each arm with a payload: mass uniform, centre uniform in the ball about the hand.
+
+    The tensor is that of a ball of water; the arm's gravity compensation knows of none of it.
+
+    Attributes:
+        robot: the arm. draw: of the arms without a payload. payload: least and most kg.
+
+    Raises:
+        UserError: they are not two numbers from 0 to 1.5 kg in order.
+    """
+
+    robot: Robot
+    draw: Draw
+    payload: Sequence[float]
+
+    def __post_init__(self):
+        if not isinstance(self.payload, list | tuple) or len(self.payload) != 2:
+            raise UserError(f"dr.payload: {self.payload!r} is not allowed; [least, most] kg is")
+        for value in self.payload:
+            check_number("dr.payload", value, f"[0, {MOST_KG}]")
+        if self.payload[0] > self.payload[1]:
+            raise UserError(f"dr.payload: {self.payload[0]:g} is above {self.payload[1]:g} kg; the least goes first")
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return m drawn dynamics."""
+        dynamics = self.draw(rng, m)
+        least, most = self.payload
+        mass, way = rng.uniform(least, most, m), rng.normal(size=(m, 3))
+        centre = FARTHEST_M * way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(size=(m, 1)) ** (1 / 3)
+        return loaded(self.robot, dynamics, Payload(mass, centre, ball(mass)))
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:

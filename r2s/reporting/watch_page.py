@@ -33,7 +33,7 @@ def watch_figures(carried: Path, friction: Path, known: pd.DataFrame, changes: S
         for axis, way in zip(axes[1:], "xyz", strict=True):
             band(axis, f"centre_{way}_m", f"centre, {way} from the hand", "cm", 100.0)
             axis.set_ylim(-10, 10)
-    joints = sum(name.startswith("friction_") and not name.endswith("_half") for name in known)
+    joints = sum(name.startswith("friction_") and not name.endswith("_half") for name in map(str, known))
     with panels(friction, joints, 2 if joints > 3 else 1, "friction, share of what was believed") as axes:
         for j, axis in enumerate(axes):
             band(axis, f"friction_{j + 1}", f"joint {j + 1}", "%", 100.0)
