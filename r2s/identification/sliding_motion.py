@@ -55,10 +55,17 @@ class SlidingMotion:
     late: np.ndarray
 
     @staticmethod
-    def of(recording: Recording, rate_hz: float, slowest: float, slid: float = 0.0) -> "SlidingMotion":
+    def of(
+        recording: Recording,
+        rate_hz: float,
+        slowest: float,
+        slid: float = 0.0,
+        presliding_rad: np.ndarray | float = PRESLIDING,
+    ) -> "SlidingMotion":
         """Find the windows about moments at `rate_hz`, in which a joint is faster than `slowest` rad/s.
 
-        With `slid`, rad, a window starts when the joint has slid that far since it turned: bristles bend first.
+        With `slid`, rad, a window starts when the joint has slid that far since it turned: bristles bend first, over
+        `presliding_rad`, one distance or (n,).
 
         Raises:
             UserError: nothing is left.
@@ -78,7 +85,7 @@ class SlidingMotion:
             instants.append(own)
             moments.append(own[some])
             places.append(base + some)
-            bristle.append(presliding(dq[s], SIM_DT, PRESLIDING)[::every])
+            bristle.append(presliding(dq[s], SIM_DT, presliding_rad)[::every])
             base += len(own)
         own, kept, at = (np.concatenate(parts) for parts in (instants, moments, places))
         if not len(kept):
