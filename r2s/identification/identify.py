@@ -21,7 +21,16 @@ from r2s.identification.bristles import Bending, bending
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import Known, Problem, Report, Search, answers_early, believed, optional_friction, searched
+from r2s.identification.problem import (
+    Known,
+    Problem,
+    Report,
+    Search,
+    answers_early,
+    believed,
+    optional_friction,
+    searched,
+)
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed

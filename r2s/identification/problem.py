@@ -194,7 +194,7 @@ class Problem:
         return np.concatenate([data(self.space.from_unit(u)), self._belief(u)], axis=1)
 
     def _belief(self, u: np.ndarray) -> np.ndarray:
-        """Return (C, B), what is believed without the motion, in standard deviations: the prior, then what is beside."""
+        """Return (C, B), what is believed without the motion, in standard deviations: the prior, then `beside`."""
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
         return np.concatenate([prior, *(known.residual(self.space, x) for known in self.beside)], axis=1)
 
