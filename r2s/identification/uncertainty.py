@@ -142,7 +142,8 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
         h = np.tensordot(times, gram, 1) + belief
         steps[k] = -np.linalg.solve(h, times @ score + believed)
     own = covariance @ np.linalg.cholesky(factor**2 * information + belief)
-    return Posterior(u, _at_least(own, steps - np.median(steps, axis=0)), information)
+    steps = _at_least(own, steps - np.median(steps, axis=0))
+    return Posterior(u, _inside(u, steps, information + belief), information)
 
 
 def _at_least(root: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -153,6 +154,27 @@ def _at_least(root: np.ndarray, steps: np.ndarray) -> np.ndarray:
     white = np.linalg.solve(root, steps.T).T
     seen, axes = np.linalg.eigh(white.T @ white / len(white))
     return (white @ axes) / np.sqrt(np.clip(seen, 1e-12, 1.0)) @ axes.T @ root.T
+
+
+def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return steps (S, P) that end in the cube: values that would leave it stop there, and the others make up for it.
+
+    h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry that is at its bound,
+    to stop one of them alone would change what they make together.
+    """
+    steps = steps.copy()
+    for step in steps:
+        stopped = np.zeros(len(u), dtype=bool)
+        for _ in range(len(u)):
+            out = np.abs(u + step - 0.5) > 0.5 + 1e-12
+            if not out.any():
+                break
+            stopped |= out
+            change = np.where(out, np.clip(u + step, 0.0, 1.0) - u - step, 0.0)
+            free = ~stopped
+            change[free] = -np.linalg.solve(h[np.ix_(free, free)], h[np.ix_(free, out)] @ change[out])
+            step += change
+    return np.clip(u + steps, 0.0, 1.0) - u
 
 
 def conclude(
