@@ -16,10 +16,21 @@ import numpy as np
 import pandas as pd
 
 from r2s.identification.breakaway import Breakaway, breakaway
+from r2s.identification.bristles import NAME as PRESLIDING
+from r2s.identification.bristles import Bending, bending
 from r2s.identification.checks import check_motion
 from r2s.identification.dead_zone import stiction
 from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import Problem, Report, Search, answers_early, believed, optional_friction, searched
+from r2s.identification.problem import (
+    Known,
+    Problem,
+    Report,
+    Search,
+    answers_early,
+    believed,
+    optional_friction,
+    searched,
+)
 from r2s.identification.replay_residual import ReplayResidual
 from r2s.identification.settings import Settings
 from r2s.identification.spare_terms import needed
@@ -138,14 +149,14 @@ def identify(
             batch=min(len(space.start) + 1, 64),
             nthread=nthread,
         )
-    at_rest = None
+    beside: list[Known] = []
     if ramps is not None and edges is not None and "rise" in space.blocks:
-        at_rest = StaticFriction(robot, ramps, edges)
+        beside.append(StaticFriction(robot, ramps, edges))
     kept = np.zeros(robot.n, dtype=bool)
     if settings.keep_nominal:
         kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
-    problem_of = partial(Problem, quick=quick, prior=prior, kept=np.asarray(kept, dtype=bool), at_rest=at_rest)
-    problem = problem_of(data)
+    problem_of = partial(Problem, prior=prior, kept=np.asarray(kept, dtype=bool), beside=beside)
+    problem = problem_of(data, quick)
     u = problem.start
     lag = space.where("lag") if "lag" in space.blocks else None
     refused = False
@@ -163,11 +174,22 @@ def identify(
             quick.ahead = EARLY * SIM_DT
             v = ended("search 1, early", search, v)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
-            refused, problem, data = True, problem_of(quick), quick
+            refused, problem, data = True, problem_of(quick, quick), quick
             break
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
         problem.adapt(u, fitted=k == len(searches) - 1 or on_level)
+    if data is quick and commanded and PRESLIDING in space.blocks:
+
+        def bends() -> dict[str, np.ndarray]:
+            arm = space.dynamics(space.from_unit(u))
+            return bending(robot, arm, recording, quick, bounds, prior, told, seed=seed, nthread=nthread)
+
+        known = step("bristles", bends)
+        beside.append(Bending(known["presliding"], known["sigma"]))
+        data = TorqueResidual(robot, space, recording, **level, presliding_rad=known["presliding"])
+        data.ahead = quick.ahead
+        problem = problem_of(data, data)
     last = searches[-1]
     if last.local:  # a local search goes on from where it was, weighed by what is left unexplained
 

@@ -14,7 +14,6 @@ from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.link_inertia import LINK, PAYLOAD
 from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, of_torque, parameter_space
 from r2s.identification.replay_residual import ReplayResidual
-from r2s.identification.static_friction import StaticFriction
 from r2s.identification.torque_residual import STEP, TorqueResidual
 from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import Dynamics
@@ -28,6 +27,14 @@ CLEAR = 3.0  # standard deviations, by which friction must be early
 TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
 TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
+
+
+class Known(Protocol):
+    """What is known of a space beside its motion."""
+
+    def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
+        """Return (C, K), in standard deviations, for x (C, P)."""
+        ...
 
 
 def check_choices(family: str, terms: Sequence[str]) -> None:
@@ -133,7 +140,7 @@ class Problem:
         prior: {"offset": sigma, ...}, standard deviation of the belief in the nominal value (of its logarithm where
             the scale is logarithmic), one or (n,). Blocks that are not named are uniform in their bounds.
         kept: (n,) bool, joints whose friction and offset stay nominal.
-        at_rest: what is known of friction at standstill.
+        beside: what is known without the motion and was not believed before: ramps, replays.
     """
 
     def __init__(
@@ -142,9 +149,9 @@ class Problem:
         quick: TorqueResidual,
         prior: Mapping[str, ArrayLike],
         kept: np.ndarray | None = None,
-        at_rest: StaticFriction | None = None,
+        beside: Sequence[Known] = (),
     ):
-        self.at_rest = at_rest
+        self.beside = list(beside)
         self.data, self.quick_data, self.space = data, quick, data.space
         space = data.space
         self.start = space.to_unit(space.start)
@@ -187,11 +194,9 @@ class Problem:
         return np.concatenate([data(self.space.from_unit(u)), self._belief(u)], axis=1)
 
     def _belief(self, u: np.ndarray) -> np.ndarray:
-        """Return (C, B), what is believed without the motion, in standard deviations: the prior, then standstill."""
-        prior = (u - self.start) * self.weight
-        if self.at_rest is None:
-            return prior
-        return np.concatenate([prior, self.at_rest.residual(self.space, self.space.from_unit(u))], axis=1)
+        """Return (C, B), what is believed without the motion, in standard deviations: the prior, then `beside`."""
+        prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
+        return np.concatenate([prior, *(known.residual(self.space, x) for known in self.beside)], axis=1)
 
     def _belief_jacobian(self, u: np.ndarray) -> np.ndarray:
         h = np.where(u > 0.5, -STEP, STEP)

@@ -25,6 +25,8 @@ NORMAL = 0.6745  # median of the magnitude of a normal variable, in standard dev
 SHORTEST, LONGEST = 0.024, 0.1  # s, half a window
 GUARD = 8e-3  # s, within which the low-pass feels a stop
 EDGE = 0.05  # s, within which it feels the end of a trajectory
+STEADY = 0.2  # share of its speed that a joint with a memory may win or lose over PRESLIDING
+CALM = 101  # rows, of the polynomials that tell so; over five of them noise looks like it
 LATEST = 0.04  # s, of a command before it is felt
 HELD = (np.arange(8) + 0.5) / 8  # steps, for which a command is held
 LAGGED, SHARE = np.polynomial.laguerre.laggauss(16)  # quadrature over exp(-x)
@@ -55,10 +57,18 @@ class SlidingMotion:
     late: np.ndarray
 
     @staticmethod
-    def of(recording: Recording, rate_hz: float, slowest: float, slid: float = 0.0) -> "SlidingMotion":
+    def of(
+        recording: Recording,
+        rate_hz: float,
+        slowest: float,
+        slid: float = 0.0,
+        presliding_rad: np.ndarray | float = PRESLIDING,
+    ) -> "SlidingMotion":
         """Find the windows about moments at `rate_hz`, in which a joint is faster than `slowest` rad/s.
 
-        With `slid`, rad, a window starts when the joint has slid that far since it turned: bristles bend first.
+        With `slid`, rad, a window starts when the joint has slid that far since it turned: bristles bend first, over
+        `presliding_rad`, one distance or (n,). Then rows are only where speed hardly changes over PRESLIDING, too:
+        as far as that bristles remember the friction of the speed before.
 
         Raises:
             UserError: nothing is left.
@@ -71,6 +81,10 @@ class SlidingMotion:
         encoder = np.median(np.abs(grid.q - smooth.q), axis=0) / NORMAL / np.sqrt(left)
         every, step = round(1 / (RATE_HZ * SIM_DT)), round(RATE_HZ / rate_hz)
         instants, moments, places, bristle, base = [], [], [], [], 0
+        slides = np.abs(dq) >= slowest
+        if slid:
+            change = np.abs(_derivative(smooth, 2, CALM)) * PRESLIDING
+            slides &= change <= STEADY * dq**2
         for s in smooth.stretches:
             own = np.arange(s.start, s.stop, every)
             edge = round(EDGE * RATE_HZ)
@@ -78,7 +92,7 @@ class SlidingMotion:
             instants.append(own)
             moments.append(own[some])
             places.append(base + some)
-            bristle.append(presliding(dq[s], SIM_DT, PRESLIDING)[::every])
+            bristle.append(presliding(dq[s], SIM_DT, presliding_rad)[::every])
             base += len(own)
         own, kept, at = (np.concatenate(parts) for parts in (instants, moments, places))
         if not len(kept):
@@ -86,8 +100,8 @@ class SlidingMotion:
         inside = np.zeros(len(own), dtype=bool)
         for begin, part in zip(np.cumsum([0, *map(len, instants)]), instants, strict=False):
             inside[begin + edge : begin + len(part) - edge] = True
-        q, slides = smooth.q[own], np.where((np.abs(dq[own]) >= slowest) & inside[:, None], np.sign(dq[own]), 0.0)
-        found = [_windows(q[:, j], slides[:, j], at, slid) for j in range(q.shape[1])]
+        q, way = smooth.q[own], np.where(slides[own] & inside[:, None], np.sign(dq[own]), 0.0)
+        found = [_windows(q[:, j], way[:, j], at, slid) for j in range(q.shape[1])]
         means, half = tuple(m for m, _ in found), np.stack([w for _, w in found], 1)
         gain = np.array([0.0, *(_noise(w) for w in range(1, round(LONGEST * RATE_HZ) + 1))])
         began, ended = (np.concatenate([np.full(len(p), p[end]) for p in instants]) for end in (0, -1))
@@ -137,12 +151,13 @@ def _cubic(x: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _derivative(recording: Recording, order: int) -> np.ndarray:
-    """Return (T, n), the first or second derivative of the angles, by polynomials through five rows."""
-    out = np.empty_like(recording.q)
+def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
+    """Return (T, n), a derivative of the angles, by polynomials of fourth order at most through `most` rows."""
+    out = np.zeros_like(recording.q)
     for s in recording.stretches:
-        rows = min(5, s.stop - s.start - (s.stop - s.start + 1) % 2)
-        out[s] = savgol_filter(recording.q[s], rows, rows - 1, deriv=order, delta=SIM_DT, axis=0) if rows > 2 else 0.0
+        rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)
+        if rows > 2:
+            out[s] = savgol_filter(recording.q[s], rows, min(rows - 1, 4), deriv=order, delta=SIM_DT, axis=0)
     return out
 
 

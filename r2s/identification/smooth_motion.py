@@ -39,7 +39,7 @@ class SmoothMotion:
 
     @staticmethod
     def of(
-        recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: float = PRESLIDING
+        recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: np.ndarray | float = PRESLIDING
     ) -> "SmoothMotion":
         """Resample on logged time, low-pass both ways, differentiate, keep `rate_hz`; edges are dropped.
 

@@ -43,14 +43,14 @@ class TorqueResidual:
         cutoff_hz: float = 10.0,
         rate_hz: float = 100.0,
         block_s: float = BLOCK_S,
-        presliding_rad: float = PRESLIDING,
+        presliding_rad: np.ndarray | float = PRESLIDING,
         slowest: float = 0.0,
     ):
         self.space = space
         m: SmoothMotion | SlidingMotion
         if slowest:
             bends = BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
-            m = sliding = SlidingMotion.of(recording, rate_hz, slowest, bends)
+            m = sliding = SlidingMotion.of(recording, rate_hz, slowest, bends, presliding_rad)
             carried = m.rows(mass_matrix(robot, m.q) ** 2) @ sliding.encoder**2
             self.seen, self._noise = sliding.seen, sliding.noise * np.sqrt(carried)
         else:

@@ -111,8 +111,8 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     drawn from its prior each time; each draw is one Gauss-Newton step from u. Where the data say nothing a draw is
     one of the prior's. A fit follows each of few windows, so what it leaves of one is less than the error, by its
     share in what is known (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). A bootstrap of few windows is
-    too narrow where single windows decide, so the spread is not let below what the residual's own variance gives.
-    Draws are centred on their median: a few of them may go far.
+    too narrow where single windows decide, so in no direction does it fall below what the residual's own variance
+    gives. Draws are centred on their median: a few of them may go far.
     """
     rng = np.random.default_rng(seed)
     residual, jacobian = problem.jacobian(u)
@@ -141,10 +141,40 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
         believed = pull - rest.T @ rng.standard_normal(len(rest))
         h = np.tensordot(times, gram, 1) + belief
         steps[k] = -np.linalg.solve(h, times @ score + believed)
-    own = np.sqrt(np.diag(covariance @ (factor**2 * information + belief) @ covariance))
-    seen = steps.std(0)
-    steps = (steps - np.median(steps, axis=0)) * np.maximum(1.0, own / np.maximum(seen, 1e-12))
-    return Posterior(u, steps, information)
+    own = covariance @ np.linalg.cholesky(factor**2 * information + belief)
+    steps = _at_least(own, steps - np.median(steps, axis=0))
+    return Posterior(u, _inside(u, steps, information + belief), information)
+
+
+def _at_least(root: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return steps (S, P), stretched in the directions in which they scatter less than root root^T (P, P) says.
+
+    In directions, not parameter by parameter: what two that trade make together is known far better than either.
+    """
+    white = np.linalg.solve(root, steps.T).T
+    seen, axes = np.linalg.eigh(white.T @ white / len(white))
+    return (white @ axes) / np.sqrt(np.clip(seen, 1e-12, 1.0)) @ axes.T @ root.T
+
+
+def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return steps (S, P) that end in the cube: values that would leave it stop there, and the others make up for it.
+
+    h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry that is at its bound,
+    to stop one of them alone would change what they make together.
+    """
+    steps = steps.copy()
+    for step in steps:
+        stopped = np.zeros(len(u), dtype=bool)
+        for _ in range(len(u)):
+            out = np.abs(u + step - 0.5) > 0.5 + 1e-12
+            if not out.any():
+                break
+            stopped |= out
+            change = np.where(out, np.clip(u + step, 0.0, 1.0) - u - step, 0.0)
+            free = ~stopped
+            change[free] = -np.linalg.solve(h[np.ix_(free, free)], h[np.ix_(free, out)] @ change[out])
+            step += change
+    return np.clip(u + steps, 0.0, 1.0) - u
 
 
 def conclude(
@@ -169,8 +199,8 @@ def conclude(
     low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
     half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
     identifiable = half < prior / SHARPER
-    # in units of the prior, I + prior H prior: a direction that the data do not see keeps an eigenvalue of 1
-    gained, directions = np.linalg.eigh(np.eye(len(u)) + prior[:, None] * information * prior)
+    # in units of the prior: a direction of which nothing else says anything keeps an eigenvalue of 1
+    gained, directions = np.linalg.eigh(prior[:, None] * (information + problem.known(u)) * prior)
     null = []
     for g, v in zip(gained, directions.T, strict=True):
         if g < 4.0:  # half of the prior's sigma is left, or more

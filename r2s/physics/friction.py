@@ -349,21 +349,25 @@ def spelled(one: Family) -> str:
     return next((path for path, f in _plugged.items() if f is one), one.name)
 
 
-@njit(cache=True)
-def presliding(dq: np.ndarray, dt: float, distance: float) -> np.ndarray:
+def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return (T, n) in [-1, 1]: the sign of friction where it turns over a distance, not over a velocity.
 
     Dahl 1968: dz/dt = (v - |v| z) / distance, stepped exactly, z = 0 at the start.
 
     Args:
-        dq: (T, n) rad/s, dt s apart. distance: rad; about 1 mrad on a Panda.
+        dq: (T, n) rad/s, dt s apart. distance: rad, one or (n,); about 1 mrad on a Panda.
     """
+    return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
+
+
+@njit(cache=True)
+def _presliding(dq, dt, distance):
     z = np.zeros(dq.shape[1])
     out = np.empty_like(dq)
     for k in range(len(dq)):
         for j in range(len(z)):
             s = 1.0 if dq[k, j] > 0 else -1.0
-            z[j] = s + (z[j] - s) * np.exp(-abs(dq[k, j]) * dt / distance)
+            z[j] = s + (z[j] - s) * np.exp(-abs(dq[k, j]) * dt / distance[j])
             out[k, j] = z[j]
     return out
 

@@ -23,6 +23,7 @@ from r2s.recordings.recording import Recording
 from r2s.recordings.robot_logs import Table
 
 OWN = {"t", "q", "dq", "tau", "trajectory", "torque", "name", "joint", "sign", "pose"}  # what `Ramps.save` writes
+UNCHANGED = 1e-3  # Nm: a command that has changed by less has not begun to rise
 STARTED = 2e-3  # rad: a joint so far from its first position has let go, or is about to
 
 
@@ -169,7 +170,7 @@ def _check_commands(ramps: Ramps) -> None:
         until = int(away.argmax()) + 1 if away.any() else len(away)  # then it may be braked
         change = r.tau[rows][:until] - r.tau[rows.start]
         up, down = (sign * change).max(0), (-sign * change).max(0)
-        if up[j] > down[j]:
+        if up[j] > down[j] or np.maximum(up, down).max() < UNCHANGED:  # or the joint went before its command rose
             continue
         other = int(np.maximum(up, down).argmax())
         way = "other way" if other == j else f"command that changes is that of joint {other + 1}"
