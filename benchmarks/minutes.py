@@ -13,8 +13,8 @@ import pandas as pd
 from common import MACHINE, ROOT, STEADY, markdown, side_by_side
 
 PARTS = {  # minutes, seeds, settings
-    "four": (4, range(75, 80), ()),
-    "twelve": (12, range(80, 85), (*STEADY, "reward=long")),
+    "four": (4, range(85, 90), ()),
+    "twelve": (12, range(90, 95), (*STEADY, "reward=long")),
 }
 SHOWN = (  # measure, how it is written, what is asked in 4 and in 12 minutes
     ("success_1cm", "< 1 cm, %", 100, {"four": 98.0}),
