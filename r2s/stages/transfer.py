@@ -137,8 +137,9 @@ def transfer(cfg, overrides):
                 done, stops, timing = on_twin
             elif driven is not None:
                 tried = np.flatnonzero(predicted.collision == "")
-                for k in np.flatnonzero(predicted.collision != ""):
-                    print(f"episode {k + 1} is left out: the arm would touch something, {predicted.collision[k]}")
+                for e, what in enumerate(predicted.collision, 1):
+                    if what:
+                        print(f"episode {e} is left out: the arm would touch something, {what}")
             if driven is not None and len(tried):
                 progress, shown = counted(f"reach on {cfg.arm.name}")
                 done = rollout(policy, driven, task, starts[tried], goals[tried], shown)
