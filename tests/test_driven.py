@@ -17,7 +17,7 @@ from r2s.arm.deploy import DrivenArm
 from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
 from r2s.arm.emulator.control import HOLD
-from r2s.arm.franka import CAUTIOUS, TORQUE_SHARE, Franka
+from r2s.arm.franka import ACCELERATION, CAUTIOUS, TORQUE_SHARE, Franka
 from r2s.arm.interface import ArmStopped, NotCleared
 from r2s.arm.ramp import BRAKE_SHARE, LARGEST, poses_about, ramp
 from r2s.arm.simulated import SimulatedArm
@@ -29,6 +29,7 @@ from r2s.excitation.paths import check_path
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
@@ -355,17 +356,21 @@ def hostile(cycles, seed):
     share = dict.fromkeys(counted, 0.0)
     while sum(counted.values()) < cycles:
         arm = Watched(hold_from=rng.choice([None, rng.uniform(0, 1.5)], p=[0.4, 0.6]))
-        kind, most = rng.choice(list(counted)), (LARGEST + BRAKE_SHARE) * PANDA.tau_max[0]
+        kind, most = min(counted, key=counted.__getitem__), (LARGEST + BRAKE_SHARE) * PANDA.tau_max[0]
         try:
             if kind == "record":
                 plan = turn(rng.uniform(0.6, 2.0), rng.uniform(-0.5, 0.5))
-                most = np.abs(Tracker(PANDA, plan)._feedforward[:, 0]).max() + CORRECTION * PANDA.tau_max[0]
+                tracker = Tracker(PANDA, plan)
+                most = np.abs(tracker._feedforward[:, 0]).max() + CORRECTION * PANDA.tau_max[0]
+                most += swung(tracker._mass, np.abs(plan.ddq).max(0))
                 record(arm, plan)
             elif kind == "ramp":
                 ramp(arm, poses_about(PANDA, 1), rate=rng.uniform(2, 60))
             elif kind == "move_to":
-                most = TORQUE_SHARE * PANDA.tau_max[0]
-                Franka(PANDA, Wire(arm)).move_to(PANDA.q_home + rng.uniform(-0.4, 0.4, 7))
+                end = PANDA.q_home + rng.uniform(-0.4, 0.4, 7)
+                mass = np.linalg.inv(InverseInertia(PANDA, 2)(np.array([PANDA.q_home, end])))
+                most = TORQUE_SHARE * PANDA.tau_max[0] + swung(mass, ACCELERATION * PANDA.ddq_max)
+                Franka(PANDA, Wire(arm)).move_to(end)
             else:
                 most = TASK.torque(PANDA)[0]
                 spoiled(arm, rng)
@@ -375,6 +380,11 @@ def hostile(cycles, seed):
         caught = np.array(arm.held) > 150  # the link that moved has been stopped
         share[kind] = max(share[kind], np.abs(np.array(arm.pushes)[caught]).max(initial=0.0) / most)
     return counted, share, reasons
+
+
+def swung(mass, ddq):
+    """Return Nm that the other links' accelerations ddq (7,) put on the first joint, mass (k, 7, 7) kg m^2."""
+    return (np.abs(mass[:, 0, 1:]) @ ddq[1:]).max()
 
 
 def spoiled(arm, rng):

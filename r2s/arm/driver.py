@@ -9,14 +9,14 @@ function of states and targets, and the tests give it a million hostile ones.
 
 from typing import NamedTuple
 
-import mujoco
-import mujoco.batch
 import numpy as np
 
 from r2s.arm.interface import ArmState
 from r2s.compiled import njit
 from r2s.physics.actuation import condition, low_pass_factor
 from r2s.physics.limits import BRAKE_S, MOST, STEP, TAU_MAX, WORK, guard, limits
+from r2s.physics.newton_euler import WORK as DESK
+from r2s.physics.newton_euler import equations, links_of
 from r2s.physics.robot import SIM_DT, Robot
 
 DEADLINE_S = 0.05  # without a fresh finite target, or PERIODS of a slow policy: then the arm is braked, and stopped
@@ -89,9 +89,7 @@ class Drivers:
         self._fast = DQ_INSIDE * robot.dq_max
         self._factor, self._fade = low_pass_factor(cutoff_hz), round(soft_start_s / SIM_DT)
         self._deadline = max(DEADLINE_S, PERIODS * period_s)
-        self._arms = mujoco.batch.Batch(robot.model(gravity=False), m, 1)
-        self._q, self._dq = self._arms.bind("qpos"), self._arms.bind("qvel")
-        self._mass, self._bias = self._arms.bind("M"), self._arms.bind("qfrc_bias")
+        self._arm = links_of(robot, robot.mass, robot.com, robot.inertia), robot.armature
         self.reset()
         still = np.zeros(self._shape)
         self(np.tile(robot.q_home, (m, 1)), still, still, None)  # to compile while no arm waits
@@ -127,12 +125,10 @@ class Drivers:
             target: (m, n) Nm that the policies want; None where they have said nothing.
         """
         memory, said = self._memory, target is not None
-        seen = look(q, dq, self._q, self._dq)
-        self._arms.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         bounds = self._torque, self._low, self._high, self._fast
         settings = self._deadline, self._factor, self._fade
-        arms = self._friction, self._mass, self._bias, self._limits
-        out = drive(q, dq, seen, tau_J_d, target if said else q, said, *bounds, *settings, *arms, memory)
+        arm = self._friction, *self._arm, self._limits
+        out = drive(q, dq, tau_J_d, target if said else q, said, *bounds, *settings, *arm, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
                 if self.stopping[i] is None:
@@ -154,25 +150,17 @@ class Drivers:
 
 
 @njit(cache=True)
-def look(q, dq, to_q, to_dq):
-    """Write the states (m, n) that are finite into `to_q`, `to_dq`; return (m,), which they are."""
-    seen = np.empty(len(q), np.bool_)
-    for i in range(len(q)):
-        seen[i] = np.isfinite(q[i]).all() and np.isfinite(dq[i]).all()
-        if seen[i]:
-            to_q[i], to_dq[i] = q[i], dq[i]
-    return seen
-
-
-@njit(cache=True)
 def drive(
-    q, dq, seen, applied, target, said, torque, low, high, fast, deadline, factor, fade,
-    friction, mass, bias, limits, memory,
+    q, dq, applied, target, said, torque, low, high, fast, deadline, factor, fade,
+    friction, links, armature, limits, memory,
 ):  # fmt: skip
-    """Return the commands (m, n) Nm of this cycle; arguments as of `Drivers`, seen (m,): the state is finite."""
+    """Return the commands (m, n) Nm of this cycle; arguments as of `Drivers`, links: `links_of` the arm."""
     out, (m, n) = np.empty_like(memory.sent), q.shape
     work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
+    inertia, bias, desk, weightless = np.empty((n, n)), np.empty(n), np.empty((n, DESK)), np.zeros(3)
+    mass = np.empty(n * (n + 1) // 2)  # its lower triangle, row by row
     for i in range(m):
+        seen = np.isfinite(q[i]).all() and np.isfinite(dq[i]).all()
         if said and np.isfinite(target[i]).all():
             memory.target[i] = np.minimum(np.maximum(target[i], -torque), torque)
             memory.silent[i] = 0
@@ -181,16 +169,16 @@ def drive(
         if memory.why[i] == RUNS:
             if memory.silent[i] * SIM_DT > deadline:
                 memory.why[i] = SILENT
-            elif not seen[i]:
+            elif not seen:
                 memory.why[i] = NOT_FINITE
             elif not ((q[i] >= low).all() and (q[i] <= high).all() and (np.abs(dq[i]) <= fast).all()):
                 memory.why[i] = OUTSIDE
         stopping = memory.why[i] != RUNS
         memory.damped[i] += stopping
-        memory.rests[i] = seen[i] and (np.abs(dq[i]) < STILL).all()
+        memory.rests[i] = seen and (np.abs(dq[i]) < STILL).all()
         if stopping:  # from the speed that there is, at once
             memory.target[i] = 0.0
-            if seen[i] and memory.damped[i] == 1:
+            if seen and memory.damped[i] == 1:
                 memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, MOST]).max())
             memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
         at = slice(i, i + 1)
@@ -199,9 +187,14 @@ def drive(
             limits[:, TAU_MAX], limits[:, STEP], effort,
         )  # fmt: skip
         last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
-        if seen[i]:
+        if seen:
+            equations(links, weightless, q[i], dq[i], inertia, bias, desk)
+            for j in range(n):
+                inertia[j, j] += armature[j]
+                for k in range(j + 1):
+                    mass[j * (j + 1) // 2 + k] = inertia[j, k]
             share, now = memory.share[i], effort[0, 0]
-            changed = guard(q[i], dq[i], now, last, share, friction, mass[i], bias[i], limits, work, out[i])
+            changed = guard(q[i], dq[i], now, last, share, friction, mass, bias, limits, work, out[i])
             memory.limited[i] += changed
         else:
             for j in range(n):
@@ -238,7 +231,7 @@ class Driver:
     @property
     def done(self) -> bool:
         """Whether a motion that is being stopped is at rest, or has had its time."""
-        return bool(self._drivers.done[0])
+        return self.stopping is not None and bool(self._drivers.done[0])
 
     def __call__(self, state: ArmState, target: np.ndarray | None) -> np.ndarray:
         """Return the command (n,) Nm of this cycle; `target` (n,) Nm, None where the policy has said nothing."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numba import njit
 
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
@@ -98,6 +99,9 @@ class Reflexes:
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot
         self._step = robot.dtau_max * dt + RATE_TOLERANCE
+        still = np.zeros(robot.n)  # to compile while no arm waits
+        _takes(still, still, robot.tau_max, self._step)
+        _inside(still, still, robot.q_min, robot.q_max, robot.dq_max)
 
     def takes(self, tau: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
         """Return (...), whether arms would take tau (..., n) Nm after the commands tau_J_d (..., n) Nm."""
@@ -113,7 +117,7 @@ class Reflexes:
         r = self.robot
         if tau.shape != r.tau_max.shape:
             raise ArmStopped(f"the command has shape {tau.shape}, the arm has {r.n} joints")
-        if self.takes(tau, tau_J_d):
+        if _takes(tau, tau_J_d, r.tau_max, self._step):
             return
         if not np.isfinite(tau).all():
             i = int(np.argmin(np.isfinite(tau)))
@@ -130,7 +134,7 @@ class Reflexes:
     def state(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Raise ArmStopped if q, dq (n,) rad, rad/s are outside the arm's limits."""
         r = self.robot
-        if self.inside(q, dq):
+        if _inside(q, dq, r.q_min, r.q_max, r.dq_max):
             return
         out = np.maximum(r.q_min - q, q - r.q_max)
         if not (out <= 0).all():
@@ -138,3 +142,21 @@ class Reflexes:
             raise ArmStopped(f"joint {i + 1}: position {q[i]:.4f} rad, allowed {r.q_min[i]:g} to {r.q_max[i]:g} rad")
         i = int(np.argmax(np.abs(dq) / r.dq_max))
         raise ArmStopped(f"joint {i + 1}: velocity {dq[i]:.3f} rad/s, allowed +-{r.dq_max[i]:g} rad/s")
+
+
+@njit(cache=True)
+def _takes(tau, tau_J_d, most, step):
+    """`Reflexes.takes` of one arm, every millisecond."""
+    good = True
+    for j in range(len(tau)):
+        good &= abs(tau[j]) <= most[j] and abs(tau[j] - tau_J_d[j]) <= step[j]
+    return good
+
+
+@njit(cache=True)
+def _inside(q, dq, low, high, fast):
+    """`Reflexes.inside` of one arm."""
+    good = True
+    for j in range(len(q)):
+        good &= low[j] <= q[j] <= high[j] and abs(dq[j]) <= fast[j]
+    return good

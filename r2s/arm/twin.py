@@ -105,7 +105,7 @@ class Twin(HiddenArm):
     def _advance(self, tau: np.ndarray) -> None:
         if self._cycle % MASS_EVERY == 0:
             self._mass = self._engine.mass_matrix(self._q)
-        gravity = self._nominal.gravity_torque(self._q)
+        gravity = self._nominal.gravity_torque_there(self._q)
         passive, damping = _drive(
             self._hidden, self._state, self._line, self._mass, tau, self._q, self._dq, gravity,
             self._cycle, self._delay, self._lag, SIM_DT,

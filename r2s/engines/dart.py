@@ -153,8 +153,15 @@ class DartEngine:
         """Return (n,) Nm that holds the arm against gravity at q (n,); the arm stays where it is."""
         return self._at(q, self._skeleton.getGravityForces)
 
+    def gravity_torque_there(self, q: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm that holds the arm against gravity at q (n,) rad, and leave it there: it never steps."""
+        self._skeleton.setPositions(q)
+        return self._skeleton.getGravityForces()
+
     def _at(self, q, query):
         here = self._skeleton.getPositions()
+        if (here == q).all():
+            return query()
         self._skeleton.setPositions(q)
         result = query()
         self._skeleton.setPositions(here)

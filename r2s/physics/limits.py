@@ -110,14 +110,11 @@ def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
         limits: (n, COLUMNS), of `limits`. work: (2 n + WORK, n), anything.
     """
     n = len(q)
-    ddq, low, high, eaten = work[2 * n], work[2 * n + 1], work[2 * n + 2], work[2 * n + 6]
+    ddq, low, high = work[2 * n], work[2 * n + 1], work[2 * n + 2]
     left = _left(q, dq, limits)
     for j in range(n):
         out[j] = left * effort[j]
         ddq[j] = out[j] - bias[j]
-        eaten[j] = 0.0
-        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # of a joint that moves, or whose torque would move it
-            eaten[j] = SURE * friction[j] * abs(np.tanh(dq[j] / DRY + out[j] / friction[j]))
     _factor(mass, limits, work)
     _solve(work, ddq)
     within = True
@@ -127,7 +124,7 @@ def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
         high[j], low[j] = RATE * (up - dq[j]), -RATE * (down + dq[j])
         within &= low[j] <= ddq[j] <= high[j]
     if not within:
-        _widen(low, high, work)
+        _widen(low, high, dq, out, friction, limits, work)
         within = True
         for j in range(n):
             within &= low[j] <= ddq[j] <= high[j]
@@ -193,10 +190,14 @@ def _solve(root, x):
 
 
 @njit(cache=True, error_model="numpy")
-def _widen(low, high, work):
+def _widen(low, high, dq, out, friction, limits, work):
     """Widen the bounds by what friction may do to each joint, its neighbours' included; M^-1 is left in `work`."""
     n = len(low)
     root, mobility, eaten = work[:n], work[n : 2 * n], work[2 * n + 6]
+    for j in range(n):
+        eaten[j] = 0.0
+        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # of a joint that moves, or whose torque would move it
+            eaten[j] = SURE * friction[j] * abs(np.tanh(dq[j] / DRY + out[j] / friction[j]))
     for k in range(n):
         for j in range(n):
             mobility[k, j] = 1.0 if j == k else 0.0

@@ -139,9 +139,9 @@ def transfer(cfg, overrides):
                 done, stops, timing = on_twin
             elif driven is not None:
                 tried = np.flatnonzero(predicted.collision == "")
-                for left_out in np.flatnonzero(predicted.collision != ""):
-                    touched = predicted.collision[left_out]
-                    print(f"episode {left_out + 1} is left out: the arm would touch something, {touched}")
+                for e, what in enumerate(predicted.collision, 1):
+                    if what:
+                        print(f"episode {e} is left out: the arm would touch something, {what}")
             if driven is not None and len(tried):
                 progress, shown = counted(f"on {cfg.arm.name}")
                 done = rollout(policy, driven, task, starts[tried], goals[tried], shown)
