@@ -7,15 +7,20 @@ those that are finished are not run again. What is known of an arm is in its tru
     five    sigmoid, coulomb, stribeck, lugre and paper: FOLDER/<name>, which are not part of this repository
     drawn   arms of benchmarks/independent_arms.py by seed; they are made where FOLDER/<seed> is missing
 
-After a change of the identification give other run folders a name by `--tag WORD`. `--quick` is a toy: search=toy on
+After a change of the identification give other run folders a name by `--tag WORD`. `--processes 8` takes as many
+arms at once, of one thread each; seconds then are those of a busy machine. `--quick` is a toy: search=toy on
 the first arm of each kind. Words with = go to run.py as they are. Without either, all arms (20 drawn ones or more)
 write docs/independent.md.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +40,20 @@ def identified(arm: Path, name: str, words: list[str]) -> Path | None:
     command = [sys.executable, "run.py", "stage=identify", *data, f"name={name}", "only_missing=true", *words]
     failed = subprocess.run(command, cwd=ROOT).returncode
     return None if failed else folder
+
+
+def judged(name: str, arm: Path, label: str, words: list[str]) -> dict | None:
+    """Return what the identification of an arm is worth, None where it failed; make a drawn arm that is missing."""
+    if name.isdigit() and not (arm / "truth.json").is_file():
+        make(arm, int(name))
+    run = identified(arm.resolve(), label, words)
+    if run is None:
+        print(f"{name}: failed", flush=True)
+        return None
+    result = judge(run, arm, threads=1 if "threads=1" in words else 0)
+    (run / "judged.json").write_text(json.dumps(result, indent=1))
+    print(", ".join(f"{k} {v}" for k, v in row(name, result).items()), flush=True)
+    return result
 
 
 def both(r: dict, key: str, most=np.nanmax) -> str:
@@ -97,21 +116,23 @@ def asked(arms: dict[str, dict]) -> pd.DataFrame:
     return pd.DataFrame(lines).set_index("what")
 
 
-def report(results: dict[str, dict], words: list[str]) -> str:
+def report(results: dict[str, dict], words: list[str], processes: int = 1) -> str:
     """Return docs/independent.md."""
     five = {n: r for n, r in results.items() if n in FIVE}
     table = pd.DataFrame([row(n, r) for n, r in results.items()]).set_index("arm")
     groups = {"The arms that are not ours": five, "All arms": results if len(results) > len(five) else {}}
     bars = "\n\n".join(f"## {name}\n\n{markdown(asked(some))}" for name, some in groups.items() if some)
     seconds = np.array([r["seconds"] for r in results.values()])
-    words = ["--five FOLDER", *words]
+    words = ["--five FOLDER", *words, *([f"--processes {processes}"] if processes > 1 else [])]
+    order = "one after the other" if processes == 1 else f"{processes} at once, of one thread each"
+    commit = ", ".join(sorted({str(r["commit"])[:12] for r in results.values()}))
     said = " ".join(["python benchmarks/independent.py", *words])
     took = f"{np.median(seconds):.0f} s in the median, {seconds.max():.0f} s at most"
     return f"""# Arms of another simulator: what identification finds of them
 
 `{said}` on {MACHINE}: {len(results)} simulated Pandas,
-each recorded for 20 s and ramped 14 times, and identified with the defaults of stage=identify, one after the other:
-{took}. The arms share no code with r2s: rigid bodies of their own, Runge-Kutta at
+each recorded for 20 s and ramped 14 times, and identified with the defaults of stage=identify, {order}:
+{took} (commit {commit}). The arms share no code with r2s: rigid bodies of their own, Runge-Kutta at
 0.1 ms, stick and slip located in time (benchmarks/independent_dynamics.py). Friction, offsets, breakaway, delay, lag
 and inertia are drawn; nothing is set for any of them.
 
@@ -152,6 +173,7 @@ def main() -> None:
     parser.add_argument("--drawn", type=Path, default=ROOT / "runs" / "independent_arms")
     parser.add_argument("--seeds", type=seeds_of, default="0-23", help="of drawn arms: 0-23, or 1,4,7")
     parser.add_argument("--quick", action="store_true", help="a toy, of the first arms")
+    parser.add_argument("--processes", type=int, default=1, help="arms at once, of one thread each")
     parser.add_argument("--tag", default="", help="of the run folders")
     own, words = parser.parse_known_args()
     if wrong := [w for w in words if "=" not in w or w.startswith("-")]:
@@ -166,23 +188,20 @@ def main() -> None:
     if own.five is None and any(n in FIVE for n in names):
         parser.error("--five FOLDER is where the five arms are")
     arms = {n: (own.five if n in FIVE else own.drawn) / n for n in names}
-    results = {}
-    for name, arm in arms.items():
-        if name.isdigit() and not (arm / "truth.json").is_file():
-            make(arm, int(name))
-        label = "_".join(w for w in ("independent", own.tag, name) if w)
-        run = identified(arm.resolve(), label, words)
-        if run is None:
-            print(f"{name}: failed", flush=True)
-            continue
-        results[name] = judge(run, arm)
-        (run / "judged.json").write_text(json.dumps(results[name], indent=1))
-        print(", ".join(f"{k} {v}" for k, v in row(name, results[name]).items()), flush=True)
+    labels = ["_".join(w for w in ("independent", own.tag, name) if w) for name in arms]
+    if own.processes > 1:
+        alone = [*words, "threads=1"]
+        os.environ["OMP_NUM_THREADS"] = "1"  # of the processes to come
+        with ProcessPoolExecutor(own.processes, get_context("spawn")) as pool:
+            found: Iterable = list(pool.map(judged, arms, arms.values(), labels, [alone] * len(arms)))
+    else:
+        found = map(judged, arms, arms.values(), labels, [words] * len(arms))
+    results = {name: r for name, r in zip(arms, found, strict=True) if r is not None}
     if not results:
         sys.exit("no arm was identified")
     if len(commits := {r["commit"] for r in results.values()}) > 1:
         print(f"these runs are of {len(commits)} commits: give all of them one --tag")
-    page = report(results, words)
+    page = report(results, words, own.processes)
     print(page)
     if len(results) < len(arms):
         sys.exit(f"failed: {', '.join(n for n in arms if n not in results)}")

@@ -379,6 +379,18 @@ def test_where_a_ramp_ends(tmp_path):
         assert len(read_ramps(in_file(tmp_path / "ramps.npz", some)).joint) == 5
 
 
+def test_a_joint_that_goes_before_its_command_rises_spoils_no_other_ramp(tmp_path):
+    """It crept off under what held it: nothing contradicts its labels, and that ramp alone tells nothing."""
+    columns = own_ramps()
+    third = (columns["joint"] == 2) & (columns["sign"] == -1)
+    t = columns["t"][third]
+    columns["q"][third, 1] = -0.03 * t
+    columns["tau_J_d"][third] = np.where(t < 0.3, 0.1, 0.1 + 0.2 * np.sin(50 * t))[:, None]  # then it is braked
+    found = breakaway(read_ramps(in_file(tmp_path / "ramps.npz", columns), n_joints=3))
+    assert found.not_reached == ["joint 2, negative, pose 1"]
+    np.testing.assert_allclose(found.value[[0, 1, 3, 4]], 0.4, atol=4e-3)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -698,6 +698,22 @@ def test_rows_that_fill_a_window_up_make_nothing_surer():
     np.testing.assert_allclose(steps[0], steps[1], rtol=1e-9)
 
 
+def test_what_trades_stays_known_together():
+    """Of two values only the sum is told, within 1e-3; draws of it are no wider, at a bound as well."""
+    rng, windows, rows = np.random.default_rng(0), 40, 6
+    r = 1e-3 * rng.standard_normal(windows * rows)
+    told = np.ones((windows * rows, 2)) / 1e-3 / np.sqrt(windows * rows)
+    problem = SimpleNamespace(
+        jacobian=lambda u: (np.append(r / 1e-3, 0 * u), np.concatenate([told, 10 * np.eye(2)])),
+        clusters=np.repeat(np.arange(windows), rows),
+    )
+    for u in (np.full(2, 0.5), np.array([1.0, 0.5])):
+        steps = posterior(problem, u, 0).steps
+        assert steps.std(0).min() > 0.03
+        assert steps.sum(1).std() == pytest.approx(1e-3, rel=0.3)
+        assert (np.abs(u + steps - 0.5) <= 0.5).all()
+
+
 def test_what_is_left_out_is_not_fitted(clean):
     """Folds cover every moment once, and what is fitted keeps 0.1 s away; of repeated motion they are phases."""
     for recording, clock in ((clean, clean.t), (replace(clean, period=1.5), clean.t % 1.5)):

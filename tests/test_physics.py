@@ -450,6 +450,9 @@ def test_presliding_goes_by_the_distance():
     assert np.abs(z).max() <= 1
     fast = np.abs(wave) > 0.9 * np.abs(wave).max(0)
     assert np.array_equal(np.sign(z[fast]), np.sign(wave[fast]))
+    own = np.array([5e-4, 1e-3, 2e-3])  # joints of distances of their own
+    alone = [presliding(wave[:, [j]], 1e-3, own[j])[:, 0] for j in range(3)]
+    np.testing.assert_array_equal(presliding(wave, 1e-3, own), np.stack(alone, 1))
     assert not presliding(np.zeros((5, 2)), 1e-3, 1e-3).any()
 
 

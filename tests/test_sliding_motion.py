@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from r2s.identification.sliding_motion import LONGEST, RATE_HZ, SHORTEST, SlidingMotion
+from r2s.identification.sliding_motion import LONGEST, RATE_HZ, SHORTEST, STEADY, SlidingMotion
+from r2s.physics.friction import PRESLIDING
 from r2s.recordings.recording import Recording
 
 DT = 1e-3
@@ -45,6 +46,9 @@ def test_a_window_starts_where_the_joint_has_slid_far_enough(motion):
             first = means.indices[means.indptr[row]]
             turned = later.q[first, j] * later.dq[first, j] < 0
             assert not turned or 0.3 - abs(later.q[first, j]) > 0.02 - 1e-4
+            own = means.indices[means.indptr[row] : means.indptr[row + 1]]
+            v, a = later.dq[own, j], later.ddq[own, j]
+            assert (np.abs(a) * PRESLIDING <= 1.01 * STEADY * v**2).all()  # bristles keep up with the speed
     assert (later.seen <= motion.seen).all()
     assert later.seen.sum() < motion.seen.sum()
 

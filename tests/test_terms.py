@@ -68,7 +68,7 @@ def test_a_term_that_is_there_enters(arm):  # noqa: F811
 
 
 def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811
-    """Friction as sliding begins is the breakaway's, in either direction, within three times SURE (5 %)."""
+    """Friction as sliding begins is the breakaway's, in either direction, within three times SURE."""
     phi = np.concatenate([PHI, np.tile([0.4, 0.03, 0.3], (3, 1))], 1)
     truth = replace(Dynamics.of(arm, phi, STRIBECK, 1e-3), hold="net", delay=2e-3)
     truth = replace(truth, breakaway=STRIBECK.at_rest(phi))

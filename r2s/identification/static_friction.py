@@ -9,7 +9,7 @@ from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 
-SURE = 0.02  # of its level, how well a ramp's release tells friction at standstill: creep and onset blur it
+SURE = 0.03  # of its level, how well a ramp's release tells friction at standstill: creep and onset blur it
 
 
 class StaticFriction:
