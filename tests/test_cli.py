@@ -217,7 +217,15 @@ def test_the_grid_is_what_its_file_says(tmp_path):
 COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / "commands.md")]
 
 
-@pytest.mark.parametrize("command", [c for c in COMMANDS if not c.startswith(("resume=", "list", "look"))])
+COSTLY = ("task=track", "stage=watch")  # test_track.py and test_adaptation.py do it in process
+TYPED = [
+    c for c in COMMANDS if not c.startswith(("resume=", "list", "look", "export"))
+]  # those have tests of their own
+
+
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=[pytest.mark.slow] if c.startswith(COSTLY) else []) for c in TYPED]
+)
 def test_command(command, root, recording, trained, identified):
     """Every `python run.py` line of docs/commands.md ends well and says where its files are."""
     command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))

@@ -45,7 +45,7 @@ def commands(page: Path) -> list[str]:
     return list(dict.fromkeys([*in_blocks(page), *inline]))
 
 
-LISTED = set(in_blocks(DOCS / "commands.md"))  # test_cli.py types them, test_look.py list and look
+LISTED = set(in_blocks(DOCS / "commands.md"))  # test_cli.py types them; test_look.py, test_export.py
 TYPED = {
     page: [c for c in commands(page) if c not in LISTED and not any(re.match(k, c) for k in ELSEWHERE)]
     for page in PAGES
