@@ -206,7 +206,7 @@ def test_a_pickled_object_in_a_run_folder_is_refused(tmp_path):
 @pytest.mark.parametrize("value", [True, None, -1, 1.5, {"a": 1}, [], [True]])
 def test_an_option_of_a_group_is_a_word(value):
     """Hydra stops with a traceback where it is none; trackers alone may be none at all."""
-    with pytest.raises(UserError, match="algo: .* is not allowed; allowed: td3, tqc"):
+    with pytest.raises(UserError, match=r"algo: .* is not allowed; allowed: td3, tqc"):
         check_option("algo", value, ["td3", "tqc"])
     check_option("algo", "tqc", ["td3", "tqc"])
     check_option("tracker", [], ["csv"])
