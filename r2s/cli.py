@@ -20,6 +20,7 @@ COMMANDS = ("look", "list", "export")
 RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
+NONE_NEEDED = ("tracker", "experiment")  # groups of which a run may have no option
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
@@ -51,6 +52,8 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
         except (HydraException, OmegaConfBaseException, UnknownOption):
             raise _first_mistake(words, own, groups) from None
         for cfg in configs:  # Hydra asks for it before the job does
+            if cfg.get("stage") not in STAGES:
+                raise UserError(f"stage: {cfg.get('stage')} is not allowed; allowed: {choices(STAGES)}")
             root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
             if isinstance(root, bool) or not isinstance(root, str | int | float):
                 raise UserError(f"root: {root} is not allowed; a folder is")
@@ -77,11 +80,20 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
         names.append(parsed.key_or_group)
         if parsed.is_add() and parsed.key_or_group not in groups:  # Hydra would take it
             raise UnknownOption
+        if not parsed.is_sweep_override() and not parsed.is_delete() and parsed.key_or_group in groups:
+            check_option(parsed.key_or_group, parsed.value(), groups[parsed.key_or_group])
         values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
         trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
         first = jobs[0]
         jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
     return names, jobs
+
+
+def check_option(group: str, value: Any, options: Sequence[str]) -> None:
+    """Raise UserError where the option of a group is no word: Hydra would stop with a traceback, later."""
+    words = value if isinstance(value, list) else [value]
+    if not all(isinstance(w, str) for w in words) or not (words or group in NONE_NEEDED):
+        raise UserError(f"{group}: {value} is not allowed; allowed: {choices(options)}")
 
 
 def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> UserError:
@@ -253,7 +265,9 @@ def main():
     if sys.argv[1:2] and sys.argv[1] in COMMANDS:
         sys.exit(command(sys.argv[1:]))
     sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
-    typed = get_args_parser().parse_args()
+    parser = get_args_parser()
+    parser.error = lambda message: sys.exit(stop(f"{message}; see python run.py --help"))  # its own is six lines
+    typed = parser.parse_args()
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
     try:
         if not (typed.help or typed.hydra_help or typed.cfg or typed.info):

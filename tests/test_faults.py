@@ -15,6 +15,7 @@ import torch
 from conftest import ROOT
 from packaging.requirements import Requirement
 
+from r2s.cli import check_option
 from r2s.errors import UserError
 from r2s.learning.checkpoint import load_tensors, save_tensors
 from r2s.runs import Run, is_done, load_arrays, read_summary
@@ -200,3 +201,12 @@ def test_a_pickled_object_in_a_run_folder_is_refused(tmp_path):
     np.savez(tmp_path / "a.npz", x=np.array([shutil.which], dtype=object))
     with pytest.raises(UserError, match=r"a.npz is damaged"):
         load_arrays(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("value", [True, None, -1, 1.5, {"a": 1}, [], [True]])
+def test_an_option_of_a_group_is_a_word(value):
+    """Hydra stops with a traceback where it is none; trackers alone may be none at all."""
+    with pytest.raises(UserError, match=r"algo: .* is not allowed; allowed: td3, tqc"):
+        check_option("algo", value, ["td3", "tqc"])
+    check_option("algo", "tqc", ["td3", "tqc"])
+    check_option("tracker", [], ["csv"])

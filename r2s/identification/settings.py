@@ -58,7 +58,7 @@ class Settings:
             raise UserError(f"identify.bounds: none for {choices(missing)}")
         check_number("identify.window_s", self.window_s, "(0, inf)")
         check_number("identify.stride", self.stride, "[1, inf)", whole=True)
-        check_number("identify.cutoff_hz", self.cutoff_hz, "(0, inf)")
+        check_number("identify.cutoff_hz", self.cutoff_hz, "(0, 500]")  # half the rate of rows
         if self.breakaway is not None:
             check_number("identify.breakaway", self.breakaway, "[0, inf)")
         check_number("identify.folds", self.folds, "[1, inf)", whole=True)

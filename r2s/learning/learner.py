@@ -55,6 +55,7 @@ class Learner(nn.Module, ABC):
         check_number("gamma", gamma, "[0, 1)")
         check_number("tau", tau, "(0, 1]")
         check_number("lr", lr, "(0, 1]")
+        check_number("lr", lr, "[1e-12, 1]")  # below it float32 learns nothing
         check_number("action_l2", action_l2, "[0, inf)")
         obs_dim, act_dim = len(scale[0]), len(torque)
         self.normalizer = Normalizer(*scale)

@@ -328,7 +328,7 @@ def family(name: str) -> Family:
         )
     try:
         found = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError, SyntaxError, ValueError) as error:
+    except (ImportError, AttributeError, SyntaxError, TypeError, ValueError) as error:
         raise UserError(f"friction.family: cannot import '{name}' ({error})") from None
     if not isinstance(found, Family):
         raise UserError(f"friction.family: '{name}' is of type {type(found).__name__}; a Family is asked for")
