@@ -4,8 +4,8 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A cycle takes some ten microseconds, every SPAN-th some forty, without what is told of it. The numbers of a payload are
-reported as a body that exists: mass, centre, and a second moment about it that is not negative (Wensing, Kim and
+A cycle takes some ten microseconds, every SPAN-th some forty, without what is told of it. The numbers of a payload
+are reported as a body that exists: mass, centre, and a second moment about it that is not negative (Wensing, Kim and
 Slotine, RA-L 3(1), 2018).
 """
 
