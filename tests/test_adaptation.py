@@ -250,4 +250,5 @@ def test_the_stage_listens_to_a_recording(tmp_path, capsys):
     assert all((folder / name).is_file() for name in ("watch.csv", "recording.rrd", "figures/payload.png"))
     rows = pd.read_csv(folder / "watch.csv")
     before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
-    assert abs(before["mass_kg"] - 1.0) < before["mass_kg_half"]
+    # without calibration= no delay is known: 3 ms of it are an acceleration's torque amiss
+    assert abs(before["mass_kg"] - 1.0) < 2 * before["mass_kg_half"]

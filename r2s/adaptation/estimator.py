@@ -4,8 +4,9 @@
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A cycle takes some ten microseconds, every SPAN-th some thirty. The numbers of a payload are reported as a body that
-exists: mass, centre, and a second moment about it that is not negative (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+A cycle takes some ten microseconds, every SPAN-th some forty, without what is told of it. The numbers of a payload
+are reported as a body that exists: mass, centre, and a second moment about it that is not negative (Wensing, Kim and
+Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
@@ -56,7 +57,7 @@ class Estimator:
     """The estimate of one arm, cycle by cycle.
 
     Attributes:
-        now: the `Estimate` at the end of the last span. changes: s, when a payload was put on or taken off.
+        changes: s, when a payload was put on or taken off.
 
     Args:
         arm: what is believed of it. noise: how wrong that may be.
@@ -66,9 +67,9 @@ class Estimator:
         self._arm, self._noise, self._n = arm, noise, len(arm.level)
         self.changes: list[float] = []
         self._filter = Filter.fresh(noise)
-        self._cycle = 0
+        self._cycle, self._changed = 0, False
+        self._now: Estimate | None = None
         self.begin()
-        self.now = self._told(False)
 
     def begin(self) -> None:
         """Begin a motion from rest: nothing is under way, what was learnt stays."""
@@ -90,12 +91,18 @@ class Estimator:
         if not observe(self._arm, self._kept, q, dq, tau, b):
             return False
         update(self._filter, self._noise, b)
-        changed = bool(self._filter.odds[0] > THRESHOLD)
-        if changed:
+        self._changed, self._now = bool(self._filter.odds[0] > THRESHOLD), None
+        if self._changed:
             self.changes.append(self._cycle * SIM_DT)
             jump(self._filter, self._noise)
-        self.now = self._told(changed)
         return True
+
+    @property
+    def now(self) -> Estimate:
+        """What is known at the end of the last span; made when it is asked for, as that takes longer than a cycle."""
+        if self._now is None:
+            self._now = self._told(self._changed)
+        return self._now
 
     @property
     def innovations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
