@@ -266,7 +266,7 @@ def main():
         sys.exit(command(sys.argv[1:]))
     sys.path.append(os.getcwd())  # a user's own parts are modules of the folder that he is in
     parser = get_args_parser()
-    parser.error = lambda message: sys.exit(stop(f"{message}; see python run.py --help"))  # its own is six lines
+    parser.error = lambda message: sys.exit(stop(f"{message}; see python run.py --help"))  # type: ignore[method-assign]
     typed = parser.parse_args()
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
     try:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numba import njit
 
+from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
