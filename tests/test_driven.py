@@ -362,7 +362,8 @@ def hostile(cycles, seed):
                 plan = turn(rng.uniform(0.6, 2.0), rng.uniform(-0.5, 0.5))
                 tracker = Tracker(PANDA, plan)
                 most = np.abs(tracker._feedforward[:, 0]).max() + CORRECTION * PANDA.tau_max[0]
-                most += swung(tracker._mass, np.abs(plan.ddq).max(0))
+                added = CORRECTION * PANDA.tau_max * np.diagonal(np.linalg.inv(tracker._mass), 0, 1, 2).max(0)
+                most += swung(tracker._mass, np.abs(plan.ddq).max(0) + added)  # which tracking may accelerate, too
                 record(arm, plan)
             elif kind == "ramp":
                 ramp(arm, poses_about(PANDA, 1), rate=rng.uniform(2, 60))
