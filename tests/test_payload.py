@@ -10,7 +10,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins import twin
 from r2s.engines.dart import DartEngine
 from r2s.errors import UserError
-from r2s.learning.randomization import Carrying
+from r2s.learning.randomization import Around
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.newton_euler import WORK, equations, links_of
 from r2s.physics.payload import carrying, loaded, payload_of
@@ -96,12 +96,14 @@ def test_training_physics_takes_a_payload_and_what_the_arm_was_told(panda):
 def test_drawn_payloads_are_carried_by_arms_in_training(panda):
     """Every arm of a draw has its own, within the range, and the heavier ones sink lower."""
     center = nominal_dynamics(panda, **conf("friction/paper"))
-    draw = Carrying(panda, lambda rng, m: center, [0.5, 1.5])
+    draw = Around(panda, center, 0.1, 0.05, [0.5, 1.5])
     drawn = draw(np.random.default_rng(0), 16)
     added = drawn.mass[:, -1] - center.mass[-1]
     assert ((added >= 0.5) & (added <= 1.5)).all()
     assert len(np.unique(added)) == 16
     assert (drawn.mass[:, :-1] == center.mass[:-1]).all()
+    still = Around(panda, center, 0.1, 0.05)(np.random.default_rng(0), 16)
+    assert (still.phi == drawn.phi).all()  # what else is drawn stays the same
     assert (np.linalg.eigvalsh(drawn.inertia)[..., 0] > 0).all()
     sim = Simulator(panda, drawn, 16, 1)
     sim.reset(np.tile(panda.q_home, (16, 1)), np.zeros((16, 7)))
@@ -110,7 +112,7 @@ def test_drawn_payloads_are_carried_by_arms_in_training(panda):
     assert np.corrcoef(added, sim.ee[:, 2])[0, 1] < -0.5
     for wrong in ([1.0, 0.5], [0.0, 2.0], 1.0):
         with pytest.raises(UserError, match=r"dr.payload"):
-            Carrying(panda, draw, wrong)
+            Around(panda, center, 0.1, 0.05, wrong)
 
 
 @pytest.mark.parametrize(

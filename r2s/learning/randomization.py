@@ -36,19 +36,22 @@ class Around:
         robot: the arm.
         center: its dynamics, without a batch shape.
         phi_relative, inertia_relative: half widths; 0 keeps the centre.
+        payload: least and most kg in each hand (`carried`); None: nothing.
 
     Raises:
-        UserError: a half width outside [0, 1).
+        UserError: a half width outside [0, 1), or no such payload.
     """
 
     robot: Robot
     center: Dynamics
     phi_relative: float
     inertia_relative: float
+    payload: Sequence[float] | None = None
 
     def __post_init__(self):
         check_number("dr.phi_relative", self.phi_relative, "[0, 1)")
         check_number("dr.inertia_relative", self.inertia_relative, "[0, 1)")
+        check_payload(self.payload)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return m drawn dynamics."""
@@ -66,22 +69,28 @@ class Around:
             inertia[arm, link] = tensor
             todo[arm, link] = ~physical(tensor)
         inertia[todo] = np.broadcast_to(center.inertia, (m, n, 3, 3))[todo]  # after 64 tries the centre: it is valid
-        return replace(center, phi=phi, inertia=inertia)
+        return carried(self.robot, replace(center, phi=phi, inertia=inertia), self.payload, rng, m)
 
 
 @dataclass(frozen=True)
 class Identified:
     """Dynamics drawn from what identification says of the arm: rows of `samples` (S, P) of `space`, so correlated.
 
+    With `payload` each arm has one in its hand, as of `Around`.
     Every row is physical: scales of tensors are positive, and the full parametrisation has no other values.
     """
 
     space: ParameterSpace
     samples: np.ndarray
+    payload: Sequence[float] | None = None
+
+    def __post_init__(self):
+        check_payload(self.payload)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return m drawn dynamics."""
-        return self.space.dynamics(self.samples[rng.integers(len(self.samples), size=m)])
+        drawn = self.space.dynamics(self.samples[rng.integers(len(self.samples), size=m)])
+        return carried(self.space.robot, drawn, self.payload, rng, m)
 
 
 @runtime_checkable
@@ -124,7 +133,12 @@ class Forces:
         return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
 
 
-def identified(robot: Robot, center: Dynamics, calibration: str | Path | None) -> Identified:
+def identified(
+    robot: Robot,
+    center: Dynamics,
+    calibration: str | Path | None,
+    payload: Sequence[float] | None = None,
+) -> Identified:
     """Return the draws of what `calibration`, a run folder, holds of the arm; they have their own centre.
 
     Raises:
@@ -133,41 +147,35 @@ def identified(robot: Robot, center: Dynamics, calibration: str | Path | None) -
     if not calibration:
         raise UserError("dr=identified draws from what was identified: give calibration=RUN_FOLDER as well")
     space, _ = load_parameters(calibration, robot)
-    return Identified(space, load_posterior(calibration, space))
+    return Identified(space, load_posterior(calibration, space), payload)
 
 
-@dataclass(frozen=True)
-class Carrying:
-    """Dynamics of another draw, each arm with a payload: mass uniform, centre uniform in the ball about the hand.
+def check_payload(payload: Sequence[float] | None) -> None:
+    """Raise UserError unless these are the least and the most kg that an arm may carry, or None."""
+    if payload is None:
+        return
+    if not isinstance(payload, list | tuple) or len(payload) != 2:
+        raise UserError(f"dr.payload: {payload!r} is not allowed; [least, most] kg is")
+    for value in payload:
+        check_number("dr.payload", value, f"[0, {MOST_KG}]")
+    if payload[0] > payload[1]:
+        raise UserError(f"dr.payload: {payload[0]:g} is above {payload[1]:g} kg; the least goes first")
 
-    The tensor is that of a ball of water; the arm's gravity compensation knows of none of it.
 
-    Attributes:
-        robot: the arm. draw: of the arms without a payload. payload: least and most kg.
+def carried(
+    robot: Robot, dynamics: Dynamics, payload: Sequence[float] | None, rng: np.random.Generator, m: int
+) -> Dynamics:
+    """Return the dynamics of m arms, each with a payload of least to most kg; None: without.
 
-    Raises:
-        UserError: they are not two numbers from 0 to 1.5 kg in order.
+    Mass uniform, centre uniform in the ball about the hand, the tensor of a ball of water. The arm's gravity
+    compensation knows of none of it.
     """
-
-    robot: Robot
-    draw: Draw
-    payload: Sequence[float]
-
-    def __post_init__(self):
-        if not isinstance(self.payload, list | tuple) or len(self.payload) != 2:
-            raise UserError(f"dr.payload: {self.payload!r} is not allowed; [least, most] kg is")
-        for value in self.payload:
-            check_number("dr.payload", value, f"[0, {MOST_KG}]")
-        if self.payload[0] > self.payload[1]:
-            raise UserError(f"dr.payload: {self.payload[0]:g} is above {self.payload[1]:g} kg; the least goes first")
-
-    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
-        """Return m drawn dynamics."""
-        dynamics = self.draw(rng, m)
-        least, most = self.payload
-        mass, way = rng.uniform(least, most, m), rng.normal(size=(m, 3))
-        centre = FARTHEST_M * way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(size=(m, 1)) ** (1 / 3)
-        return loaded(self.robot, dynamics, Payload(mass, centre, ball(mass)))
+    if payload is None:
+        return dynamics
+    least, most = payload
+    mass, way = rng.uniform(least, most, m), rng.normal(size=(m, 3))
+    centre = FARTHEST_M * way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(size=(m, 1)) ** (1 / 3)
+    return loaded(robot, dynamics, Payload(mass, centre, ball(mass)))
 
 
 def physical(tensor: np.ndarray) -> np.ndarray:

@@ -169,11 +169,7 @@ def make_task(cfg, robot, dynamics):
 
 def make_draw(cfg, robot, center):
     """Return the domain randomization of conf/dr about `center`: (rng, m) -> Dynamics."""
-    from r2s.learning.randomization import Carrying
-
-    draw = part(cfg.dr, "dr", robot, center, beside=["payload"])
-    payload = plain(cfg.dr).get("payload")
-    return draw if payload is None else Carrying(robot, draw, payload)
+    return part(cfg.dr, "dr", robot, center)
 
 
 @contextmanager

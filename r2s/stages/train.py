@@ -180,7 +180,7 @@ def keep_calibration(cfg, folder):
 
 def title(cfg):
     """Return what the table of a training says above it."""
-    spread = ", ".join(f"{k} {v}" for k, v in plain(cfg.dr).items() if k != "_target_")
+    spread = ", ".join(f"{k} {v}" for k, v in plain(cfg.dr).items() if k != "_target_" and v is not None)
     return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 
 
