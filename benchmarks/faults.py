@@ -262,7 +262,13 @@ def as_nobody(root: Path, err: Path, note) -> None:
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     err.chmod(0o666)
 
+    from numba import config
+
+    compiled = Path(tempfile.mkdtemp())
+    compiled.chmod(0o777)
+
     def nobody() -> None:
+        config.CACHE_DIR = str(compiled)  # his own home is none
         os.setgid(65534)
         os.setuid(65534)
 

@@ -245,6 +245,10 @@ def said_in_one_line():
         if error.errno is None:
             raise
         failed(f"{error.strerror}{f': {error.filename}' if error.filename else ''}; what was whole before is still")
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # so numba says it
+            raise
+        failed("neither r2s's own folder nor ~/.cache may be written; NUMBA_CACHE_DIR=FOLDER says what may")
     except MemoryError as error:
         failed(f"not enough memory: {' '.join(str(error).split())}")
     except Stopped as reason:
