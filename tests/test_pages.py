@@ -25,7 +25,7 @@ ELSEWHERE = {  # what this file does not type, and why
     r"(source|rerun|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) ": "the shell; programs of others, which wait",
     r"python benchmarks/": "takes minutes to hours; its page names the machine that it ran on",
     r"python( -m r2s| run.py)$": "names of doors: test_wheel.py, and every other command",
-    r"r2s (list|look)$": "names of commands: test_look.py",
+    r"r2s (list|look|export)$": "names of commands: test_look.py, test_export.py",
     r"pytest -m gazebo$": "needs Gazebo",
     r"python run.py resume=": "test_cli.py kills a run first",
     r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli.py runs two of them",
