@@ -37,9 +37,9 @@ N = PANDA.n
 
 @pytest.fixture(scope="module")
 def plans():
-    """Return eight plans, two of each kind."""
+    """Return four plans, one of each kind."""
     return np.concatenate(
-        [replace(TASK, kinds=(k,)).goals(PANDA, np.random.default_rng(i), 2) for i, k in enumerate(KINDS)]
+        [replace(TASK, kinds=(k,)).goals(PANDA, np.random.default_rng(i), 1) for i, k in enumerate(KINDS)]
     )
 
 
