@@ -148,7 +148,7 @@ def test_another_arm_goes_through_environment_and_identification(arm):
     state = env.reset()
     state["action"] = env.action_spec.rand()
     after = env.step(state)["next"]
-    assert after["observation"].shape == (4, 5 * 3 + 12)
+    assert after["observation"].shape == (4, 6 * 3 + 12)
     assert not np.array_equal(after["observation"], state["observation"])
 
     motion = fourier(arm, duration=3.0, seed=0)

@@ -159,7 +159,7 @@ def test_the_preview_is_the_path(plans):
     state = State(np.full(m, 1.23), q, rest, ee, np.zeros((m, 3, N)), rest, rest, *none)
     seen = TASK.observe(state, plans, TASK.torque(PANDA))
     assert seen.shape == (len(plans), len(TASK.observation_scale(PANDA)[0]))
-    first = 5 * N + 12
+    first = 6 * N + 12
     for j in range(TASK.preview):
         ahead = seen[:, first + 3 * j : first + 3 * j + 3]
         np.testing.assert_allclose(ahead, plans[:, 124 + j, :3] - state.ee, atol=1e-6)

@@ -37,7 +37,7 @@ def panels(
         lines, labels = list(named.values()), list(named)
         below += LINE * (-(-len(named) // wide) + (key is not None)) + 0.1
         figure.legend(lines, labels, loc="lower center", ncols=wide, frameon=False, title=key)
-    tall = TOP + height * rows + 0.2 * (rows - 1) + below
+    tall = 0.9 + height * rows + 0.2 * (rows - 1) + below - BOTTOM
     figure.suptitle(title, fontsize=13, fontweight="bold", y=1 - 0.12 / tall, va="top")
     figure.set_size_inches(WIDTH, tall)
     left = LEFT + LETTER * max(0, max(len(text.get_text()) for text in axes[0].get_yticklabels()) - 6)

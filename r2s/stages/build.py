@@ -1,6 +1,7 @@
 """What several stages make from the config: parts by their `_target_`, robot, dynamics, draws, arms, run folders."""
 
 import inspect
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -64,6 +65,7 @@ def target(node: Any, group: str) -> Callable[..., Any]:
     path = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(path, str) or not path:
         raise UserError(f"{group}: its yaml has no _target_, the dotted path of what makes it")
+    logging.getLogger("hydra.utils").disabled = True  # it would say it, too
     try:
         return get_object(path)
     except Exception as error:  # importing a user's module may fail in any way
