@@ -4,6 +4,7 @@ import contextlib
 import gc
 import io
 import logging
+import threading
 import warnings
 
 import torch
@@ -18,7 +19,8 @@ native_friction.install()
 with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
     compose("config")
 logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-tqdm.monitor_interval = 0  # its thread might hold a lock when a command is forked off
+tqdm.monitor_interval = 0  # its thread might hold a lock when a command is forked off;
+tqdm.set_lock(threading.RLock())  # its own lock would leave a process of the server behind
 with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
     warnings.simplefilter("ignore")
     torch.onnx.export(torch.nn.Linear(1, 1), (torch.zeros(2, 1),), verbose=False)  # it finds its operators: 2 s
