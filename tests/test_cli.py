@@ -333,6 +333,8 @@ def test_same_seed_same_training(root, trained):
 
 
 MISTAKES = {
+    "stage=identify arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
+    "stage=watch arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
     "algo=tqq": r"algo: no option 'tqq'.*tqc",
     "algo.gama=0.9": r"unknown option 'algo.gama'; did you mean 'algo.gamma'",
     "+typo=1": r"unknown option 'typo'",

@@ -99,25 +99,24 @@ class Reflexes:
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot
         self._step = robot.dtau_max * dt + RATE_TOLERANCE
-        still = np.zeros(robot.n)  # to compile while no arm waits
-        _takes(still, still, robot.tau_max, self._step)
-        _inside(still, still, robot.q_min, robot.q_max, robot.dq_max)
+        still = np.zeros((1, robot.n))  # to compile while no arm waits
+        self.takes(still, still)
+        Reflexes.inside(self, still, still)
 
     def takes(self, tau: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-        """Return (...), whether arms would take tau (..., n) Nm after the commands tau_J_d (..., n) Nm."""
-        return ((np.abs(tau) <= self.robot.tau_max) & (np.abs(tau - tau_J_d) <= self._step)).all(-1)  # NaN fails both
+        """Return (m,), whether arms would take tau (m, n) Nm after the commands tau_J_d (m, n) Nm."""
+        return _takes(tau, tau_J_d, self.robot.tau_max, self._step)
 
     def inside(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """Return (...), whether q, dq (..., n) rad, rad/s are within the arm's limits."""
-        r = self.robot
-        return ((q >= r.q_min) & (q <= r.q_max) & (np.abs(dq) <= r.dq_max)).all(-1)
+        """Return (m,), whether q, dq (m, n) rad, rad/s are within the arm's limits."""
+        return _inside(q, dq, self.robot.q_min, self.robot.q_max, self.robot.dq_max)
 
     def command(self, tau: np.ndarray, tau_J_d: np.ndarray) -> None:
         """Raise ArmStopped if the arm would not take tau (n,) Nm after the command tau_J_d (n,) Nm."""
         r = self.robot
         if tau.shape != r.tau_max.shape:
             raise ArmStopped(f"the command has shape {tau.shape}, the arm has {r.n} joints")
-        if _takes(tau, tau_J_d, r.tau_max, self._step):
+        if self.takes(tau[None], tau_J_d[None])[0]:
             return
         if not np.isfinite(tau).all():
             i = int(np.argmin(np.isfinite(tau)))
@@ -134,7 +133,7 @@ class Reflexes:
     def state(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Raise ArmStopped if q, dq (n,) rad, rad/s are outside the arm's limits."""
         r = self.robot
-        if _inside(q, dq, r.q_min, r.q_max, r.dq_max):
+        if self.inside(q[None], dq[None])[0]:
             return
         out = np.maximum(r.q_min - q, q - r.q_max)
         if not (out <= 0).all():
@@ -146,17 +145,17 @@ class Reflexes:
 
 @njit(cache=True)
 def _takes(tau, tau_J_d, most, step):
-    """`Reflexes.takes` of one arm, every millisecond."""
-    good = True
-    for j in range(len(tau)):
-        good &= abs(tau[j]) <= most[j] and abs(tau[j] - tau_J_d[j]) <= step[j]
+    good = np.ones(len(tau), np.bool_)
+    for i in range(len(tau)):
+        for j in range(tau.shape[1]):  # NaN fails both
+            good[i] &= abs(tau[i, j]) <= most[j] and abs(tau[i, j] - tau_J_d[i, j]) <= step[j]
     return good
 
 
 @njit(cache=True)
 def _inside(q, dq, low, high, fast):
-    """`Reflexes.inside` of one arm."""
-    good = True
-    for j in range(len(q)):
-        good &= low[j] <= q[j] <= high[j] and abs(dq[j]) <= fast[j]
+    good = np.ones(len(q), np.bool_)
+    for i in range(len(q)):
+        for j in range(q.shape[1]):
+            good[i] &= low[j] <= q[i, j] <= high[j] and abs(dq[i, j]) <= fast[j]
     return good

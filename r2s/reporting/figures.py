@@ -14,13 +14,17 @@ LEGEND_WIDTH = 160  # letters, of a figure
 # Inches around the panels and between them. A layout that measures every text would take most of a figure's time.
 LEFT, RIGHT, TOP, BOTTOM, ACROSS, DOWN, LINE = 0.8, 0.15, 0.75, 0.5, 0.85, 0.75, 0.22
 LETTER = 0.085  # inches, of a label beside the first panel
+TITLE, AGAIN = 0.9, 0.2  # inches that a figure has beyond the `height` of its rows: once, and for each further row
 
 
 @contextmanager
 def panels(
     path: Path, count: int, columns: int, title: str, height: float = 2.3, key: str | None = None
 ) -> Iterator[list[Axes]]:
-    """Give `count` axes in a grid, with one legend for all, headed by `key`, and save the figure to `path`."""
+    """Give `count` axes in a grid, with one legend for all, headed by `key`, and save the figure to `path`.
+
+    height: inches of a row of panels.
+    """
     rows = -(-count // columns)
     figure = Figure(dpi=DPI)
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(count)]
@@ -37,7 +41,7 @@ def panels(
         lines, labels = list(named.values()), list(named)
         below += LINE * (-(-len(named) // wide) + (key is not None)) + 0.1
         figure.legend(lines, labels, loc="lower center", ncols=wide, frameon=False, title=key)
-    tall = 0.9 + height * rows + 0.2 * (rows - 1) + below - BOTTOM
+    tall = TITLE + height * rows + AGAIN * (rows - 1) + below - BOTTOM
     figure.suptitle(title, fontsize=13, fontweight="bold", y=1 - 0.12 / tall, va="top")
     figure.set_size_inches(WIDTH, tall)
     left = LEFT + LETTER * max(0, max(len(text.get_text()) for text in axes[0].get_yticklabels()) - 6)

@@ -256,6 +256,13 @@ def opened_source(cfg, robot, noise):
     yield SimulatedArm(robot, dynamics, **sensors, seed=cfg.data.excitation_seed + noise)
 
 
+def check_source(cfg, robot):
+    """Say what is wrong with an arm that is recorded before there is a run folder; a real one is not touched."""
+    if cfg.data.kind == "simulated" or is_twin(cfg):
+        with opened_source(cfg, robot, 0):
+            pass
+
+
 def make_truth(cfg, robot):
     """Return the dynamics of data.truth: a file of conf/friction, with the one of conf/inertia of that name.
 

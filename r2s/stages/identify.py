@@ -8,10 +8,10 @@ from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
 from r2s.stages.build import (
     called,
+    check_source,
     console,
     make_dynamics,
     make_robot,
-    make_truth,
     open_run,
     opened_source,
     part,
@@ -294,8 +294,7 @@ def identify(cfg, overrides):
     else:
         called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
         ramp_poses(cfg, robot)
-        if cfg.data.kind == "simulated":
-            make_truth(cfg, robot)
+        check_source(cfg, robot)
         if cfg.data.excitation:
             motion = load(cfg.data.excitation, robot)
             inputs = [cfg.data.excitation]

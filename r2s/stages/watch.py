@@ -5,7 +5,7 @@ from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.files import located
-from r2s.stages.build import called, make_dynamics, make_robot, open_run, opened_source, plain
+from r2s.stages.build import called, check_source, make_dynamics, make_robot, open_run, opened_source, plain
 
 WHY = {
     "arm": "only data=arm moves an arm",
@@ -97,6 +97,7 @@ def watch(cfg, overrides):
         called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
         if cfg.data.torque != "commanded":
             raise UserError(f"data.torque: {cfg.data.torque} is not allowed for stage=watch; commanded is")
+        check_source(cfg, robot)
     dynamics, posterior, unloaded = calibrated(cfg, robot)
     if cfg.data.kind == "arm" and cfg.arm.get("load"):  # what the arm was told of is no surprise
         dynamics = replace(dynamics, told=moment(robot, payload_of(plain(cfg.arm)["load"], "arm.load")))

@@ -16,6 +16,9 @@ from r2s.tasks.task import Entry, Episodes, State, Usual
 FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
 FINE_RAD = 0.015
 FINE_DQ = 0.1  # rad/s: a joint that creeps would hardly be seen, and one that the hand turns on is not missed
+OBSERVED = (  # by `observe`, in words
+    f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
+)
 CLOSE_M = 1e-3  # at least this is a distance that others are divided by
 MIDDLE = 0.05, 0.95  # of random postures: between these quantiles of their distances goals lie by default
 POSTURES = 500  # that those are told from
@@ -60,20 +63,9 @@ class ReachTask(Usual):
         return share * robot.tau_max
 
     @property
-    def steps(self) -> int:
-        """Control steps of an episode."""
-        return round(self.episode_s * self.ctrl_hz)
-
-    @property
-    def substeps(self) -> int:
-        """Physics steps of a control step."""
-        return round(1.0 / (self.ctrl_hz * SIM_DT))
-
-    @property
     def observed(self) -> str:
         """What is in an observation."""
-        fine = f"tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
-        return f"q dq ee goal error effort {fine}; rad, rad/s, m"
+        return f"{OBSERVED}; rad, rad/s, m"
 
     @property
     def paper_weights(self) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +181,20 @@ class Task(Protocol):
 class Usual:
     """What most tasks have in common: an action is a share of the torque, and a goal is what there is to look at."""
 
+    ctrl_hz: int
+    episode_s: float
     share = 1.0
     pool = 2048
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+        return round(self.episode_s * self.ctrl_hz)
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps of a control step."""
+        return round(1.0 / (self.ctrl_hz * SIM_DT))
 
     def believing(self, robot: Robot, dynamics: Dynamics) -> "Usual":
         """Return the task: it has no use for a model."""

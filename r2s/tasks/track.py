@@ -13,7 +13,7 @@ from r2s.excitation.safety import Space
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.model_torque import ModelTorque
-from r2s.tasks.reach import ReachTask, observe
+from r2s.tasks.reach import OBSERVED, ReachTask, observe
 from r2s.tasks.task import Episodes, State, Usual
 from r2s.tasks.timed_path import KINDS, Paths, V, X, curve
 
@@ -103,16 +103,6 @@ class TrackTask(Usual):
         return ReachTask(self.ctrl_hz, self.episode_s, reach=self.reach, height=self.height, azimuth=self.azimuth)
 
     @property
-    def steps(self) -> int:
-        """Control steps of an episode."""
-        return round(self.episode_s * self.ctrl_hz)
-
-    @property
-    def substeps(self) -> int:
-        """Physics steps of a control step."""
-        return round(1.0 / (self.ctrl_hz * SIM_DT))
-
-    @property
     def share(self) -> float:  # type: ignore[override]
         """Of `torque`, what an action of 1 changes a target by."""
         return self.residual if self.base == "model" else 1.0
@@ -120,8 +110,9 @@ class TrackTask(Usual):
     @property
     def observed(self) -> str:
         """What is in an observation."""
-        own = f"q dq ee goal error effort tanh(error/0.02) J'error tanh(J'error/0.015) tanh(dq/0.1) {self.preview} x"
-        own += f" ahead - ee velocity tanh(error/{FINE_M:g}) limited plan q - q plan dq - dq"
+        own = (
+            f"{OBSERVED} {self.preview} x ahead - ee velocity tanh(error/{FINE_M:g}) limited plan q - q plan dq - dq"
+        )
         return f"{own}{' base' if self.base == 'model' else ''}; rad, rad/s, m, m/s"
 
     @property
