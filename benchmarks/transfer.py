@@ -141,6 +141,15 @@ def summary(folder: Path) -> dict:
     return json.loads(path.read_text()) if path.is_file() else {}
 
 
+def machines(part: str) -> str:
+    """Return the processors that the trainings of a part ran on, by what their run folders say; else this one."""
+    found = {}
+    for path in sorted((RUNS / "train").glob(f"{part}_*/meta.json")):
+        machine = json.loads(path.read_text())["machine"]
+        found[f"{machine['cpu']}, {machine['cores']} cores"] = None
+    return " and ".join(found) or MACHINE
+
+
 def transfers(part: str) -> pd.DataFrame:
     """Return what every transfer of a part measured on its twin, a row each."""
     rows = []
@@ -332,16 +341,16 @@ def main() -> None:
         "## Another engine",
         *engines_table(),
         "## Hidden twins",
-        f"Each twin was identified from 20 s of motion and its ramps; trainings had {OF_A_TWIN:,} env steps, "
-        "3 to 4 minutes of a core, and no DR. Mean over twins with a 95 % bootstrap interval over twins. The gaps "
-        "are between the twin and the simulation that the policy was trained in, same policy and goals. The "
-        "return on a twin is given with the noise of its speeds taken out.",
+        f"On {machines('judge')}. Each twin was identified from 20 s of motion and its ramps; trainings had "
+        f"{OF_A_TWIN:,} env steps, 2 to 4 minutes of a core, and no DR. Mean over twins with a 95 % bootstrap "
+        "interval over twins. The gaps are between the twin and the simulation that the policy was trained in, same "
+        "policy and goals. The return on a twin is given with the noise of its speeds taken out.",
         *twins_tables(),
         "## The ablation",
-        f"Trainings of {ENV_STEPS:,} env steps with the settings of conf/algo/tqc.yaml (about two minutes on one "
-        f"thread), so that each can be repeated to the bit; {GOALS} goals. The interval is over twins and training "
-        "seeds. A policy of the nominal model is the same for every twin; dr=identified draws from what the "
-        "identification left uncertain, so there is none of it without one.",
+        f"On {machines('ablation')}. Trainings of {ENV_STEPS:,} env steps with the settings of conf/algo/tqc.yaml "
+        f"(about two minutes on one thread), so that each can be repeated to the bit; {GOALS} goals. The interval is "
+        "over twins and training seeds. A policy of the nominal model is the same for every twin; dr=identified "
+        "draws from what the identification left uncertain, so there is none of it without one.",
         *ablation_tables(),
         "## The clients of the real arms",
         "The packages that drive hardware (panda-python with libfranka 0.9, pylibfranka), against our emulator of "

@@ -238,6 +238,7 @@ def test_the_first_two_terms_are_equation_2(distance, distance0, dq, ddq):
     assert out[0] + out[1] == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert out @ PAPER == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert 0 <= out[TERMS.index("precision")] <= 1  # a bonus
+    assert -out[TERMS.index("precision")] <= out[TERMS.index("stillness")] <= 0  # takes away no more than that
     assert out[TERMS.index("limited")] == -0.3  # a price
 
 

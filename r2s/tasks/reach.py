@@ -145,7 +145,7 @@ class ReachTask(Usual):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m and the reward terms (m, 4) of r2s/tasks/rewards.py; see `Task.judge`."""
+        """Return the distance (m,) m and the reward terms (m, 5) of r2s/tasks/rewards.py; see `Task.judge`."""
         return _judge(state.ee, goals, reference, state.dq, ddq, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:

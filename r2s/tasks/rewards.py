@@ -1,7 +1,7 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
-A reward is a weighted sum of terms. Two of them are not in the paper: a bonus for precision, and a price of asking
-for what the law does not let through. The replay buffer keeps the terms. So when the curriculum moves its
+A reward is a weighted sum of terms. Three of them are not in the paper: a bonus for precision, a price of moving
+where precision is, and a price of asking for what the law does not let through. The replay buffer keeps the terms. So when the curriculum moves its
 weights, every stored transition is worth what the present weights say.
 """
 
@@ -15,21 +15,20 @@ from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
 PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
-STILL = (0.2, 0.05)  # rad/s, of its stillness: of the fastest joint, as a hand can lie on the axis of one that turns
-MOVING = 0.35  # what each of these two takes away
-TERMS = ("distance", "smoothness", "precision", "limited")
+STILL = (0.2, 0.05)  # rad/s, of the fastest joint, as a hand can lie on the axis of one that turns
+TERMS = ("distance", "smoothness", "precision", "stillness", "limited")
 
 
 @njit(cache=True)
 def terms(
     distance: np.ndarray, distance0: np.ndarray, dq: np.ndarray, ddq: np.ndarray, limited: np.ndarray
 ) -> np.ndarray:
-    """Return (m, 4): the two halves of eq. (2), which add up to it, a bonus for precision, and what the law changed.
+    """Return (m, 5): the two halves of eq. (2), which add up to it, and the three terms that are not in the paper.
 
     distance    -k1 d, with d the distance over the initial one
     smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision   (1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2)
-                (1 - 0.35 tanh(max|dq| / 0.2 rad/s) - 0.35 tanh(max|dq| / 0.05 rad/s))
+    precision   1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2
+    stillness   -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2)
     limited     -limited
 
     Args:
@@ -38,7 +37,7 @@ def terms(
         ddq: (m, n) rad/s^2, mean over the last control period.
         limited: (m,), in which share of it the driver's law changed what was asked for.
     """
-    out = np.empty((len(distance), 4))
+    out = np.empty((len(distance), 5))
     for i in range(len(distance)):
         d = distance[i] / distance0[i]
         speed, jerkiness, fastest = 0.0, 0.0, 0.0
@@ -49,12 +48,13 @@ def terms(
         near = 1.0 - 0.5 * (np.tanh(distance[i] / PRECISION_M[0]) + np.tanh(distance[i] / PRECISION_M[1]))
         out[i, 0] = -K1 * d
         out[i, 1] = -K2 * speed - K3 * jerkiness / abs(K4 - min(1.0, d)) - K5 * jerkiness / (K6 + d)
-        out[i, 2] = near * (1.0 - MOVING * (np.tanh(fastest / STILL[0]) + np.tanh(fastest / STILL[1])))
-        out[i, 3] = -limited[i]
+        out[i, 2] = near
+        out[i, 3] = -0.5 * near * (np.tanh(fastest / STILL[0]) + np.tanh(fastest / STILL[1]))
+        out[i, 4] = -limited[i]
     return out
 
 
-PAPER = np.array([1.0, 1.0, 0.0, 0.0])  # weights of the terms that make eq. (2)
+PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq. (2)
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
@@ -69,7 +69,7 @@ class Curriculum:
     fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
     Attributes:
-        smoothness, precision, limited: weights before and after.
+        smoothness, precision, stillness, limited: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
 
     Raises:
@@ -78,6 +78,7 @@ class Curriculum:
 
     smoothness: Sequence[float]
     precision: Sequence[float]
+    stillness: Sequence[float]
     limited: Sequence[float]
     anneal: Sequence[float]
 
@@ -93,5 +94,6 @@ class Curriculum:
         """Return the (4,) weights at `progress`, the fraction of the training budget that is spent."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
-        moving = [before + at * (after - before) for before, after in (self.smoothness, self.precision, self.limited)]
+        pairs = (getattr(self, name) for name in TERMS[1:])
+        moving = [before + at * (after - before) for before, after in pairs]
         return np.array([1.0, *moving])

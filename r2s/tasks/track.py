@@ -117,8 +117,8 @@ class TrackTask(Usual):
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(4,), of what is reported: error and smoothness."""
-        return np.array([1.0, 1.0, 0.0, 0.0])
+        """(5,), of what is reported: error and smoothness."""
+        return np.array([1.0, 1.0, 0.0, 0.0, 0.0])
 
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm, the most that a target asks for."""
@@ -243,7 +243,7 @@ class TrackTask(Usual):
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the hand is off its path (m,) m, and the reward terms (m, 4); see `_judge`."""
+        """Return how far the hand is off its path (m,) m, and the reward terms (m, 5); see `_judge`."""
         n, rows = state.q.shape[1], np.arange(len(goals))
         k = self._at(state.t)
         now, before = goals[rows, k], goals[rows, np.maximum(k - 1, 0)]
@@ -325,11 +325,12 @@ def _later(
 
 @njit(cache=True)
 def _judge(error, dq, push, limited):
-    """Return the distance (m,) m and the terms (m, 4).
+    """Return the distance (m,) m and the terms (m, 5).
 
     error       -2 tanh(distance / 3 cm)
     smoothness  -0.03 sum tanh(|dq| / 1 rad/s) - 0.03 sum tanh(|push| / 10 rad/s^2)
     precision   1 - tanh(distance / 1 cm) / 2 - tanh(distance / 3 mm) / 2
+    stillness   0: the path says where to rest
     limited     -limited
 
     Args:
@@ -337,7 +338,7 @@ def _judge(error, dq, push, limited):
         limited: (m,), as of `State`.
     """
     m = len(error)
-    distance, out = np.empty(m), np.empty((m, 4))
+    distance, out = np.empty(m), np.empty((m, 5))
     for i in range(m):
         d = np.sqrt(error[i, 0] ** 2 + error[i, 1] ** 2 + error[i, 2] ** 2)
         rough = 0.0
@@ -347,5 +348,6 @@ def _judge(error, dq, push, limited):
         out[i, 0] = -2.0 * np.tanh(d / FAR_M)
         out[i, 1] = -0.03 * rough
         out[i, 2] = 1.0 - 0.5 * (np.tanh(d / NEAR_M) + np.tanh(d / FINE_M))
-        out[i, 3] = -limited[i]
+        out[i, 3] = 0.0
+        out[i, 4] = -limited[i]
     return distance, out
