@@ -7,12 +7,13 @@ every cycle. docs/law.md is made of it.
 The action of the law is what is sent less what is asked for. Its spectrum is judged by its largest line above 20 Hz,
 against the largest below: a loop that shakes has its line there.
 
-`python benchmarks/law.py cost` says what the law, and the motors' delay behind it, cost a training's environment: CPU
-time of one thread, with and without, in turns.
+`python benchmarks/law.py cost [RUN]` says what the law, and the motors' delay behind it, cost a training's
+environment: CPU time of one thread, with and without, in turns, under random actions and those of RUN's policy.
 """
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.networks import Policy
 from r2s.learning.policy import load_policy
 from r2s.physics.limits import limits
 from r2s.stages.build import make_dynamics, make_robot, make_task
@@ -38,7 +40,7 @@ DELAYS_MS = (0, 2, 4, 6, 8)
 TWINS = range(4)
 GOALS = 20
 ARMS, STEPS, TURNS = 32, 25, 41
-ACTIONS = {"gentle": 0.1, "wild": 0.5}  # standard deviation of random actions: of a trained policy, of a new one
+ACTIONS = {"gentle": 0.1, "wild": 0.5}  # standard deviation of random actions: the wild are those of a new policy
 
 
 class Watched:
@@ -83,20 +85,21 @@ def judged(arm, friction, policy, task, starts, goals) -> dict[str, float]:
     }
 
 
-def cost(size: float) -> dict[str, float]:
-    """Return one row: what the law costs an environment under random actions of this size."""
+def cost(act: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, float]:
+    """Return one row: what the law costs an environment in which observations (ARMS, d) are answered by `act`."""
     task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
     envs = [TaskEnv(ROBOT, task, lambda rng, m: NEW, ARMS, nthread=1) for _ in range(2)]
     envs[1].arms.sim.drive(np.zeros_like(limits(ROBOT, task.torque(ROBOT))))  # a TAU_MAX of 0: there is none
     torch.manual_seed(0)
     states, took, limited = [env.reset() for env in envs], np.zeros((TURNS, 2)), 0.0
     for turn in range(TURNS):
-        actions = (size * torch.randn(STEPS, ARMS, ROBOT.n)).clamp(-1, 1)
         for which, env in enumerate(envs):
-            began = time.process_time()
-            for action in actions:
+            torch.manual_seed(turn)
+            for _ in range(STEPS):
+                action = act(states[which]["observation"])
+                began = time.process_time()
                 _, states[which] = env.step_and_maybe_reset(states[which].set("action", action))
-            took[turn, which] = time.process_time() - began
+                took[turn, which] += time.process_time() - began
         limited += envs[0].arms.read().limited.mean() / TURNS
     rate = ARMS * STEPS / np.median(took[1:], axis=0)
     return {
@@ -107,21 +110,26 @@ def cost(size: float) -> dict[str, float]:
     }
 
 
-def costs() -> pd.DataFrame:
-    """Return what the law costs under gentle and wild actions."""
-    return pd.DataFrame.from_dict({k: cost(size) for k, size in ACTIONS.items()}, orient="index").rename_axis(
-        "actions"
-    )
+def costs(policy: Policy | None = None) -> pd.DataFrame:
+    """Return what the law costs under gentle and wild actions, and under those of a trained policy."""
+    rows = {k: cost(lambda o, s=size: (s * torch.randn(len(o), ROBOT.n)).clamp(-1, 1)) for k, size in ACTIONS.items()}
+    if policy is not None:
+        with torch.no_grad():
+            rows["of a trained policy"] = cost(policy.action)
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("actions")
 
 
-def main(folder: str) -> None:
-    """Write docs/law.md."""
+def main(folder: str, only_cost: bool = False) -> None:
+    """Write docs/law.md, or print what the law costs."""
     cfg = OmegaConf.create({"policy": folder})
     source, trained = trained_config(cfg)
     robot = make_robot(trained)
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
     policy = load_policy(source, robot, task)
+    if only_cost:
+        print(costs(policy).round(1).to_string())
+        return
     starts, goals = fixed_episodes(robot, task, GOALS)
     rows = {}
     for ms in DELAYS_MS:
@@ -143,16 +151,17 @@ episodes.
 What the law, and the motors' delay behind it, cost a training's environment of {ARMS} arms, in CPU time of one
 thread:
 
-{markdown(costs().round(1))}
+{markdown(costs(policy).round(1))}
 """
     (ROOT / "docs" / "law.md").write_text(text)
     print(table.round(3).to_string())
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["cost"]:
+    words = sys.argv[1:]
+    if words == ["cost"]:
         print(costs().round(1).to_string())
         raise SystemExit
-    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
+    if not words or not Path(words[-1]).is_dir() or words[:-1] not in ([], ["cost"]):
         raise SystemExit(__doc__)
-    main(sys.argv[1])
+    main(words[-1], words[0] == "cost")
