@@ -3,16 +3,20 @@
 Parts, each doing only what is missing:
     python benchmarks/tracking.py twins MAKE SEED ...      computed torque on the nominal and the identified model
     python benchmarks/tracking.py simulated SEED ...       the same and the true model, on arms of known truth
-    python benchmarks/tracking.py policy FOLDER MAKE SEED  a training's policy on a twin
+    python benchmarks/tracking.py learned MAKE SEED ...    policies: identified, and nominal with dr=paper
+    python benchmarks/tracking.py ablation MAKE SEED ...   previews, randomizations and pure torque, seed 0
+    python benchmarks/tracking.py policy FOLDER MAKE SEED  any training's policy on a twin
     python benchmarks/tracking.py                          the table of what there is
-Identifications go through run.py into run folders named track_*; rows are added to runs/bench/tracking.csv.
+Identifications and trainings go through run.py into run folders named track_*; each row is a file of
+runs/bench/tracking/, so that parts can run side by side.
 Seeds 0-3 are for development, 100 and above (make 1) and 200 and above (make 2) for judging.
 """
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +28,7 @@ from r2s.arm.deploy import DrivenArm
 from r2s.arm.interface import Arm
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins import twin
+from r2s.files import whole
 from r2s.identification.parameter_file import load_parameters
 from r2s.learning.computed_torque import Still
 from r2s.learning.evaluate import fixed_episodes
@@ -36,7 +41,21 @@ from r2s.tasks.episode import Acts, rollout
 from r2s.tasks.track import TrackTask
 
 RUNS = Path(os.environ.get("R2S_ROOT", ROOT / "runs"))
-TABLE = RUNS / "bench" / "tracking.csv"
+ROWS = RUNS / "bench" / "tracking"
+TRAININGS = (0, 1, 2)  # seeds
+STEPS = ("budget.minutes=null", "budget.env_steps=120_000")  # a minute of a core
+NOMINAL = ("friction=gaz2019", "inertia=nominal")
+LEARNED = {"identified": ("dr=identified",), "nominal, dr=paper": ("dr=paper",)}
+ABLATION = {  # what LEARNED has not; settings of later words win
+    "identified, preview 1": ("dr=identified", "task.preview=1"),
+    "identified, preview 10": ("dr=identified", "task.preview=10"),
+    "identified, no DR": ("dr=none",),
+    "identified, dr=paper": ("dr=paper",),
+    "identified, dr=force": ("dr=force",),
+    "nominal, no DR": ("dr=none",),
+    "nominal, dr=force": ("dr=force",),
+    "identified, torque alone": ("dr=identified", "task.base=none", "budget.env_steps=800_000"),
+}
 PATHS = 12  # a row: each costs a second of a core on a twin
 TASK = TrackTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/track").items()})
 
@@ -62,18 +81,20 @@ def judged(arm: Arm, task: TrackTask, friction: np.ndarray, policy: Acts) -> dic
 
 def add(row: dict) -> None:
     """Add a row to the table."""
-    TABLE.parent.mkdir(parents=True, exist_ok=True)
-    old = pd.read_csv(TABLE) if TABLE.is_file() else pd.DataFrame()
-    pd.concat([old, pd.DataFrame([row])]).to_csv(TABLE, index=False)
+    ROWS.mkdir(parents=True, exist_ok=True)
+    with whole(file(row["arm"], row["what"])) as part:
+        part.write_text(json.dumps(row))
     print(row, flush=True)
+
+
+def file(arm: str, what: str) -> Path:
+    """Return where a row is."""
+    return ROWS / f"{arm}, {what}.json".replace(" ", "_").replace("=", "_")
 
 
 def known(arm: str, what: str) -> bool:
     """Return whether a row is there."""
-    if not TABLE.is_file():
-        return False
-    table = pd.read_csv(TABLE)
-    return bool(((table["arm"] == arm) & (table["what"] == what)).any())
+    return file(arm, what).is_file()
 
 
 def twins(make: int, seeds: Sequence[int]) -> None:
@@ -103,7 +124,30 @@ def simulated(seeds: Sequence[int]) -> None:
                 add({"arm": name, "group": "simulated", "what": f"computed torque, {what}"} | row)
 
 
-def policy(folder: str, make: int, seed: int) -> None:
+def learned(make: int, seeds: Sequence[int], conditions: Mapping[str, Sequence[str]], ks: Sequence[int]) -> None:
+    """Train under each condition, on what was identified of each twin or on the nominal model; judge on the twin."""
+    for seed in seeds:
+        name, model = f"twin {seed} of make {make}", f"track_{make}_{seed}"
+        identified(model, f"arm.make={make}", f"arm.seed={seed}")
+        for label, words in conditions.items():
+            short = label.replace(", ", "_").replace(" ", "").replace("=", "")
+            nominal = label.startswith("nominal")
+            of = NOMINAL if nominal else (f"calibration={RUNS}/identify/{model}",)
+            for k in ks:
+                if not known(name, f"policy, {label}, seed {k}"):
+                    folder = training(f"{'track' if nominal else model}_{short}_{k}", f"seed={k}", *of, *words)
+                    policy(folder, make, seed, f"policy, {label}, seed {k}")
+
+
+def training(name: str, *words: str) -> str:
+    """Return the folder of a training of this task, after doing it where it is missing."""
+    settings = {word.split("=")[0]: word for word in (*STEPS, *words)}
+    command = ["task=track", f"name={name}", f"root={RUNS}", "threads=1", "only_missing=true", *settings.values()]
+    subprocess.run([sys.executable, "run.py", *command], cwd=ROOT, check=True)
+    return str(RUNS / "train" / name)
+
+
+def policy(folder: str, make: int, seed: int, what: str | None = None) -> None:
     """Judge a training's policy on a twin."""
     from omegaconf import OmegaConf
 
@@ -112,7 +156,9 @@ def policy(folder: str, make: int, seed: int) -> None:
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
     row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics.level, load_policy(source, robot, task))
-    add({"arm": f"twin {seed} of make {make}", "group": f"make {make}", "what": f"policy {source.name}"} | row)
+    add(
+        {"arm": f"twin {seed} of make {make}", "group": f"make {make}", "what": what or f"policy {source.name}"} | row
+    )
 
 
 def interval(rows: pd.DataFrame) -> str:
@@ -131,11 +177,12 @@ def interval(rows: pd.DataFrame) -> str:
 
 def report() -> None:
     """Print the table: groups of arms, by what followed the paths."""
-    table = pd.read_csv(TABLE)
+    table = pd.DataFrame([json.loads(path.read_text()) for path in sorted(ROWS.glob("*.json"))])
+    table["what"] = table["what"].str.replace(r", seed \d+$", "", regex=True)
     rows = {}
     for (group, what), part in table.groupby(["group", "what"], sort=False):
         cells = {
-            "arms": str(len(part)),
+            "arms": str(part["arm"].nunique()),
             "RMSE, mm": interval(part),
             "worst arm, mm": f"{part['path_rmse_mm'].max():.2f}",
         }
@@ -152,6 +199,10 @@ if __name__ == "__main__":
             twins(int(make), [int(s) for s in seeds])
         case ["simulated", *seeds]:
             simulated([int(s) for s in seeds])
+        case ["learned", make, *seeds]:
+            learned(int(make), [int(s) for s in seeds], LEARNED, TRAININGS)
+        case ["ablation", make, *seeds]:
+            learned(int(make), [int(s) for s in seeds], ABLATION, TRAININGS[:1])
         case ["policy", folder, make, seed]:
             policy(folder, int(make), int(seed))
         case []:
