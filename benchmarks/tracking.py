@@ -2,7 +2,7 @@
 
 Parts, each doing only what is missing:
     python benchmarks/tracking.py twins MAKE SEED ...      computed torque on the nominal and the identified model
-    python benchmarks/tracking.py simulated SEED ...       the same and the true model, on arms of known truth
+    python benchmarks/tracking.py simulated SEED ...       the same, the true model and policies, on known truth
     python benchmarks/tracking.py learned MAKE SEED ...    policies: identified, and nominal with dr=paper
     python benchmarks/tracking.py ablation MAKE SEED ...   previews, randomizations and pure torque, seed 0
     python benchmarks/tracking.py policy FOLDER MAKE SEED  any training's policy on a twin
@@ -33,7 +33,6 @@ from r2s.identification.parameter_file import load_parameters
 from r2s.learning.computed_torque import Still
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import load_policy
-from r2s.learning.randomization import Around
 from r2s.physics.dynamics import Dynamics
 from r2s.stages.build import make_dynamics, make_robot, make_task
 from r2s.stages.transfer import trained_config
@@ -112,16 +111,22 @@ def twins(make: int, seeds: Sequence[int]) -> None:
 
 
 def simulated(seeds: Sequence[int]) -> None:
-    """Judge computed torque on simulated arms of known truth: the paper's NEW parameters, drawn as dr=paper does."""
+    """Judge computed torque and a policy on simulated arms of known truth; a seed is an excitation and its noise."""
+    truth = replace(NEW, delay=0.003, lag=0.002)
     for seed in seeds:
-        drawn = Around(ROBOT, NEW, 0.1, 0.05)(np.random.default_rng(seed), 1).one(0)
-        truth = replace(drawn, delay=0.003, lag=0.002)
-        for what, dynamics in {"nominal": OLD, "true": truth}.items():
-            name = f"simulated {seed}"
+        name, model = f"simulated {seed}", f"track_simulated_{seed}"
+        arm = SimulatedArm(ROBOT, truth, position_noise=1e-5, velocity_noise=3e-3, seed=seed)
+        told = "data=simulated", "data.delay=0.003", "data.lag=0.002", f"data.excitation_seed={seed}"
+        found = identified(model, *told, f"seed={seed}")
+        for what, dynamics in {"nominal": OLD, "identified": found, "true": truth}.items():
             if not known(name, f"computed torque, {what}"):
-                arm = SimulatedArm(ROBOT, truth, position_noise=1e-5, velocity_noise=3e-3, seed=seed)
                 row = judged(arm, TASK.believing(ROBOT, dynamics), dynamics.level, Still(ROBOT.n))
                 add({"arm": name, "group": "simulated", "what": f"computed torque, {what}"} | row)
+        for k in TRAININGS:
+            if not known(name, f"policy, identified, seed {k}"):
+                words = f"calibration={RUNS}/identify/{model}", *LEARNED["identified"]
+                row = judged(arm, *followed(training(f"{model}_identified_{k}", f"seed={k}", *words)))
+                add({"arm": name, "group": "simulated", "what": f"policy, identified, seed {k}"} | row)
 
 
 def learned(make: int, seeds: Sequence[int], conditions: Mapping[str, Sequence[str]], ks: Sequence[int]) -> None:
@@ -147,18 +152,22 @@ def training(name: str, *words: str) -> str:
     return str(RUNS / "train" / name)
 
 
-def policy(folder: str, make: int, seed: int, what: str | None = None) -> None:
-    """Judge a training's policy on a twin."""
+def followed(folder: str) -> tuple[TrackTask, np.ndarray, Acts]:
+    """Return the task of a training, the level of friction of its model, and its policy."""
     from omegaconf import OmegaConf
 
     source, trained = trained_config(OmegaConf.create({"policy": folder}))
     robot = make_robot(trained)
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
-    row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics.level, load_policy(source, robot, task))
-    add(
-        {"arm": f"twin {seed} of make {make}", "group": f"make {make}", "what": what or f"policy {source.name}"} | row
-    )
+    return task, dynamics.level, load_policy(source, robot, task)
+
+
+def policy(folder: str, make: int, seed: int, what: str | None = None) -> None:
+    """Judge a training's policy on a twin."""
+    row = judged(twin(ROBOT, make=make, seed=seed), *followed(folder))
+    arm = {"arm": f"twin {seed} of make {make}", "group": f"make {make}"}
+    add(arm | {"what": what or f"policy {Path(folder).name}"} | row)
 
 
 def interval(rows: pd.DataFrame) -> str:
