@@ -128,10 +128,12 @@ def hostile(robot: Robot, task: ReachTask, cycles: int) -> dict[str, np.ndarray]
     return {"q": q, "dq": dq, "applied": applied, "target": target, "told": told, "begin": begin, "goal": goal}
 
 
-def driven(robot: Robot, task: ReachTask, friction: np.ndarray, cycles: int) -> dict[str, np.ndarray]:
+def driven(
+    robot: Robot, task: ReachTask, friction: np.ndarray, cycles: int, rotors: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Return `hostile` motion with `tau` (cycles, n) Nm that r2s makes of it, and `last`, what the arm applied."""
     motion = hostile(robot, task, cycles)
-    driver = episode_driver(robot, task, 0.0, friction)
+    driver = episode_driver(robot, task, 0.0, friction, rotors)
     tau, last = np.zeros((2, cycles, robot.n))
     for k in range(cycles):
         if motion["begin"][k]:
@@ -169,15 +171,16 @@ def test_the_law_of_the_runtime_is_that_of_r2s(exported, motion):
 
 @pytest.mark.parametrize("arm", ["six_joints", "kinova_gen3", "iiwa14", "fr3"])
 def test_so_it_is_for_other_arms(arm, panda):
-    """With rotors, with joints that turn without end, and with less speed near position limits."""
+    """With rotors of its own and identified ones, joints that turn without end, less speed near position limits."""
     slow = (np.full(7, 6.0), np.full(7, 0.3))
     file = ROOT / "tests" / "models" / "six_joints.xml" if arm == "six_joints" else f"r2s:models/{arm}.xml"
     robot = replace(panda, slowing=slow) if arm == "fr3" else load_robot(str(file))
     if arm == "six_joints":
         robot = replace(robot, armature=np.full(6, 0.1))
     task, friction = ReachTask(reach=None, height=-9.0, azimuth=3.2), np.linspace(0.0, 1.0, robot.n)
-    contract = json.loads(json.dumps(make_contract(robot, task, friction), allow_nan=False))
-    motion = driven(robot, task, friction, 300)
+    rotors = np.linspace(0.3, 0.01, robot.n) if arm == "iiwa14" else None
+    contract = json.loads(json.dumps(make_contract(robot, task, friction, rotors), allow_nan=False))
+    motion = driven(robot, task, friction, 300, rotors)
     assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
 
 

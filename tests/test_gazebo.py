@@ -1,5 +1,7 @@
 """The Gazebo adapter: against a stand-in with the bindings' names and semantics; against Gazebo where it is."""
 
+from dataclasses import replace
+
 import gazebo_standin
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ def dynamics(panda):
 
 def agree(gazebo, panda, dynamics):
     """Drive Gazebo and DART alike, with two resets on the way: the same motion."""
-    dart = DartEngine(panda, gravity=False, inertias=dynamics.inertia)
+    dart = DartEngine(panda, gravity=False, inertias=dynamics.inertia, armature=dynamics.armature)
     rng = np.random.default_rng(0)
     for _ in range(2):
         q, dq = panda.q_home + rng.uniform(-0.2, 0.2, 7), rng.uniform(-0.3, 0.3, 7)
@@ -38,6 +40,11 @@ def agree(gazebo, panda, dynamics):
 
 def test_steps_resets_and_commands_are_those_of_dart(panda, dynamics):
     agree(GazeboEngine(panda, dynamics, gazebo_standin), panda, dynamics)
+
+
+def test_rotors_are_there_which_sdf_cannot_say(panda, dynamics):
+    rotors = replace(dynamics, armature=2e-3 * panda.tau_max)
+    agree(GazeboEngine(panda, rotors, gazebo_standin), panda, rotors)
 
 
 def test_an_error_inside_a_callback_comes_out(panda, dynamics):

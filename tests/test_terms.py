@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import conf
@@ -14,8 +15,9 @@ from r2s.identification.identify import with_terms
 from r2s.identification.static_friction import SURE
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, STRIBECK
+from r2s.physics.rigid_body import put_links
 
-EXTRA = ["viscous_asymmetry", "link", "load", "drag"]
+EXTRA = conf("config")["identify"]["extra"]["commanded"]
 PHI = np.array([[1.2, 0.05, 0.3], [0.9, -0.05, 0.2], [0.5, 0.1, 0.1]])
 
 
@@ -48,7 +50,7 @@ def test_hard_stiction_does_not_spoil_friction_or_delay(hard):
 
 
 def test_no_term_enters_that_is_not_there(hard):
-    assert not {"viscous_asymmetry", "load", "drag_sin", "link_d1"} & set(hard[0].space.blocks)
+    assert not {"viscous_asymmetry", "load", "drag_sin", "link_d1", "armature"} & set(hard[0].space.blocks)
 
 
 def test_stiction_is_found_to_be_of_the_net_torque(hard):
@@ -65,6 +67,36 @@ def test_a_term_that_is_there_enters(arm):  # noqa: F811
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
     found = run(arm, start, recorded(arm, truth, 12.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
     assert "drag_sin" in found.space.blocks
+
+
+def test_rotors_that_are_there_enter_and_leave_the_links_alone(arm):  # noqa: F811
+    """A command feels them on the motor's side: no link has to stand in, whose inertia joints share.
+
+    The inertia that each joint moves is right within 2 %. Rotors are within four standard deviations of their draws,
+    and those that motion tells (the first joint's is a part of its link) within a fifth.
+    """
+    rotors = np.array([0.15, 0.1, 0.03])
+    truth = replace(coulomb_arm(arm), armature=rotors)
+    start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
+    found = run(arm, start, recorded(arm, truth, 8.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
+    at = found.space.where("armature")
+    assert np.all(np.abs(found.x[at] - rotors) < 4 * found.found.samples[:, at].std(0))
+    np.testing.assert_allclose(found.x[at][1:], rotors[1:], rtol=0.2)
+    moved = []
+    for d in (found.dynamics, truth):
+        model = arm.model(gravity=False)
+        put_links(model, d.mass, d.com, d.inertia, d.armature)
+        moved.append(np.diag(whole_mass(model, arm.q_home)))
+    np.testing.assert_allclose(*moved, rtol=0.02)
+
+
+def whole_mass(model, q) -> np.ndarray:
+    """Return MuJoCo's (n, n) kg m^2 of a compiled arm at q (n,) rad."""
+    data, out = mujoco.MjData(model), np.empty((len(q), len(q)))
+    data.qpos[:] = q
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_fullM(model, data, out)
+    return out
 
 
 def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811

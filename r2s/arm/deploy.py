@@ -65,10 +65,12 @@ class Stop:
         return f"episode {self.episode + 1}, {self.when}: {self.reason}"
 
 
-def episode_driver(robot: Robot, task: Task, soft_start_s: float, friction: np.ndarray) -> Driver:
-    """Return the driver of an episode of `task`; friction (n,) Nm, how much is believed to hold each joint."""
+def episode_driver(
+    robot: Robot, task: Task, soft_start_s: float, friction: np.ndarray, rotors: np.ndarray | None = None
+) -> Driver:
+    """Return the driver of an episode of `task`; friction (n,) Nm and rotors as of `Drivers`."""
     period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
-    return Driver(robot, task.torque(robot), friction, **period, soft_start_s=soft_start_s)
+    return Driver(robot, task.torque(robot), friction, **period, soft_start_s=soft_start_s, rotors=rotors)
 
 
 class DrivenArm:
@@ -85,15 +87,24 @@ class DrivenArm:
         task: rates and torques.
         friction: (n,) Nm, how much is believed to hold each joint: `Dynamics.level` of what the policy learned on.
         soft_start_s: s, over which the torque of an episode fades in; hardware deserves some, the twin needs none.
+        rotors: (n,) kg m^2, `Dynamics.armature` of the same; None: the robot's.
     """
 
     width = 1
 
-    def __init__(self, arm: Arm, task: Task, friction: np.ndarray, *, soft_start_s: float = 0.0):
+    def __init__(
+        self,
+        arm: Arm,
+        task: Task,
+        friction: np.ndarray,
+        *,
+        soft_start_s: float = 0.0,
+        rotors: np.ndarray | None = None,
+    ):
         self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
         self._kinematics = Kinematics(arm.robot)
         self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
-        self._driven = Driven(arm, episode_driver(arm.robot, task, soft_start_s, friction), self._log)
+        self._driven = Driven(arm, episode_driver(arm.robot, task, soft_start_s, friction, rotors), self._log)
         self.stops: list[Stop] = []
         self.timing = Timing()
         self.done = 0

@@ -7,7 +7,7 @@ function of states and targets, and the tests give it a million hostile ones.
 `Drivers` is that of many arms in lock-step, `Driver` that of one.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,6 +70,7 @@ class Drivers:
         m: arms. cutoff_hz: low-pass on the target. period_s: s between the targets of a policy.
         soft_start_s: s, over which the targets of a motion fade in; 0: not at all.
         friction: (n,) Nm, how much is believed to hold each joint.
+        rotors: (n,) kg m^2, believed inertia of each joint's rotor, as of `Dynamics.armature`; None: the robot's.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class Drivers:
         cutoff_hz: float = 100.0,
         period_s: float = 0.02,
         soft_start_s: float = 0.0,
+        rotors: np.ndarray | None = None,
     ):
         self._shape, self._torque, self._limits = (m, robot.n), torque, limits(robot, torque)
         self._friction = np.array(friction, dtype=float)
@@ -89,7 +91,8 @@ class Drivers:
         self._fast = DQ_INSIDE * robot.dq_max
         self._factor, self._fade = low_pass_factor(cutoff_hz), round(soft_start_s / SIM_DT)
         self._deadline = max(DEADLINE_S, PERIODS * period_s)
-        self._arm = links_of(robot, robot.mass, robot.com, robot.inertia), robot.armature
+        own = robot.armature if rotors is None else np.array(rotors, dtype=float)
+        self._arm = links_of(robot, robot.mass, robot.com, robot.inertia), own
         self.reset()
         still = np.zeros(self._shape)
         self(np.tile(robot.q_home, (m, 1)), still, still, None)  # to compile while no arm waits
@@ -206,7 +209,7 @@ def drive(
 class Driver:
     """The last word on every command of one arm; arguments as of `Drivers`."""
 
-    def __init__(self, robot: Robot, torque: np.ndarray, friction: np.ndarray, **settings: float):
+    def __init__(self, robot: Robot, torque: np.ndarray, friction: np.ndarray, **settings: Any):
         self._drivers = Drivers(robot, torque, 1, friction=friction, **settings)
 
     def reset(self) -> None:

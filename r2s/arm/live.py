@@ -65,7 +65,7 @@ class LiveArm:
     Args:
         open_arm: returns the arm, or a context manager that gives it; runs in the process, so it must be picklable.
         robot: whose number of joints the arm has.
-        task, friction, soft_start_s: as of `DrivenArm`.
+        task, friction, soft_start_s, rotors: as of `DrivenArm`.
 
     Raises:
         UserError, ArmStopped: what opening the arm says.
@@ -81,6 +81,7 @@ class LiveArm:
         friction: np.ndarray,
         *,
         soft_start_s: float = 0.0,
+        rotors: np.ndarray | None = None,
     ):
         self.robot, self._task, self._n = robot, task, robot.n
         self.stops: list[Stop] = []
@@ -91,7 +92,8 @@ class LiveArm:
         self._kinematics = Kinematics(robot)
         self._operator: Callable[[str], bool] | None = None
         self._target, self._state, self._over = Slot(robot.n), Slot(5 * robot.n + 4), Slot(1)
-        self._given = open_arm, task, friction, soft_start_s, self._target, self._state, self._over
+        driver = {"friction": friction, "soft_start_s": soft_start_s, "rotors": rotors}
+        self._given = open_arm, task, driver, self._target, self._state, self._over
 
     def __enter__(self) -> "LiveArm":
         context = multiprocessing.get_context("spawn")  # a fork would copy threads in any state
@@ -197,8 +199,7 @@ def _serve(
     line: Connection,
     open_arm: Callable[[], Any],
     task: Task,
-    friction: np.ndarray,
-    soft_start_s: float,
+    driver: dict[str, Any],
     target: Slot,
     state: Slot,
     over: Slot,
@@ -218,7 +219,7 @@ def _serve(
             operator = None
             if isinstance(arm, Operated):
                 operator, arm.operator = arm.operator, ask  # whose terminal is that of the other process
-            driven = DrivenArm(arm, task, friction, soft_start_s=soft_start_s)
+            driven = DrivenArm(arm, task, **driver)
             line.send(("ready", (arm.robot, operator)))
             while True:
                 _, starts, first = line.recv()

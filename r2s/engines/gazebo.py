@@ -18,7 +18,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.description import chain, write_sdf
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 
 RELEASES = ("gz.sim", "gz.sim9", "gz.sim8")  # Jetty, Ionic, Harmonic
 
@@ -31,7 +31,7 @@ class GazeboEngine:
     torque: that step starts at q, dq exactly.
 
     Args:
-        robot, dynamics: masses, centres and tensors; friction is not Gazebo's (r2s/engines/interface.py).
+        robot, dynamics: masses, centres, tensors and rotors; friction is not Gazebo's (r2s/engines/interface.py).
         sim: the bindings; None imports those that are installed.
 
     Raises:
@@ -43,6 +43,8 @@ class GazeboEngine:
         os.environ.setdefault("GZ_IP", "127.0.0.1")
         os.environ.setdefault("GZ_PARTITION", f"r2s-{uuid.uuid4().hex}")  # no other server hears us
         self._robot = robot
+        # SDF has no rotors: they are damping A/h in the file, put back as a torque (r2s/engines/dart.py)
+        self._counter = dynamics.armature / SIM_DT
         self._names = [link.joint for link in chain(robot, dynamics)[0]]
         self._joints: list = []
         self._error: BaseException | None = None
@@ -102,7 +104,9 @@ class GazeboEngine:
                 joint.reset_position(ecm, [float(q)])
                 joint.reset_velocity(ecm, [float(dq)])
             self._start = None
-        for joint, torque in zip(self._joints, self._tau, strict=True):
+        limit = self._robot.tau_max
+        force = np.clip(self._tau, -limit, limit) + self._counter * self._dq
+        for joint, torque in zip(self._joints, force, strict=True):
             joint.set_force(ecm, [float(torque)])
 
     def _after(self, ecm) -> None:

@@ -52,7 +52,7 @@ def write_bundle(
     """
     if to.exists():
         raise UserError(f"export: {to} is there already; remove it, or say another to=FOLDER")
-    contract = make_contract(robot, task, dynamics.level)
+    contract = make_contract(robot, task, dynamics.level, dynamics.armature)
     meta = read_meta(source)
     part = to.with_name(f".{to.name}.{os.getpid()}.part")
     try:

@@ -32,11 +32,12 @@ class Says(Protocol):
         ...
 
 
-def make_contract(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, Any]:
+def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.ndarray | None = None) -> dict[str, Any]:
     """Return the contract of a policy of this arm and task, without files, versions and seal.
 
     Args:
-        robot, task: what it was trained on and at. friction: (n,) Nm, as of `r2s.physics.limits.guard`.
+        robot, task: what it was trained on and at. friction: (n,) Nm, as of `r2s.physics.limits.guard`. rotors: (n,)
+            kg m^2, what the law believes of them; None: the robot's.
 
     Raises:
         UserError: the task does not say how its observations are made.
@@ -72,7 +73,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, A
             "gravity": "none: the arm compensates it",
             "links": [{k: v if isinstance(v, str) else listed(v) for k, v in row.items()} for row in rows],
             "hand_m": listed(hand[:3, 3]),
-            "rotors": listed(robot.armature),
+            "rotors": listed(robot.armature if rotors is None else rotors),
         },
         "law": {"units": UNITS, "joint": of_joints(robot, task, friction), "number": numbers(task)},
     }

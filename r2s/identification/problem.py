@@ -23,7 +23,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 NONE = 1e-4  # of its bounds' width, standard deviation of the belief in a value that is not searched
-CLEAR = 3.0  # standard deviations, by which friction must be early
+CLEAR, ABOUT = 3.0, (0.5, 2.0)  # standard deviations by which friction must be early; as a share of what it would be
 TERMS: tuple[str, ...] = ("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain")
 TERMS += ("drag", "drag_sin", "drag_cos")
 Report = Callable[[dict], None]
@@ -120,10 +120,12 @@ def fitting(
 
 
 def believed(prior: Mapping[str, ArrayLike], robot: Robot, recording: Recording) -> dict[str, ArrayLike]:
-    """Return deviations in SI units: what is in Nm, prior.motor names as shares of each joint's largest torque."""
-    if recording.torque != "motor":
-        return dict(prior)
-    own, reach = of_torque() - logarithmic(), _largest_torque(robot, recording)
+    """Return deviations in SI units: of rotors prior names shares of each joint's largest torque.
+
+    So it does of motor torque for all that is in Nm.
+    """
+    own = of_torque() - logarithmic() if recording.torque == "motor" else {"armature"}
+    reach = _largest_torque(robot, recording)
     return {name: sigma * reach if name in own else sigma for name, sigma in prior.items()}
 
 
@@ -222,10 +224,12 @@ class Problem:
         return r[0], ((r[1:] - r[0]) / h[:, None]).T
 
 
-def answers_early(problem: Problem, u: np.ndarray) -> bool:
+def answers_early(problem: Problem, u: np.ndarray, clear: float = CLEAR) -> bool:
     """Say whether friction is that of the velocity half a step ahead, at u (P,), a fit to the level of torque.
 
-    It is in a simulator that solves for friction at the end of a step, on no arm whose time is continuous.
+    It is in a simulator that solves for friction at the end of a step, on no arm whose time is continuous. What the
+    torque shows of it must be about as large as it would be, and `clear` standard deviations: a rotor that the model
+    lacks looks alike, a hundred times larger.
     """
     data = problem.quick_data
     r, j = problem.quick(u[None])[0], problem.quick_jacobian(u)
@@ -234,7 +238,7 @@ def answers_early(problem: Problem, u: np.ndarray) -> bool:
     data.ahead = 0.0
     own = moved - j @ np.linalg.lstsq(j, moved, rcond=None)[0]  # what the parameters cannot stand in for
     share = -(own @ r) / (own @ own)
-    return bool(share > 0.5 and share * np.linalg.norm(own) > CLEAR)
+    return bool(ABOUT[0] < share < ABOUT[1] and share * np.linalg.norm(own) > clear)
 
 
 class Search(Protocol):

@@ -175,14 +175,15 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
     """Write the arm as SDF 1.9, fixed to the world; a frame `ee` sits at the end effector. Arguments as `chain`.
 
     With `world` the model stands in a world of its own, as r2s/engines/gazebo.py runs it: 1 ms steps as fast as they
-    go, physics and nothing else, no gravity (libfranka's convention: the arm compensates it), no velocity limits
-    (they are the driver's), and no friction (it comes as a torque).
+    go, physics and nothing else, no gravity (libfranka's convention: the arm compensates it), no limits of speed or
+    torque (they are the driver's), and no friction (it comes as a torque). Rotors are there a damping, of armature
+    over 1 ms: r2s/engines/gazebo.py puts that torque back.
 
     Raises:
-        UserError: the joints have armature, which SDF cannot say.
+        UserError: the joints have armature, which SDF cannot say; not with `world`.
     """
     links, hand = chain(robot, dynamics, friction=not world)
-    if any(link.armature for link in links):
+    if not world and any(link.armature for link in links):
         raise UserError("robot.armature: the joints have some, which SDF cannot say; write it into the links")
     root = ET.Element("sdf", version="1.9")
     place = root
@@ -208,11 +209,13 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         axis = ET.SubElement(joint, "axis")
         _text(axis, xyz=_words(link.axis))
         low, high = np.nan_to_num([robot.q_min[i], robot.q_max[i]], posinf=ENDLESS, neginf=-ENDLESS)
-        limit = {"lower": low, "upper": high, "effort": robot.tau_max[i]}
-        if not world:
-            limit["velocity"] = robot.dq_max[i]
+        limit, damping = {"lower": low, "upper": high}, link.damping
+        if world:
+            damping += link.armature / SIM_DT
+        else:
+            limit |= {"effort": robot.tau_max[i], "velocity": robot.dq_max[i]}
         _text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})
-        _text(ET.SubElement(axis, "dynamics"), damping=repr(link.damping), friction=repr(link.friction))
+        _text(ET.SubElement(axis, "dynamics"), damping=repr(damping), friction=repr(link.friction))
         parent = link.name
     frame = ET.SubElement(model, "frame", name="ee", attached_to=parent)
     _text(frame, pose=_pose_words(hand))

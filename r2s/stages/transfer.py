@@ -94,7 +94,7 @@ def transfer(cfg, overrides):
             approach(robot, robot.q_home, start, what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
-    friction, dynamics, draw = center.level, None, None
+    dynamics, draw = None, None
     if cfg.simulator.name != "none":
         dynamics = center
         draw = make_draw(trained, robot, dynamics)
@@ -109,12 +109,12 @@ def transfer(cfg, overrides):
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
             pass  # what is wrong with it is said before there is a run folder
-    opened = nullcontext() if cfg.arm.name == "none" or twin else opened_arms(cfg, robot, task, friction)
+    opened = nullcontext() if cfg.arm.name == "none" or twin else opened_arms(cfg, robot, task, center)
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         on_twin = None
         if twin:  # first: it forks, and then there are no threads yet
             progress, shown = counted(f"on {cfg.arm.name}")
-            opens = partial(opened_arms, cfg, robot, task, friction)
+            opens = partial(opened_arms, cfg, robot, task, center)
             on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
             progress.close()
         if draw is not None:
