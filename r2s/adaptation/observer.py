@@ -1,12 +1,12 @@
 """A disturbance observer: what commands, friction and links do not explain is added, through one low-pass.
 
 With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum tells the lacking torque d without
-accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006), here as its
-mean over 20 ms (balance.py), which a low-pass of first order follows: filter_s dd^/dt = d - d^. Commands go through
-the identified delay and lag first.
+accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006), here as
+its mean over 20 ms (balance.py), which a low-pass of first order follows: filter_s dd^/dt = d - d^. Commands go
+through the identified delay and lag first.
 
-A joint that does not slide may be held by anything within its edges: d is somewhere between two bounds then, and d^
-changes no more than it has to. So stiction is left to hold the arm, as the policy has learnt it.
+A joint that does not slide all the time may be held by anything within its edges: d is somewhere between two bounds
+then, and d^ changes no more than it has to. So stiction is left to hold the arm, as the policy has learnt it.
 """
 
 import numpy as np
@@ -53,7 +53,7 @@ def _hear(arm, kept, balance, q, dq, tau, share, aim, lacks):
         for j in range(n):
             aim[j] = balance.y[j]
             if balance.slides[j] == 0.0:
-                free, edge = balance.y[j] + balance.rub[j], arm.edge[j]
+                free, edge = balance.y[j] + balance.rub[j], max(arm.edge[j], abs(balance.rub[j]))
                 aim[j] = min(max(lacks[j], free - edge), free + edge)
     for j in range(n):
         lacks[j] += share * (aim[j] - lacks[j])

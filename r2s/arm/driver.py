@@ -1,8 +1,9 @@
 """Between a policy and an arm, once a millisecond: whatever the policy says, what is sent is within the arm's rules.
 
-In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> what an adapter adds (r2s/adaptation/adapter.py)
--> the law of r2s/physics/limits.py, the same as in training -> rate limit, last, against what the arm applied last. No
-clock and no arm in here: `Driver` is a function of states and targets, and the tests give it a million hostile ones.
+In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> what an adapter adds
+(r2s/adaptation/adapter.py) -> the law of r2s/physics/limits.py, the same as in training -> rate limit, last, against
+what the arm applied last. No clock and no arm in here: `Driver` is a function of states and targets, and the tests
+give it a million hostile ones.
 
 `Drivers` is that of many arms in lock-step, `Driver` that of one.
 """

@@ -209,27 +209,27 @@ def arm_maker(cfg, robot):
 
 
 @contextmanager
-def opened_arms(cfg, robot, task, friction, noise=0):
+def opened_arms(cfg, robot, task, friction, noise=0, adapter=None):
     """Give the arm of conf/arm behind its driver, for episodes of `task`: a `DrivenArm`, or a `LiveArm` where
     `live` says that the arm's clock does not wait. It is stopped at the end whatever happens.
 
-    friction: (n,) Nm, as of `DrivenArm`. noise: as of `opened_arm`.
+    friction, adapter: as of `DrivenArm`. noise: as of `opened_arm`.
     """
     from r2s.arm.deploy import DrivenArm
     from r2s.arm.interface import ArmStopped
     from r2s.arm.live import LiveArm
 
-    fade = cfg.arm.get("soft_start_s", 0.0)
+    beside = {"soft_start_s": cfg.arm.get("soft_start_s", 0.0), "adapter": adapter}
     if not cfg.arm.get("live", False):
         with opened_arm(cfg, robot, noise) as arm:
             try:
-                yield DrivenArm(arm, task, friction, soft_start_s=fade)
+                yield DrivenArm(arm, task, friction, **beside)
             finally:
                 arm.stop()
         return
     with ExitStack() as stack:
         try:
-            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, friction, soft_start_s=fade))
+            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, friction, **beside))
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         yield arms
