@@ -49,7 +49,7 @@ class Compensation:
         filter, kept, balance = self.estimator.inside
         if new:
             thing(filter.x, self._carried)
-            _weigh(filter, balance, self._carried, self._weight)
+            weigh(filter, balance, self._carried, self._weight)
         _add(filter, kept, self._carried, self._weight, self._slow, self._adds)
         return self._adds
 
@@ -75,7 +75,7 @@ def thing(x, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _weigh(filter, balance, carried, weight):
+def weigh(filter, balance, carried, weight):
     """Write the weights (n,) of what is known of each joint at the end of a span."""
     x, P, n = filter.x, filter.P, len(weight)
     h, at = np.empty(BODY + 2), np.empty(BODY + 2, dtype=np.int64)

@@ -42,10 +42,11 @@ class Timing:
     def table(self) -> list[dict[str, float | str]]:
         """Return one row each: count, median, 99 % and largest, ms."""
         rows: list[dict[str, float | str]] = []
-        for name in ("policy", "driver", *(["adapter"] if self.adapter else []), "period"):
+        names = ["policy", "driver", *(["adapter"] if self.adapter else []), "period"]
+        for name in names:
             x = 1e3 * np.array(getattr(self, name) or [np.nan])
             row = {"median_ms": np.median(x), "p99_ms": np.percentile(x, 99), "max_ms": x.max()}
-            rows.append({"what": name, "count": len(x)} | {k: float(v) for k, v in row.items()})
+            rows.append({"what": name, "count": len(x), **{k: float(v) for k, v in row.items()}})
         return rows
 
 

@@ -32,8 +32,8 @@ class Driven:
     Args:
         arm: at 1 kHz. driver: whose settings say what the targets of these motions may ask for.
         log: gets (state, command) of every cycle before it is sent.
-        adapter: hears every cycle, and adds to the targets from the next on. Where it raises, the arm is brought to
-            rest without it before its exception goes on.
+        adapter: hears every cycle, and adds to the targets from the next on. Where it raises, the driver stops the
+            arm, as one whose policy is silent, before its exception goes on.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Driven:
             self._hears, self._added = True, np.zeros(self.arm.robot.n)
 
     def _hear(self, adapter: Adapter) -> None:
-        """Let the adapter hear this cycle; where it raises, bring the arm to rest without it."""
+        """Let the adapter hear this cycle; where it raises, say nothing until the driver has stopped the arm."""
         try:
             self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
             if self._added.shape != self.sent.shape:
@@ -134,7 +134,8 @@ class Driven:
             with suppress(ArmStopped):
                 self.arm.command(self.sent)
                 self.state = self.arm.read()
-                self.rest()
+                while True:
+                    self(None)
             raise
 
     def _stopped(self, reason: str) -> None:

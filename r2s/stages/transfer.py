@@ -111,14 +111,12 @@ def transfer(cfg, overrides):
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
             pass  # what is wrong with it is said before there is a run folder
-    opened = (
-        nullcontext() if cfg.arm.name == "none" or twin else opened_arms(cfg, robot, task, friction, adapter=adapter)
-    )
+    opens = partial(opened_arms, cfg, robot, task, friction, adapter=adapter)
+    opened = nullcontext() if cfg.arm.name == "none" or twin else opens()
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         on_twin = None
         if twin:  # first: it forks, and then there are no threads yet
             progress, shown = counted(f"on {cfg.arm.name}")
-            opens = partial(opened_arms, cfg, robot, task, friction, adapter=adapter)
             on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
             progress.close()
         if draw is not None:
