@@ -102,8 +102,8 @@ def test_every_command_comes_out_of_a_driver(monkeypatch):
     decided = []
     decide = law.Drivers.__call__
 
-    def noted(self, q, dq, tau_J_d, target):
-        out = decide(self, q, dq, tau_J_d, target)
+    def noted(self, q, dq, tau_J_d, target, added):
+        out = decide(self, q, dq, tau_J_d, target, added)
         decided.append(out[0].copy())
         return out
 

@@ -105,6 +105,11 @@ class Estimator:
         return self._now
 
     @property
+    def inside(self) -> tuple[Filter, Kept, Balance]:
+        """The filter, what is kept from cycle to cycle, and the last span's balance; not to be written."""
+        return self._filter, self._kept, self._balance
+
+    @property
     def innovations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The last span's innovations (n,) Nm, their variances (n,) Nm^2, and whether each joint slid (n,)."""
         return self._filter.seen[0], self._filter.seen[1], self._balance.slides > 0

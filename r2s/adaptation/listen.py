@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
-from r2s.adaptation.believed import believed
+from r2s.adaptation.believed import Believed, believed
 from r2s.adaptation.estimator import Estimate, Estimator
+from r2s.adaptation.kalman import Noise
 from r2s.adaptation.noise import balances, learnt, noise_of, prior_of
 from r2s.errors import UserError
 from r2s.identification.parameters import ParameterSpace
@@ -32,11 +33,21 @@ def estimator(
             how wrong the model is. Without them it is taken to be a tenth of friction.
     """
     arm = believed(robot, dynamics)
+    return Estimator(arm, noise(robot, arm, posterior, unloaded))
+
+
+def noise(
+    robot: Robot,
+    arm: Believed,
+    posterior: tuple[ParameterSpace, np.ndarray] | None,
+    unloaded: tuple[Recording, Recording] | None,
+) -> Noise:
+    """Return how wrong what is believed of an arm may be; arguments as of `estimator`."""
     prior = prior_of(*posterior) if posterior is not None else None
     if unloaded is None:
-        return Estimator(arm, noise_of(arm, prior))
+        return noise_of(arm, prior)
     train, other = (balances(arm, at_rate(robot, r)) for r in unloaded)
-    return Estimator(arm, learnt(arm, prior, train, other))
+    return learnt(arm, prior, train, other)
 
 
 def at_rate(robot: Robot, recording: Recording) -> Recording:

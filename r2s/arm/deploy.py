@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.signal import savgol_filter
 
+from r2s.adaptation.adapter import Adapter
 from r2s.arm.driven import Driven
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped, NotCleared, Operated
@@ -30,20 +31,22 @@ class Timing:
 
     Attributes:
         policy: from a state to the policy's target, once per control step. driver: working out one command.
-        period: from one command to the next.
+        adapter: hearing one cycle, where there is an adapter. period: from one command to the next.
     """
 
     policy: list[float] = field(default_factory=list)
     driver: list[float] = field(default_factory=list)
+    adapter: list[float] = field(default_factory=list)
     period: list[float] = field(default_factory=list)
 
     def table(self) -> list[dict[str, float | str]]:
         """Return one row each: count, median, 99 % and largest, ms."""
         rows: list[dict[str, float | str]] = []
-        for name in ("policy", "driver", "period"):
+        names = ["policy", "driver", *(["adapter"] if self.adapter else []), "period"]
+        for name in names:
             x = 1e3 * np.array(getattr(self, name) or [np.nan])
             row = {"median_ms": np.median(x), "p99_ms": np.percentile(x, 99), "max_ms": x.max()}
-            rows.append({"what": name, "count": len(x)} | {k: float(v) for k, v in row.items()})
+            rows.append({"what": name, "count": len(x), **{k: float(v) for k, v in row.items()}})
         return rows
 
 
@@ -88,6 +91,7 @@ class DrivenArm:
         friction: (n,) Nm, how much is believed to hold each joint: `Dynamics.level` of what the policy learned on.
         soft_start_s: s, over which the torque of an episode fades in; hardware deserves some, the twin needs none.
         rotors: (n,) kg m^2, `Dynamics.armature` of the same; None: the robot's.
+        adapter: what adds to the policy's torque; None: nothing.
     """
 
     width = 1
@@ -100,11 +104,14 @@ class DrivenArm:
         *,
         soft_start_s: float = 0.0,
         rotors: np.ndarray | None = None,
+        adapter: Adapter | None = None,
     ):
         self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
         self._kinematics = Kinematics(arm.robot)
         self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
-        self._driven = Driven(arm, episode_driver(arm.robot, task, soft_start_s, friction, rotors), self._log)
+        self._adapts = adapter is not None
+        driver = episode_driver(arm.robot, task, soft_start_s, friction, rotors)
+        self._driven = Driven(arm, driver, self._log, adapter)
         self.stops: list[Stop] = []
         self.timing = Timing()
         self.done = 0
@@ -158,8 +165,10 @@ class DrivenArm:
         except ArmStopped as reason:
             self._stop(f"{self._driven.state.t:.2f} s", reason)
         self._angles.append(self._driven.state.q)
-        began, now = self._driven.clock
+        began, now, heard = self._driven.clock
         self.timing.driver.append(now - began)
+        if self._adapts:
+            self.timing.adapter.append(heard - now)
         if self._sent:
             self.timing.period.append(now - self._sent)
         self._sent = now

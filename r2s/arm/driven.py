@@ -6,9 +6,11 @@ makes of them is sent, and nothing else. tests/test_driven.py holds that there i
 
 import time
 from collections import deque
+from contextlib import suppress
 
 import numpy as np
 
+from r2s.adaptation.adapter import Adapter
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
 from r2s.physics.rigid_body import InverseInertia
@@ -25,24 +27,33 @@ class Driven:
 
     Attributes:
         arm, driver: which. state: of the current cycle. sent: (n,) Nm, the last command.
-        clock: s, perf_counter before and after the driver's last decision.
+        clock: s, perf_counter before and after the driver's last decision, and after the adapter's.
 
     Args:
         arm: at 1 kHz. driver: whose settings say what the targets of these motions may ask for.
         log: gets (state, command) of every cycle before it is sent.
+        adapter: hears every cycle, and adds to the targets from the next on. Where it raises, the driver stops the
+            arm, as one whose policy is silent, before its exception goes on.
     """
 
-    def __init__(self, arm: Arm, driver: Driver, log: deque[tuple[ArmState, np.ndarray]] | None = None):
+    def __init__(
+        self,
+        arm: Arm,
+        driver: Driver,
+        log: deque[tuple[ArmState, np.ndarray]] | None = None,
+        adapter: Adapter | None = None,
+    ):
         self.arm, self.driver = arm, driver
+        self._adapter, self._hears = adapter, False
+        self._added: np.ndarray | None = None
         self._log, self._over = log, False
         self._inverse = InverseInertia(arm.robot)
         self.state: ArmState
-        self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0)
+        self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
         """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
-        self.driver.reset()
-        self._over = False
+        self._reset()
         try:
             self.state = self.arm.move_to(q)
         except ArmStopped:
@@ -52,8 +63,7 @@ class Driven:
 
     def begin(self) -> None:
         """Begin a motion where the arm is."""
-        self.driver.reset()
-        self._over = False
+        self._reset()
         self.state = self.arm.read()
 
     def __call__(self, target: np.ndarray | None) -> ArmState:
@@ -65,8 +75,11 @@ class Driven:
         if self._over:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
-        self.sent = self.driver(self.state, target)
-        self.clock = began, time.perf_counter()
+        self.sent = self.driver(self.state, target, self._added)
+        decided = time.perf_counter()
+        if self._adapter is not None and self._hears:
+            self._hear(self._adapter)
+        self.clock = began, decided, time.perf_counter()
         if self._log is not None:
             self._log.append((self.state, self.sent))
         try:
@@ -102,6 +115,28 @@ class Driven:
         self._over = True
         self.arm.stop()
         return reason
+
+    def _reset(self) -> None:
+        self.driver.reset()
+        self._over = False
+        if self._adapter is not None:
+            self._adapter.begin()
+            self._hears, self._added = True, np.zeros(self.arm.robot.n)
+
+    def _hear(self, adapter: Adapter) -> None:
+        """Let the adapter hear this cycle; where it raises, say nothing until the driver has stopped the arm."""
+        try:
+            self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
+            if self._added.shape != self.sent.shape:
+                raise ValueError(f"an adapter of {len(self.sent)} joints returned {self._added.shape}")
+        except Exception:
+            self._hears, self._added = False, None
+            with suppress(ArmStopped):
+                self.arm.command(self.sent)
+                self.state = self.arm.read()
+                while True:
+                    self(None)
+            raise
 
     def _stopped(self, reason: str) -> None:
         self._over = True

@@ -1,8 +1,9 @@
 """Between a policy and an arm, once a millisecond: whatever the policy says, what is sent is within the arm's rules.
 
-In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> the law of r2s/physics/limits.py, the same as
-in training -> rate limit, last, against what the arm applied last. No clock and no arm in here: `Driver` is a
-function of states and targets, and the tests give it a million hostile ones.
+In this order: finite -> fresh (watchdog) -> soft start -> low-pass -> what an adapter adds
+(r2s/adaptation/adapter.py) -> the law of r2s/physics/limits.py, the same as in training -> rate limit, last, against
+what the arm applied last. No clock and no arm in here: `Driver` is a function of states and targets, and the tests
+give it a million hostile ones.
 
 `Drivers` is that of many arms in lock-step, `Driver` that of one.
 """
@@ -25,6 +26,7 @@ DAMP_S = 0.5  # at most
 Q_INSIDE = 0.02  # rad within the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # of the velocity limits
 STILL = 0.02  # rad/s
+ADDED = 0.3  # of tau_max, the most that an adapter adds: on a Panda 1.5 kg anywhere within reach, and friction
 RUNS, SILENT, NOT_FINITE, OUTSIDE = range(4)  # `Memory.why`
 
 
@@ -88,7 +90,7 @@ class Drivers:
         self._shape, self._torque, self._limits = (m, robot.n), torque, limits(robot, torque)
         self._friction = np.array(friction, dtype=float)
         self._low, self._high = robot.q_min + Q_INSIDE, robot.q_max - Q_INSIDE
-        self._fast = DQ_INSIDE * robot.dq_max
+        self._fast, self._most = DQ_INSIDE * robot.dq_max, ADDED * robot.tau_max
         self._factor, self._fade = low_pass_factor(cutoff_hz), round(soft_start_s / SIM_DT)
         self._deadline = max(DEADLINE_S, PERIODS * period_s)
         own = robot.armature if rotors is None else np.array(rotors, dtype=float)
@@ -119,19 +121,29 @@ class Drivers:
         m = self._memory
         return (m.why != RUNS) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
 
-    def __call__(self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, target: np.ndarray | None) -> np.ndarray:
+    def __call__(
+        self,
+        q: np.ndarray,
+        dq: np.ndarray,
+        tau_J_d: np.ndarray,
+        target: np.ndarray | None,
+        added: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the commands (m, n) Nm of this cycle.
 
         Args:
             q, dq: (m, n) rad, rad/s, of this cycle; where they are not finite the torque fades out.
             tau_J_d: (m, n) Nm, what the arms applied last.
             target: (m, n) Nm that the policies want; None where they have said nothing.
+            added: (m, n) Nm that adapters add in this cycle, up to ADDED of tau_max; None: there are none. Where it
+                is not finite nothing is added, and a target that comes with it is not heard.
         """
-        memory, said = self._memory, target is not None
-        bounds = self._torque, self._low, self._high, self._fast
+        memory, said, adds = self._memory, target is not None, added is not None
+        bounds = self._torque, self._low, self._high, self._fast, self._most
         settings = self._deadline, self._factor, self._fade
         arm = self._friction, *self._arm, self._limits
-        out = drive(q, dq, tau_J_d, target if said else q, said, *bounds, *settings, *arm, memory)
+        wanted = target if said else q, said, added if adds else q, adds
+        out = drive(q, dq, tau_J_d, *wanted, *bounds, *settings, *arm, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
                 if self.stopping[i] is None:
@@ -154,7 +166,7 @@ class Drivers:
 
 @njit(cache=True)
 def drive(
-    q, dq, applied, target, said, torque, low, high, fast, deadline, factor, fade,
+    q, dq, applied, target, said, added, adds, torque, low, high, fast, most, deadline, factor, fade,
     friction, links, armature, limits, memory,
 ):  # fmt: skip
     """Return the commands (m, n) Nm of this cycle; arguments as of `Drivers`, links: `links_of` the arm."""
@@ -164,7 +176,8 @@ def drive(
     mass = np.empty(n * (n + 1) // 2)  # its lower triangle, row by row
     for i in range(m):
         seen = np.isfinite(q[i]).all() and np.isfinite(dq[i]).all()
-        if said and np.isfinite(target[i]).all():
+        helped = adds and np.isfinite(added[i]).all()
+        if said and np.isfinite(target[i]).all() and helped == adds:
             memory.target[i] = np.minimum(np.maximum(target[i], -torque), torque)
             memory.silent[i] = 0
         else:
@@ -197,6 +210,10 @@ def drive(
                 for k in range(j + 1):
                     mass[j * (j + 1) // 2 + k] = inertia[j, k]
             share, now = memory.share[i], effort[0, 0]
+            if helped and not stopping:
+                faded = min(1.0, memory.cycle[i] / fade) if fade > 0 else 1.0
+                for j in range(n):
+                    now[j] += faded * min(max(added[i, j], -most[j]), most[j])
             changed = guard(q[i], dq[i], now, last, share, friction, mass, bias, limits, work, out[i])
             memory.limited[i] += changed
         else:
@@ -236,7 +253,12 @@ class Driver:
         """Whether a motion that is being stopped is at rest, or has had its time."""
         return self.stopping is not None and bool(self._drivers.done[0])
 
-    def __call__(self, state: ArmState, target: np.ndarray | None) -> np.ndarray:
-        """Return the command (n,) Nm of this cycle; `target` (n,) Nm, None where the policy has said nothing."""
-        wanted = None if target is None else target[None]
-        return self._drivers(state.q[None], state.dq[None], state.tau_J_d[None], wanted)[0]
+    def __call__(self, state: ArmState, target: np.ndarray | None, added: np.ndarray | None = None) -> np.ndarray:
+        """Return the command (n,) Nm of this cycle.
+
+        Args:
+            state: of the arm. target: (n,) Nm, None where the policy has said nothing.
+            added: (n,) Nm that an adapter adds; None: there is none.
+        """
+        wanted, more = (None if x is None else x[None] for x in (target, added))
+        return self._drivers(state.q[None], state.dq[None], state.tau_J_d[None], wanted, more)[0]

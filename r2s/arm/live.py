@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from r2s.adaptation.adapter import Adapter
 from r2s.arm.deploy import DrivenArm, Stop, Timing, as_state
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
 from r2s.physics.rigid_body import Kinematics
@@ -65,7 +66,7 @@ class LiveArm:
     Args:
         open_arm: returns the arm, or a context manager that gives it; runs in the process, so it must be picklable.
         robot: whose number of joints the arm has.
-        task, friction, soft_start_s, rotors: as of `DrivenArm`.
+        task, friction, soft_start_s, rotors, adapter: as of `DrivenArm`; the adapter works in the process.
 
     Raises:
         UserError, ArmStopped: what opening the arm says.
@@ -82,6 +83,7 @@ class LiveArm:
         *,
         soft_start_s: float = 0.0,
         rotors: np.ndarray | None = None,
+        adapter: Adapter | None = None,
     ):
         self.robot, self._task, self._n = robot, task, robot.n
         self.stops: list[Stop] = []
@@ -92,7 +94,7 @@ class LiveArm:
         self._kinematics = Kinematics(robot)
         self._operator: Callable[[str], bool] | None = None
         self._target, self._state, self._over = Slot(robot.n), Slot(5 * robot.n + 4), Slot(1)
-        driver = {"friction": friction, "soft_start_s": soft_start_s, "rotors": rotors}
+        driver = {"friction": friction, "soft_start_s": soft_start_s, "rotors": rotors, "adapter": adapter}
         self._given = open_arm, task, driver, self._target, self._state, self._over
 
     def __enter__(self) -> "LiveArm":
@@ -152,14 +154,14 @@ class LiveArm:
                 return self._read()
             looked += 1
             if looked % 100 == 0 and not self._process.is_alive():
-                raise ArmStopped("the process that drove the arm has ended")
+                self._hear("ended")  # raises: what it said last, or that it has ended
             time.sleep(POLL_S)
 
     def end(self) -> np.ndarray:
         """Stop the arm; return (1,), whether it had stopped, or was being stopped, before."""
         self._over.write(np.ones(1))
         self.stops, stopped, timing, self.speeds = self._hear("ended")
-        self.timing.driver, self.timing.period = timing.driver, timing.period
+        self.timing.driver, self.timing.adapter, self.timing.period = timing.driver, timing.adapter, timing.period
         return np.array([stopped])
 
     def _look(self) -> tuple[int, ArmState, np.ndarray, bool, int]:

@@ -209,17 +209,17 @@ def arm_maker(cfg, robot):
 
 
 @contextmanager
-def opened_arms(cfg, robot, task, dynamics, noise=0):
+def opened_arms(cfg, robot, task, dynamics, noise=0, adapter=None):
     """Give the arm of conf/arm behind its driver, for episodes of `task`: a `DrivenArm`, or a `LiveArm` where
     `live` says that the arm's clock does not wait. It is stopped at the end whatever happens.
 
-    dynamics: of one arm, what the policy learned on. noise: as of `opened_arm`.
+    dynamics: of one arm, what the policy learned on. adapter: as of `DrivenArm`. noise: as of `opened_arm`.
     """
     from r2s.arm.deploy import DrivenArm
     from r2s.arm.interface import ArmStopped
     from r2s.arm.live import LiveArm
 
-    how = {"soft_start_s": cfg.arm.get("soft_start_s", 0.0), "rotors": dynamics.armature}
+    how = {"soft_start_s": cfg.arm.get("soft_start_s", 0.0), "rotors": dynamics.armature, "adapter": adapter}
     if not cfg.arm.get("live", False):
         with opened_arm(cfg, robot, noise) as arm:
             try:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, nearest
+from r2s.stages.adapting import make_adapter
 from r2s.stages.build import (
     console,
     is_learner,
@@ -37,7 +38,7 @@ def some(episodes, which):
 
 def reads(cfg):
     """Return the keys of the config that this stage reads."""
-    return {"policy", "simulator", "arm", "evaluation.episodes"}
+    return {"policy", "simulator", "arm", "adapt", "evaluation.episodes"}
 
 
 def trained_config(cfg):
@@ -62,7 +63,7 @@ def trained_config(cfg):
 
 
 def transfer(cfg, overrides):
-    """Evaluate a trained policy in simulators and on an arm, on the same goals."""
+    """Evaluate a trained policy in simulators and on an arm, on the same goals; adapters act on the arm alone."""
     import numpy as np
 
     from r2s.arm.spread import spread
@@ -94,6 +95,7 @@ def transfer(cfg, overrides):
             approach(robot, robot.q_home, start, what=f"the start of episode {k}", space=space)
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
+    adapter = make_adapter(cfg, robot, source)
     dynamics, draw = None, None
     if cfg.simulator.name != "none":
         dynamics = center
@@ -109,12 +111,12 @@ def transfer(cfg, overrides):
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
             pass  # what is wrong with it is said before there is a run folder
-    opened = nullcontext() if cfg.arm.name == "none" or twin else opened_arms(cfg, robot, task, center)
+    opens = partial(opened_arms, cfg, robot, task, center, adapter=adapter)
+    opened = nullcontext() if cfg.arm.name == "none" or twin else opens()
     with opened as driven, open_run(cfg, overrides, parents=[str(source)]) as run:
         on_twin = None
         if twin:  # first: it forks, and then there are no threads yet
             progress, shown = counted(f"on {cfg.arm.name}")
-            opens = partial(opened_arms, cfg, robot, task, center)
             on_twin = spread(opens, policy, task, starts, goals, cfg.threads or os.cpu_count() or 1, shown)
             progress.close()
         if draw is not None:

@@ -1,10 +1,10 @@
 """stage=watch: listens to an arm at work: what it carries, when that changes, how its friction drifts."""
 
 from dataclasses import replace
-from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.files import located
+from r2s.stages.adapting import calibrated
 from r2s.stages.build import called, check_source, make_dynamics, make_robot, open_run, opened_source, plain
 
 WHY = {
@@ -19,24 +19,6 @@ def reads(cfg):
     """Return the keys of the config that this stage reads."""
     keys = {"robot", "calibration", "data", "watch"} | (set() if cfg.calibration else {"friction", "inertia"})
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
-
-
-def calibrated(cfg, robot):
-    """Return what is believed of the arm: its dynamics, draws of them, and motion without a payload, where known."""
-    from r2s.identification.parameter_file import load_parameters, load_posterior
-    from r2s.recordings.readers import read
-
-    if not cfg.calibration:
-        return make_dynamics(cfg, robot), None, None
-    space, x = load_parameters(cfg.calibration, robot)
-    folder = Path(cfg.calibration)
-    folder = folder if folder.is_dir() else folder.parent
-    posterior = (space, load_posterior(folder, space)) if (folder / "posterior.npz").is_file() else None
-    paths = [folder / f"{name}.npz" for name in ("train", "validation")]
-    unloaded = None
-    if all(path.is_file() for path in paths):
-        unloaded = tuple(read(path, torque="commanded") for path in paths)
-    return space.dynamics(x), posterior, unloaded
 
 
 def heard(cfg, robot):
@@ -98,7 +80,9 @@ def watch(cfg, overrides):
         if cfg.data.torque != "commanded":
             raise UserError(f"data.torque: {cfg.data.torque} is not allowed for stage=watch; commanded is")
         check_source(cfg, robot)
-    dynamics, posterior, unloaded = calibrated(cfg, robot)
+    dynamics, posterior, unloaded = make_dynamics(cfg, robot), None, None
+    if cfg.calibration:
+        dynamics, posterior, unloaded = calibrated(cfg.calibration, robot)
     if cfg.data.kind == "arm" and cfg.arm.get("load"):  # what the arm was told of is no surprise
         dynamics = replace(dynamics, told=moment(robot, payload_of(plain(cfg.arm)["load"], "arm.load")))
     parents = [str(cfg.calibration)] if cfg.calibration else []
