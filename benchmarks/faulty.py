@@ -1,4 +1,4 @@
-"""What benchmarks/faults.py and benchmarks/mutations.py share: commands forked off one process that imported all."""
+"""What benchmarks/faults.py and the mutations share: commands forked off one process that imported all."""
 
 import os
 import resource

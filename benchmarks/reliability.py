@@ -89,7 +89,7 @@ seen: files carry no checksums, but sha256 of inputs is in meta.json and a resum
 def page(kept: Path, machine: str, markdown: Callable[[pd.DataFrame], str]) -> str:
     """Return the page of what lies in `kept`."""
     from faults import SEED
-    from mutations import SEEDS
+    from mutated import SEEDS
 
     parts = [HEAD.format(machine=machine, seed=SEED, seeds=", ".join(str(s) for s in SEEDS.values())), RULES]
     if (kept / "kills.jsonl").is_file():

@@ -38,9 +38,10 @@ def conf(path: str) -> dict:
 
 
 def in_blocks(page: Path) -> list[str]:
-    """Return the commands in a page's ```bash blocks, a line each, without comments."""
+    """Return the commands in a page's ```bash blocks, a line each, joined where they go on, without comments."""
     blocks = re.findall(r"^```bash\n(.*?)^```", page.read_text(), flags=re.S | re.M)
-    lines = [re.sub(r"(^| +)# .*", "", line).strip() for block in blocks for line in block.splitlines()]
+    whole = [re.sub(r" *\\\n *", " ", block) for block in blocks]
+    lines = [re.sub(r"(^| +)# .*", "", line).strip() for block in whole for line in block.splitlines()]
     return [line for line in lines if line]
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 import yaml
@@ -24,13 +25,16 @@ from r2s.arm.deploy import as_state, episode_driver
 from r2s.arm.interface import ArmState
 from r2s.errors import UserError
 from r2s.export.bundle import one_file
+from r2s.export.card import card
 from r2s.export.contract import make_contract
 from r2s.export.law import Driver, Model
 from r2s.learning.networks import Policy
 from r2s.learning.policy import export_onnx, make_policy, save_policy
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot, load_robot
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.track import TrackTask
 
 EPISODE = 50  # cycles, of hostile motion
 LIBFRANKA = ROOT / "examples" / "libfranka"
@@ -304,6 +308,16 @@ def test_the_bundle_is_whole(exported, runtime):
     assert contract["observation"]["size"] == len(exported.task.observation_scale(exported.robot)[0])
 
 
+def test_the_runtime_says_what_a_bundle_wants(exported, runtime, tmp_path, monkeypatch, capsys):
+    """`python bundle/r2s_runtime.py bundle`, and where there is none."""
+    monkeypatch.setattr(sys, "argv", ["r2s_runtime.py", str(exported.folder)])
+    assert runtime.main() == 0
+    assert "policy 50 Hz, torque without gravity at 1000 Hz" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["r2s_runtime.py", str(tmp_path)])
+    assert runtime.main() == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_the_card_says_where_it_was_measured_and_where_not(exported):
     card = (exported.folder / "MODEL_CARD.md").read_text()
     assert "| twin (there) | 100.0 | - | 90.0 |" in card
@@ -312,6 +326,39 @@ def test_the_card_says_where_it_was_measured_and_where_not(exported):
     untried = next(line for line in card.splitlines() if line.startswith("Not tried:"))
     assert "panda" in untried
     assert "twin" not in untried
+
+
+def test_the_card_of_a_policy_that_follows_paths_says_errors_in_mm(exported, tmp_path):
+    """Whatever a run's rows measure: no word of points, columns of paths, transfers beside it."""
+    run = tmp_path / "train" / "drawn"
+    row = {"path_rmse_mm": 1.234, "path_max_mm": 3.0, "within_2mm": 0.9, "within_5mm": 1.0, "stopped": 0.0}
+    best = row | {"env_steps": 9, "updates": 3}
+    for folder, said in ((run, {"best": best}), (tmp_path / "transfer/t", {"twin": row})):
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text(json.dumps(said))
+        (folder / "meta.json").write_text(json.dumps({"status": "done", "parents": [str(run)]}))
+    config = yaml.safe_load((exported.run / "config.yaml").read_text())
+    contract = json.loads((exported.folder / "contract.json").read_text())
+    said = card(run, config, {}, contract, exported.folder, ["twin", "dart"])
+    head, table = " ".join(map(str, next(iter(said.values())))), said["Measured"][0]
+    assert "follows timed paths" in head
+    assert "points" not in head
+    assert isinstance(table, pd.DataFrame)
+    assert list(table.index) == ["MuJoCo, as trained, goals on which nothing was chosen", "twin (t)"]
+    assert table.loc["twin (t)", "RMSE, mm"] == "1.23"
+    assert said["Not tried"][0] == "Not tried: dart."
+
+
+@pytest.mark.parametrize(("base", "said"), [("model", "and its actions are added to what it "), ("none", "numbers;")])
+def test_a_policy_that_needs_a_plan_does_not_travel(panda, base, said):
+    """task=track: in one line, before anything is written."""
+    settings = conf("task/track") | {"reach": (0.3, 0.75), "torque_fraction": 0.12, "base": base}
+    settings |= {k: tuple(settings[k]) for k in ("speed", "size", "kinds")}
+    task = TrackTask(**settings).believing(panda, Dynamics.of(panda, np.zeros((panda.n, 3))))
+    with pytest.raises(UserError, match="does not travel: its goals are plans of 404 x 27 numbers") as refused:
+        make_contract(panda, task, np.zeros(panda.n))
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_the_runtime_needs_numpy_and_onnxruntime_alone():

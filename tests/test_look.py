@@ -2,10 +2,12 @@
 
 import base64
 import json
+import multiprocessing
 import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -14,17 +16,26 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import psutil
 import pytest
 import yaml
 from conftest import ROOT, conf
 
 from r2s import cli
 from r2s.errors import UserError
+from r2s.reporting import look
 from r2s.reporting.run_list import ago, run_rows
 from r2s.reporting.viewer_layout import Overlay
 from r2s.runs import status_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+WRAPPER = """
+import pathlib, subprocess
+inner = subprocess.Popen(["sleep", "60"])
+pathlib.Path("part").write_text(str(inner.pid))
+pathlib.Path("part").rename("pid")
+inner.wait()
+"""
 GONE = 2**22 - 3  # a process id beyond what Linux gives by default
 
 
@@ -154,12 +165,10 @@ def test_what_cannot_be_looked_at_is_one_line(root, monkeypatch, capsys):
 
 def test_only_this_computer_is_served(monkeypatch):
     """`--web` binds to the loopback address."""
-    from r2s.reporting import look
-
     seen = []
 
     class Viewer:
-        def __init__(self, words):
+        def __init__(self, words, **_):
             seen.extend(words)
 
         def poll(self):
@@ -168,13 +177,25 @@ def test_only_this_computer_is_served(monkeypatch):
         def wait(self):
             return 1
 
-        def terminate(self):
-            pass
-
     monkeypatch.setattr(look.subprocess, "Popen", Viewer)
     with pytest.raises(UserError, match="exit status 1"):
         look.show_in_browser([Path("recording.rrd")], 9090)
     assert seen[seen.index("--bind") + 1] == "127.0.0.1"
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_a_viewer_ends_with_its_command(by, tmp_path, monkeypatch):
+    """Interrupted or terminated, alone and not its group, the command takes along what the viewer has started."""
+    (tmp_path / "rerun.py").write_text(WRAPPER)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    command = multiprocessing.get_context("fork").Process(target=look.open_native, args=([],))
+    command.start()
+    inner = psutil.Process(int(waited(lambda: Path("pid").exists() and Path("pid").read_text())))
+    os.kill(command.pid, by)
+    command.join(20)
+    assert command.exitcode not in (None, 0)
+    assert waited(lambda: not inner.is_running() or inner.status() == psutil.STATUS_ZOMBIE)
 
 
 @pytest.mark.slow

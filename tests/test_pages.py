@@ -25,7 +25,8 @@ ELSEWHERE = {  # what this file does not type, and why
     r"(source|rerun|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) ": "the shell; programs of others, which wait",
     r"python benchmarks/": "takes minutes to hours; its page names the machine that it ran on",
     r"python( -m r2s| run.py)$": "names of doors: test_wheel.py, and every other command",
-    r"r2s (list|look|export)$": "names of commands: test_look.py, test_export.py",
+    r"(python run.py|r2s) (list|look|export)( RUN| runs/train/NAME)?$": "named alone: test_look.py, test_export.py",
+    r"(python bundle/r2s_runtime.py|g\+\+) ": "test_export.py; the loop itself needs an arm",
     r"pytest -m gazebo$": "needs Gazebo",
     r"python run.py resume=": "test_cli.py kills a run first",
     r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli.py runs two of them",
@@ -56,6 +57,8 @@ def test_every_command_is_typed_by_a_test():
     """What is left is a command of r2s, so that it can be; and no reason is there without its command."""
     left = [c for typed in TYPED.values() for c in typed]
     assert not [c for c in left if not c.startswith(("python run.py ", "r2s "))]
+    others = {page.name: re.findall(r"^```(?!bash)\w*\n(.*?)^```", page.read_text(), re.S | re.M) for page in PAGES}
+    assert not [(k, b) for k, blocks in others.items() for b in blocks if re.search(f"^{PROGRAM}", b, re.M)]
     everything = [c for page in PAGES for c in commands(page)]
     assert not [k for k in ELSEWHERE if not any(re.match(k, c) for c in everything)]
     assert not [k for k in INSTEAD if not any(k in c for c in everything)]
@@ -78,16 +81,18 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
         if words[0] not in ("list", "look", "--help"):
             words += TOY
             name = next((w.removeprefix("name=") for w in words if w.startswith("name=")), None)
-            if name and f"runs/identify/{name}/ramps.npz" in page.read_text() and "data=recording" not in words:
+            named = name and f"runs/identify/{name}/ramps.npz" in page.read_text()
+            if named and "stage=identify" in words and "data=recording" not in words:
                 words.append("data.ramp_poses=1")
         succeed(*words, at=tmp_path)
 
 
 def test_the_site_leads_to_every_page():
-    """mkdocs.yml has each page of docs/ once, besides those that are made."""
+    """mkdocs.yml has each page of docs/ once, besides those that are made; no page links to what the site lacks."""
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     found = re.findall(r"(\S+\.md)$", yaml.safe_dump(nav), flags=re.M)
     assert sorted(found) == sorted(["index.md", *(p.name for p in DOCS.glob("*.md"))])
+    assert not [p.name for p in DOCS.glob("*.md") if "](../" in p.read_text()]
 
 
 def opened(browser: str, page: str, picture: Path, folder: Path) -> tuple[str, list[str]]:

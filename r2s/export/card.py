@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from r2s.reporting.document import Item
+from r2s.reporting.measures import shown
 from r2s.reporting.tables import reach_rows
 
 LEFT_OUT = ("_target_", "name")
@@ -30,15 +31,15 @@ def card(
         places: names of the simulators and arms that there are.
     """
     summary = json.loads((source / "summary.json").read_text())
+    best = summary["best"]
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
     title = f"{config['algo']['name']} for {contract['robot']}, {source.name}"
     head: list[Item] = [
         f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}; the driver's law "
         f"makes of it what an arm may be sent at {rates['cycle_hz']} Hz. contract.json says all of it in numbers.",
-        "It reaches points and stays there. It knows nothing of what stands around the arm, of people, and of its "
-        "own links: it may reach through itself.",
+        f"{shown(best).does} It knows nothing of what stands around the arm, of people, and of its own links: it may "
+        "reach through itself.",
     ]
-    best = summary["best"]
     trained: list[Item] = [
         [
             f"algorithm: {settings(config['algo'])}",
@@ -52,7 +53,7 @@ def card(
     if not (bundle / "model" / "arm.sdf").is_file():
         trained.append(NO_SDF)
     rows = {"MuJoCo, as trained, goals on which nothing was chosen": best}
-    measured = transfers(source)
+    measured = transfers(source, shown(best).judged[0])
     for place, row in measured.items():
         rows[place] = row
     done: list[Item] = [reach_rows({k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})]
@@ -100,8 +101,8 @@ def model(source: Path, config: Mapping[str, Any]) -> str:
     return f"model: identified, from {', '.join(f'{k} {v}' for k, v in said.items())} (parameters.yaml)"
 
 
-def transfers(source: Path) -> dict[str, dict[str, Any]]:
-    """Return what the finished transfers of a policy beside it measured: place and run -> its row."""
+def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
+    """Return what the finished transfers of a policy beside it measured, by place and run: rows with `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:
@@ -111,7 +112,7 @@ def transfers(source: Path) -> dict[str, dict[str, Any]]:
             if meta["status"] not in ("done", "stopped") or source.resolve().parts[-2:] not in parents:
                 continue
             for place, row in json.loads(path.read_text()).items():
-                if place != "predicted" and np.isfinite(row.get("success_1cm", np.nan)):
+                if place != "predicted" and np.isfinite(row.get(measure, np.nan)):
                     found[f"{place} ({path.parent.name})"] = row
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue  # not whole, or not ours

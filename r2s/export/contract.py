@@ -17,7 +17,7 @@ from r2s.physics.actuation import low_pass_factor
 from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.tasks.task import Entry, Task
+from r2s.tasks.task import Entry, State, Task
 
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
@@ -40,8 +40,9 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
             kg m^2, what the law believes of them; None: the robot's.
 
     Raises:
-        UserError: the task does not say how its observations are made.
+        UserError: the task does not say how its observations are made, or needs what no runtime of a bundle has.
     """
+    travels(robot, task)
     links, hand = chain(robot, Dynamics.of(robot, np.zeros((robot.n, 3))), friction=False)
     rows = (
         {"name": k.name, "place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis, "mass": k.mass}
@@ -77,6 +78,21 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
         },
         "law": {"units": UNITS, "joint": of_joints(robot, task, friction), "number": numbers(task)},
     }
+
+
+def travels(robot: Robot, task: Task) -> None:
+    """Raise UserError where a runtime, which takes a point and sends what the policy says, could not do a task."""
+    goals, torque = task.goals(robot, np.random.default_rng(0), 1), task.torque(robot)
+    needs, numbers = [], " x ".join(map(str, goals.shape[1:]))
+    if goals.shape != (1, 3):
+        needs.append(f"its goals are plans of {numbers} numbers")
+    if not np.allclose(task.target(np.ones((1, robot.n)), State.still(robot), goals, torque), torque):
+        needs.append("its actions are added to what it computes with a model")
+    if needs:
+        raise UserError(
+            f"export: a policy of {type(task).__name__} does not travel: {' and '.join(needs)}; the runtime of "
+            "a bundle takes points and has no model's torque to add to. stage=transfer runs it"
+        )
 
 
 def observation(robot: Robot, task: Task) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -68,29 +70,45 @@ def has_screen() -> bool:
 
 def open_native(recordings: Sequence[Path]) -> None:
     """Open the viewer on recordings and wait until it is closed."""
-    _ended(subprocess.Popen([sys.executable, "-m", "rerun", *map(str, recordings)]))
+    with _viewer(map(str, recordings)):
+        pass
 
 
 def show_in_browser(recordings: Sequence[Path], port: int) -> None:
     """Serve the viewer to browsers on this computer alone, at `port`, until Ctrl-C."""
     words = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), "--port", str(port + 1)]
-    process = subprocess.Popen([sys.executable, "-m", "rerun", *words, *map(str, recordings)])
-    time.sleep(0.5)
-    if process.poll() is None:
-        source = f"rerun%2Bhttp://{LOOPBACK}:{port + 1}/proxy"
-        print(f"look: http://{LOOPBACK}:{port}/?url={source} (Ctrl-C ends it)", flush=True)
-    _ended(process)
+    with _viewer([*words, *map(str, recordings)]) as process:
+        time.sleep(0.5)
+        if process.poll() is None:
+            source = f"rerun%2Bhttp://{LOOPBACK}:{port + 1}/proxy"
+            print(f"look: http://{LOOPBACK}:{port}/?url={source} (Ctrl-C ends it)", flush=True)
 
 
-def _ended(process: subprocess.Popen) -> None:
-    """Wait for the viewer; take it along where this process is interrupted.
+@contextmanager
+def _viewer(words: Iterable[str]) -> Iterator[subprocess.Popen]:
+    """Start the viewer, and wait for it; it ends with this process, also where that is interrupted or terminated.
 
     Raises:
         UserError: it failed.
     """
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    # a session of its own: `python -m rerun` starts another process, and does not take it along
+    process = subprocess.Popen([sys.executable, "-m", "rerun", *words], start_new_session=True)
     try:
+        yield process
         status = process.wait()
     finally:
-        process.terminate()
+        if process.poll() is None:
+            _end_group(process)
+        signal.signal(signal.SIGTERM, before)
     if status:
         raise UserError(f"the rerun viewer ended with exit status {status}, see above")
+
+
+def _end_group(process: subprocess.Popen) -> None:
+    """End a process and those that it started, where the system has groups."""
+    if sys.platform == "win32":
+        process.terminate()
+    else:
+        os.killpg(process.pid, signal.SIGTERM)
+    process.wait()

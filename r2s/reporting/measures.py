@@ -36,6 +36,7 @@ class Shown:
         row: columns of a table, a row each simulator or arm. compared: those of trainings side by side.
         curves: of learning figures. judged: the two that trainings are compared by, of which the first selects.
         scored: those of the figure of scores. error: of the figure of episodes, what a distance is called.
+        does: what a policy of it does, in a sentence.
     """
 
     known: Mapping[str, Measure]
@@ -46,6 +47,7 @@ class Shown:
     judged: tuple[str, str]
     scored: tuple[str, ...]
     error: str
+    does: str
 
 
 RETURN = "return, eq. (2) over 4 s"
@@ -66,6 +68,7 @@ REACH = Shown(
     judged=("success_1cm", "return_paper"),
     scored=("success_1cm", "success_5mm", "distance_median_m", "return_paper"),
     error="distance to the goal",
+    does="It reaches points with its hand and stays there.",
 )
 TRACK = Shown(
     known={
@@ -86,6 +89,7 @@ TRACK = Shown(
     judged=("within_5mm", "path_rmse_mm"),
     scored=("path_rmse_mm", "path_max_mm", "within_5mm", "return_track"),
     error="error of the path",
+    does="It follows timed paths with its hand; an error is how far that is from where it is to be.",
 )
 ALL = {**REACH.known, **TRACK.known}
 

@@ -104,7 +104,10 @@ def _read(folder: Path) -> Trained:
     if curve.empty:
         raise ValueError("no evaluation")
     measures = shown(curve.columns).compared
-    if not np.isfinite(curve[["env_steps", "wall_clock_s", *measures]].astype(float).to_numpy()).all():
+    last = json.loads((folder / "summary.json").read_text())["last"]
+    last = {k: np.nan if v is None else float(v) for k, v in last.items()}  # null: no episode had one
+    rows = curve[["env_steps", "wall_clock_s", *measures]].astype(float).to_numpy()
+    if not np.isfinite([*rows.ravel(), *(last[m] for m in measures)]).all():
         raise ValueError("an evaluation that is not finite")
     return Trained(
         folder,
@@ -117,7 +120,7 @@ def _read(folder: Path) -> Trained:
         typed.get("experiment") == "toy",
         None if budget.get("env_steps") else budget.get("minutes"),
         curve,
-        {k: float(v) for k, v in json.loads((folder / "summary.json").read_text())["last"].items()},
+        last,
     )
 
 
