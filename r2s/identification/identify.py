@@ -1,8 +1,8 @@
 """Real2Sim: find friction, inertia, offsets and delay that make the simulated arm do what the recorded one did.
 
 `identify` goes: friction family (compared on motion left out, with family=auto) -> the searches one after the other
--> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found (block
-bootstrap). The paper's algorithm is search=ga on the residual of eq. (8).
+-> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found. The paper's
+algorithm is search=ga on the residual of eq. (8).
 """
 
 import json
@@ -74,7 +74,7 @@ def identify(
         searches: at least one.
         settings: what is searched, within what, and how the residuals are made.
         ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
-        seed: of the bootstrap.
+        seed: of the draws of what was found.
         nthread: 0 is all.
         report: called with a row of history after every step or generation.
         memo: called with the name of a step and a function that does it, returns its result; it may remember.
@@ -218,7 +218,7 @@ def identify(
         space = replace(space, nominal=replace(space.nominal, hold=rule, dq_min=dq_min))
         if ramps is None:
             space = replace(space, nominal=replace(space.nominal, breakaway=np.asarray(found["edges"])))
-    sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
+    sure = step("posterior", lambda: posterior(problem, u, seed)._asdict())
     return conclude(problem, space, sure, pd.DataFrame(history), families, edges, refused)
 
 

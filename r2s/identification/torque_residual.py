@@ -23,7 +23,7 @@ STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's c
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
 LEAST = 1e-9  # Nm, of a deviation
 BENT = 4.0  # presliding distances, after which bristles are as bent as they get: all but 2 %
-BLOCK_S = 0.5  # s, stretches that the bootstrap draws
+BLOCK_S = 0.5  # s, stretches whose errors count as independent
 
 
 class TorqueResidual:
