@@ -40,7 +40,7 @@ def bending(
 
     Args:
         dynamics: everything else. quick: on the level of torque. bounds, prior: of presliding, as of all others.
-        seed: of the bootstrap.
+        seed: of draws of the joint distribution.
     """
     space = parameter_space(robot, dynamics, {NAME: bounds[NAME]})
     data = ReplayResidual(

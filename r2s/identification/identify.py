@@ -1,8 +1,8 @@
 """Real2Sim: find friction, inertia, offsets and delay that make the simulated arm do what the recorded one did.
 
 `identify` goes: friction family (compared on motion left out, with family=auto) -> the searches one after the other
--> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found (block
-bootstrap). The paper's algorithm is search=ga on the residual of eq. (8).
+-> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found. The paper's
+algorithm is search=ga on the residual of eq. (8).
 """
 
 import json
@@ -74,7 +74,7 @@ def identify(
         searches: at least one.
         settings: what is searched, within what, and how the residuals are made.
         ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
-        seed: of the bootstrap.
+        seed: of the draws of what was found.
         nthread: 0 is all.
         report: called with a row of history after every step or generation.
         memo: called with the name of a step and a function that does it, returns its result; it may remember.
@@ -137,9 +137,9 @@ def identify(
     quick = TorqueResidual(robot, space, recording, **level)
     data: ReplayResidual | TorqueResidual = quick
     edges = breakaway(ramps) if commanded and ramps is not None else None  # a link-side sensor hides the motor's
-    started_on_level = getattr(searches[0], "level", "") == "torque"
+    started_on_level, replayed = on_level(searches[0]), not all(map(on_level, searches))
     # how far the bristles are bent where a window starts nobody measured: replays would put right what is right
-    if commanded and not (nominal.family.has_memory and started_on_level):
+    if commanded and replayed and not (nominal.family.has_memory and started_on_level):
         data = ReplayResidual(
             *(robot, space, recording),
             window_s=settings.window_s,
@@ -163,14 +163,13 @@ def identify(
 
     def ended(name: str, search: Search, u: np.ndarray, report: Report = told) -> np.ndarray:
         u = np.asarray(step(name, lambda: {"u": search(problem, u, report)})["u"])
-        if getattr(search, "level", "") == "torque":  # it weighs as it goes on; one that is remembered does not
+        if on_level(search):  # it weighs as it goes on; one that is remembered does not
             problem.quick_data.adapt(space.from_unit(u), fitted=True)
         return u
 
     for k, search in enumerate(searches):
-        on_level = getattr(search, "level", "") == "torque"
         v = ended(f"search {k + 1}", search, u)
-        if commanded and on_level and not k and answers_early(problem, v):
+        if commanded and on_level(search) and not k and answers_early(problem, v):
             quick.ahead = EARLY * SIM_DT
             v = ended("search 1, early", search, v)
         if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
@@ -178,7 +177,7 @@ def identify(
             break
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
-        problem.adapt(u, fitted=k == len(searches) - 1 or on_level)
+        problem.adapt(u, fitted=k == len(searches) - 1 or on_level(search))
     if data is quick and commanded and PRESLIDING in space.blocks:
 
         def bends() -> dict[str, np.ndarray]:
@@ -219,8 +218,13 @@ def identify(
         space = replace(space, nominal=replace(space.nominal, hold=rule, dq_min=dq_min))
         if ramps is None:
             space = replace(space, nominal=replace(space.nominal, breakaway=np.asarray(found["edges"])))
-    sure = step("bootstrap", lambda: posterior(problem, u, seed)._asdict())
+    sure = step("posterior", lambda: posterior(problem, u, seed)._asdict())
     return conclude(problem, space, sure, pd.DataFrame(history), families, edges, refused)
+
+
+def on_level(search: Search) -> bool:
+    """Say whether a search minimises the residual on the level of torque, and needs no replays."""
+    return getattr(search, "level", "") == "torque"
 
 
 def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:

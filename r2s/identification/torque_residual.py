@@ -23,7 +23,7 @@ STEP = 1e-4  # of the unit cube: far above round-off, far below the residual's c
 LONGEST = 40  # rows: a residual that drifts slowly is not one single row
 LEAST = 1e-9  # Nm, of a deviation
 BENT = 4.0  # presliding distances, after which bristles are as bent as they get: all but 2 %
-BLOCK_S = 0.5  # s, stretches that the bootstrap draws
+BLOCK_S = 0.5  # s, stretches whose errors count as independent
 
 
 class TorqueResidual:
@@ -70,7 +70,9 @@ class TorqueResidual:
         self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(self._gravity @ self._nominal)
         self._sin, self._cos = m.rows(np.sin(m.q)), m.rows(np.cos(m.q))
-        self._sign = {False: m.filtered(np.tanh(m.fast / WIDTH_DQ)), True: m.filtered(m.bristle)}  # by has_memory
+        # by has_memory; a joint that slides has all of its friction, however slow: no law turns in such rows
+        self._way = {False: np.sign(m.fast) if slowest else np.tanh(m.fast / WIDTH_DQ), True: m.bristle}
+        self._sign = {memory: m.filtered(way) for memory, way in self._way.items()}
         block = (m.t / block_s).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
         self.ahead = 0.0  # s, half a step of a simulator that made the recording: `answers_early`
@@ -105,7 +107,7 @@ class TorqueResidual:
         A simulator's step knows the velocity of the step before, `ahead` s too old, and makes up for it where
         friction rises: it solves for that at the step's end.
         """
-        m, bristle = self.motion, self.motion.bristle if d.family.has_memory else None
+        m, bristle = self.motion, self._way[d.family.has_memory]
         if not self.ahead:
             return d.friction(m.fast, bristle)
         old, coming = (m.fast + s * self.ahead * m.ddq for s in (-1.0, 1.0))

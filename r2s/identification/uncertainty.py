@@ -105,14 +105,16 @@ class Posterior(NamedTuple):
 
 
 def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
-    """Return draws of the joint distribution about the result u (P,), by a linearised block bootstrap.
+    """Return draws of the joint distribution about the result u (P,): normal, of a covariance from blocks.
 
-    Errors within a window are correlated, so windows are drawn with replacement (Kuensch 1989), and the belief is
-    drawn from its prior each time; each draw is one Gauss-Newton step from u. Where the data say nothing a draw is
-    one of the prior's. A fit follows each of few windows, so what it leaves of one is less than the error, by its
-    share in what is known (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). A bootstrap of few windows is
-    too narrow where single windows decide, so in no direction does it fall below what the residual's own variance
-    gives. Draws are centred on their median: a few of them may go far.
+    Errors within a window are correlated, so what scatters is a window's whole score, its part of the gradient: the
+    covariance is H^-1 (sum of s s^T + belief) H^-1 (White, Econometrica 48(4), 1980; of clusters Liang and Zeger,
+    Biometrika 73(1), 1986). Where the data say nothing a draw is one of the prior's. A fit follows each of few
+    windows, so what it leaves of one is less than the error, by its share in what is known (CR2 of Bell and
+    McCaffrey, Survey Methodology 28(2), 2002). What all scores have in common is no scatter: at a bound it is not 0.
+    Few windows are too narrow where single ones decide, so in no direction does the covariance fall below what the
+    residual's own variance gives. A bootstrap, which draws windows, would draw some H that hardly know of a value
+    that few windows tell, and the tails of that are no belief.
     """
     rng = np.random.default_rng(seed)
     residual, jacobian = problem.jacobian(u)
@@ -124,8 +126,8 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     j, r = j[order], r[order]
     gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
     score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
-    rest, known = jacobian[rows:], residual[rows:]
-    belief, pull = rest.T @ rest, rest.T @ known
+    rest = jacobian[rows:]
+    belief = rest.T @ rest
     told = j.any(1)  # rows that fill a window up have neither a residual nor a slope
     factor = max(1.0, float(np.sqrt(np.mean(r[told] ** 2)))) if told.any() else 1.0
     information = gram.sum(0)
@@ -135,45 +137,41 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     left = np.maximum(1.0 - share, LEAST_LEFT)[..., None]
     within = axes @ ((axes.swapaxes(1, 2) @ (root.T @ score[..., None])) / np.sqrt(left))
     score = np.linalg.solve(root.T, within[..., 0].T).T
-    steps = np.empty((DRAWS, p))
-    for k in range(DRAWS):
-        times = rng.multinomial(count, np.full(count, 1 / count)).astype(float)
-        believed = pull - rest.T @ rng.standard_normal(len(rest))
-        h = np.tensordot(times, gram, 1) + belief
-        steps[k] = -np.linalg.solve(h, times @ score + believed)
-    own = covariance @ np.linalg.cholesky(factor**2 * information + belief)
-    steps = _at_least(own, steps - np.median(steps, axis=0))
+    score -= score.mean(0)
+    own, windows = (covariance @ np.linalg.cholesky(m + belief) for m in (factor**2 * information, score.T @ score))
+    steps = rng.standard_normal((DRAWS, p)) @ _at_least(own, windows).T
     return Posterior(u, _inside(u, steps, information + belief), information)
 
 
-def _at_least(root: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return steps (S, P), stretched in the directions in which they scatter less than root root^T (P, P) says.
+def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return root (P, P) of a covariance root root^T, more where that is less than least least^T says.
 
     In directions, not parameter by parameter: what two that trade make together is known far better than either.
     """
-    white = np.linalg.solve(root, steps.T).T
-    seen, axes = np.linalg.eigh(white.T @ white / len(white))
-    return (white @ axes) / np.sqrt(np.clip(seen, 1e-12, 1.0)) @ axes.T @ root.T
+    axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
+    return least @ (axes * np.maximum(seen, 1.0))
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return steps (S, P) that end in the cube: values that would leave it stop there, and the others make up for it.
 
     h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry that is at its bound,
-    to stop one of them alone would change what they make together.
+    to stop one of them alone would change what they make together. One at a time, the farthest first: of two that
+    trade and are both out, the other comes back by itself.
     """
     steps = steps.copy()
     for step in steps:
         stopped = np.zeros(len(u), dtype=bool)
         for _ in range(len(u)):
-            out = np.abs(u + step - 0.5) > 0.5 + 1e-12
-            if not out.any():
+            out = np.abs(u + step - 0.5) - 0.5
+            k = int(out.argmax())
+            if out[k] < 1e-12:
                 break
-            stopped |= out
-            change = np.where(out, np.clip(u + step, 0.0, 1.0) - u - step, 0.0)
+            stopped[k] = True
             free = ~stopped
-            change[free] = -np.linalg.solve(h[np.ix_(free, free)], h[np.ix_(free, out)] @ change[out])
-            step += change
+            change = np.clip(u[k] + step[k], 0.0, 1.0) - u[k] - step[k]
+            step[k] += change
+            step[free] -= np.linalg.solve(h[np.ix_(free, free)], h[free, k] * change)
     return np.clip(u + steps, 0.0, 1.0) - u
 
 

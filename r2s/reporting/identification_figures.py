@@ -174,7 +174,7 @@ def whiteness_figure(
 ) -> Path:
     """Draw the autocorrelation of torque errors {label: (T, n)} over t (T,) s, with that of filtered white noise.
 
-    `cutoff_hz` is of the zero-phase filter behind t, `block_s` the length of the bootstrap's blocks.
+    `cutoff_hz` is of the zero-phase filter behind t, `block_s` the length of the intervals' blocks.
     """
     colour = colours(error)
     lags, white, band = _filtered_white(t, cutoff_hz)
@@ -185,7 +185,7 @@ def whiteness_figure(
             axis.fill_between(lags, white - band, white + band, color="#9aa0a6", alpha=0.35, linewidth=0, label=name)
             for label, e in error.items():
                 axis.plot(lags, autocorrelation(t, e[:, [j]], len(lags))[:, 0], color=colour[label], label=label)
-            axis.axvline(block_s, color="#555555", linewidth=0.8, linestyle=":", label="block of the bootstrap")
+            axis.axvline(block_s, color="#555555", linewidth=0.8, linestyle=":", label="block of the intervals")
             axis.set_title(f"joint {j + 1}", loc="left")
             axis.set(xlabel="lag, s", ylabel="autocorrelation", xlim=(0, lags[-1]), ylim=(-1, 1.03))
     return path

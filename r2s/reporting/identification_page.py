@@ -91,7 +91,7 @@ def identification_sections(
         "What the data cannot tell": doubts(found),
         "Residual": [
             "What the identified model leaves unexplained of the held-out torque. White is what is left when a model "
-            "explains everything; a residual that stays correlated for longer than a block of the bootstrap makes "
+            "explains everything; a residual that stays correlated for longer than a block of the intervals makes "
             "intervals too narrow.",
             whiteness,
             *shown("whiteness"),
