@@ -1,8 +1,8 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
 A reward is a weighted sum of terms. Three of them are not in the paper: a bonus for precision, a price of moving
-where precision is, and a price of asking for what the law does not let through. The replay buffer keeps the terms. So when the curriculum moves its
-weights, every stored transition is worth what the present weights say.
+where precision is, and a price of asking for what the law does not let through. The replay buffer keeps the terms. So
+when the curriculum moves its weights, every stored transition is worth what the present weights say.
 """
 
 from collections.abc import Sequence
