@@ -4,6 +4,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from r2s.errors import check_number
+from r2s.stages.adapting import is_taught, teach
 from r2s.stages.build import (
     Evaluation,
     called,
@@ -38,6 +39,8 @@ CALIBRATION = ("parameters.yaml", "posterior.npz")  # of an identification, kept
 
 def reads(cfg):
     """Return the keys of the config that this stage reads."""
+    if is_taught(cfg):
+        return {"robot", "task", "calibration", "adapt"}
     keys = {"robot", "dr", "algo", "task", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
@@ -64,6 +67,8 @@ def train(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.tasks.rewards import Curriculum
 
+    if is_taught(cfg):
+        return teach(cfg, overrides, keep_calibration)
     if not is_learner(cfg):
         return reference(cfg, overrides)
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
