@@ -1,14 +1,15 @@
 """The league of adapters (docs/adaptation.md): one frozen controller, what nobody announced, and who copes.
 
-`python benchmarks/adapters.py [root=RUNS] [task=reach] [policy=FOLDER] [adapters=none,observer,rls] [episodes=N] TWIN ...`
-TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to 2_209.
-Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root), under
-computed torque, or under a training's policy. Rows go to ROOT/bench/adapters.csv, each only once, and the table of what is
-there is printed: means over twins and episodes with paired 95 % bootstrap intervals.
+`python benchmarks/adapters.py [root=RUNS] [task=reach] [policy=FOLDER] [adapters=NAME,...] [episodes=N] TWIN ...`
+TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to
+2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
+under computed torque, or under a training's policy; adapt=history with a network of its own (two minutes of a core).
+Rows go to ROOT/bench/adapters.csv, each only once, and the table of what is there is printed: means over twins and
+episodes with paired 95 % bootstrap intervals.
 
-Conditions: a payload of 0, 0.5, 1.0, 1.5 kg put on at U(0.5, 1.5) s, its centre uniform within 7.5 cm; friction that has
-warmed to 0.8 of what it was when the arm was identified; commands that come 5 ms later. Judged is from 1 s after the
-payload, the same seconds of the same episodes in all conditions.
+Conditions: a payload of 0, 0.5, 1.0, 1.5 kg put on at U(0.5, 1.5) s, its centre uniform within 7.5 cm; friction that
+has warmed to 0.8 of what it was when the arm was identified; commands that come 5 ms later. Judged is from 1 s after
+the payload, the same seconds of the same episodes in all conditions.
 """
 
 import sys
@@ -32,7 +33,7 @@ from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import load_policy
 from r2s.physics.payload import FARTHEST_M, Payload, ball
 from r2s.physics.robot import SIM_DT
-from r2s.stages.adapting import calibrated
+from r2s.stages.adapting import BESIDE, calibrated
 from r2s.tasks.episode import HOLD_S, rollout
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.track import TrackTask
@@ -103,12 +104,12 @@ def carried(rng: np.random.Generator, mass: float) -> Payload:
     return Payload(np.array(mass), far * way / np.linalg.norm(way), ball(np.array(mass)), on)
 
 
-def one(name: str, task, under: str, condition: str, adapter: str, known, policy, episodes) -> list[dict]:
+def one(name: str, task, under: str, condition: str, adapter: str, known, policy, episodes, networks) -> list[dict]:
     """Return a row per episode of one twin, condition and adapter."""
     make, seed = (int(x) for x in name.split("_"))
     given, rows, (starts, goals, predicted) = CONDITIONS[condition], [], episodes
     arm, commanded = opened(make, seed, **given)
-    works = None if adapter == "none" else made_of(adapter, known)
+    works = None if adapter == "none" else made_of(adapter, known, networks / f"net_m{name}")
     driven = DrivenArm(commanded, task, known.dynamics.level, adapter=works)
     for k in range(len(goals)):
         thing = carried(np.random.default_rng([make, seed, k]), given.get("mass", 0.0))
@@ -123,14 +124,16 @@ def one(name: str, task, under: str, condition: str, adapter: str, known, policy
             {"twin": name, "under": under, "condition": condition, "adapter": adapter, "episode": k}
             | {"rmse": np.sqrt((error**2).mean()), "within_5mm": (error < 5).mean(), "reached": held < 0.01}
             | {"gap": np.sqrt((gap**2).mean()), "stopped": int(ended)}
-            | {"us": 1e6 * np.mean(driven.timing.adapter) if works else 0.0}
+            | {"us": 1e6 * np.median(driven.timing.adapter) if works else 0.0}
         )
     return rows
 
 
-def made_of(adapter: str, known):
+def made_of(adapter: str, known, network: Path):
     """Return an adapter with the settings of conf/adapt."""
-    settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", "calibration")}
+    settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", *BESIDE)}
+    if "network" in settings:
+        settings["network"] = network
     return getattr(made, adapter)(known, **settings)
 
 
@@ -172,7 +175,7 @@ def told(frame: pd.DataFrame, task: str) -> str:
     table = table[[c for a in names for c in table.columns if c.endswith(f": {a}")]]
     cost = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'us'].mean():.0f}" for a in names)
     stops = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'stopped'].sum():.0f}" for a in names)
-    return f"{markdown(table.T.rename_axis(task))}\n\nµs a cycle: {cost}. Stops: {stops}. Nothing here was trained."
+    return f"{markdown(table.T.rename_axis(task))}\n\nµs a cycle: {cost}. Stops: {stops}."
 
 
 def main() -> None:
@@ -189,6 +192,12 @@ def main() -> None:
         ["stage=identify", "arm=twin", f"arm.make={n[0]}", f"arm.seed={n[2:]}", f"root={root}", f"name=m{n}"]
         for n in names
         if not (root / "identify" / f"m{n}" / "posterior.npz").is_file()
+    )
+    taught = ["adapt=history", "task=track", f"root={root}"]
+    side_by_side(
+        [*taught, f"calibration={root / 'identify' / f'm{n}'}", f"name=net_m{n}"]
+        for n in names
+        if "history" in wanted and not (root / "train" / f"net_m{n}" / made.NETWORK).is_file()
     )
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in conf(f"task/{kind}").items()}
     bare = TASKS[kind](**settings)
@@ -210,7 +219,9 @@ def main() -> None:
                 if (same & (old["adapter"] == adapter)).sum() >= count:
                     continue
                 began = time.process_time()
-                rows = one(name, task, under, condition, adapter, known, policy(), (starts, goals, predicted))
+                rows = one(
+                    name, task, under, condition, adapter, known, policy(), (starts, goals, predicted), root / "train"
+                )
                 pd.concat([old, pd.DataFrame(rows)] if len(old) else [pd.DataFrame(rows)]).to_csv(path, index=False)
                 rmse = np.sqrt(np.mean([r["rmse"] ** 2 for r in rows]))
                 seconds = time.process_time() - began
