@@ -22,6 +22,7 @@ from r2s.arm.driver import ADDED, DEADLINE_S, Driver, Drivers
 from r2s.arm.interface import ArmStopped, Reflexes
 from r2s.arm.live import LiveArm
 from r2s.arm.simulated import SimulatedArm
+from r2s.cli import check_overrides
 from r2s.errors import UserError
 from r2s.learning.history import Lessons, fit
 from r2s.physics.dynamics import nominal_dynamics
@@ -265,6 +266,10 @@ def test_what_an_adapter_lacks_is_said_in_one_line(tmp_path):
     (tmp_path / "parameters.yaml").write_text("source: {torque: measured}\n")
     with pytest.raises(UserError, match=r"^adapt=rls: .* was identified from measured torque"):
         make_adapter(cfg, PANDA, tmp_path)
+    with pytest.raises(UserError, match=r"^adapt: no option 'obsever'; allowed: .* did you mean 'observer'"):
+        check_overrides(["stage=transfer", "adapt=obsever"], None)
+    with pytest.raises(UserError, match=r"^adapt: stage=train does not read it: adapters work on an arm"):
+        check_overrides(["adapt=observer"], None)
     with pytest.raises(UserError, match=r"filter_s"):
         observer(known(), 0.0)
 

@@ -28,6 +28,7 @@ WHY = {
     "inertia": "calibration= says what the links are",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
+    "adapt": "adapters work on an arm, with stage=transfer; of them adapt=history is trained",
     "arm": "a training meets no arm; stage=transfer does",
     "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
     "data": "only stage=identify records or reads a motion",
