@@ -9,10 +9,11 @@ import pytest
 from conftest import conf
 from omegaconf import OmegaConf
 
-from r2s.adaptation.adapters import Known, observer, rls
+from r2s.adaptation.adapters import NETWORK, Known, history, load_network, observer, rls, save_network
 from r2s.adaptation.balance import SPAN, Balance
 from r2s.adaptation.believed import believed
 from r2s.adaptation.compensation import RATE_S, thing, weigh
+from r2s.adaptation.history import SPANS, History, Network, Seen
 from r2s.adaptation.kalman import BODY, Filter
 from r2s.adaptation.noise import noise_of
 from r2s.adaptation.observer import Observer
@@ -21,7 +22,9 @@ from r2s.arm.driver import ADDED, DEADLINE_S, Driver, Drivers
 from r2s.arm.interface import ArmStopped, Reflexes
 from r2s.arm.live import LiveArm
 from r2s.arm.simulated import SimulatedArm
+from r2s.cli import check_overrides
 from r2s.errors import UserError
+from r2s.learning.history import Lessons, fit
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.payload import FARTHEST_M, MOST_KG, loaded, payload_of
 from r2s.physics.robot import SIM_DT, load_robot
@@ -263,8 +266,57 @@ def test_what_an_adapter_lacks_is_said_in_one_line(tmp_path):
     (tmp_path / "parameters.yaml").write_text("source: {torque: measured}\n")
     with pytest.raises(UserError, match=r"^adapt=rls: .* was identified from measured torque"):
         make_adapter(cfg, PANDA, tmp_path)
+    with pytest.raises(UserError, match=r"^adapt: no option 'obsever'; allowed: .* did you mean 'observer'"):
+        check_overrides(["stage=transfer", "adapt=obsever"], None)
+    with pytest.raises(UserError, match=r"^adapt: stage=train does not read it: adapters work on an arm"):
+        check_overrides(["adapt=observer"], None)
     with pytest.raises(UserError, match=r"filter_s"):
         observer(known(), 0.0)
+
+
+def test_the_history_s_network_is_shown_what_lacks():
+    """One that says the last span's balance adds what a push takes; one that says nothing adds nothing."""
+    n, seen = 7, Seen(known().arm)
+    while (shown := seen(PANDA.q_home, np.zeros(n), np.zeros(n))) is None:
+        pass
+    d = len(shown)
+    last = np.zeros((d, n))
+    last[(SPANS - 1) * n : SPANS * n] = np.diag(known().arm.level)
+    says = Network(np.zeros(d), np.ones(d), np.ones(n), (last, np.zeros(n)))
+    heard = Heard(History(known().arm, says))
+    swing(heard, push=-3.0, seconds=1.5)
+    assert abs(np.array(heard.added)[-500:, 1].mean() - 3.0) < 0.05
+    mute = Heard(History(known().arm, says._replace(size=np.zeros(n))))
+    swing(mute, push=-3.0, seconds=0.1)
+    assert not np.any(mute.added)
+
+
+def test_a_network_is_kept_for_the_model_that_it_was_taught_for(tmp_path):
+    rng = np.random.default_rng(0)
+    layers = rng.normal(size=(6, 4)), rng.normal(size=4), rng.normal(size=(4, 7)), rng.normal(size=7)
+    network = Network(rng.normal(size=6), np.ones(6), np.ones(7), layers)
+    save_network(tmp_path / NETWORK, known().arm, network)
+    kept, x = load_network(tmp_path / NETWORK, known().arm), rng.normal(size=6)
+    assert np.array_equal(kept(x), network(x))
+    with pytest.raises(UserError, match=r"was taught for another model; train it with this calibration="):
+        load_network(tmp_path / NETWORK, believed(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019"))))
+    for wrong in (None, tmp_path / "nothing"):
+        with pytest.raises(UserError, match=r"^network: '.*' is no run folder of stage=train adapt=history"):
+            history(known(), wrong)
+    with pytest.raises(UserError, match=r"dr\.payload: -1 is not allowed"):
+        Lessons(payload=(-1, 1.5))
+
+
+@pytest.mark.slow
+def test_a_network_learns_what_there_is_to_learn():
+    """A linear law, of arms that it was not taught with, and twice the same."""
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(30, 40, 6))
+    lacks = inputs @ rng.normal(size=(6, 3)) * [1.0, 0.1, 5.0]
+    (network, explained), (again, same) = (fit(inputs, lacks, Lessons(hidden=32, epochs=200), 0) for _ in range(2))
+    assert explained > 0.95
+    assert same == explained
+    assert np.array_equal(network(inputs[0, 0]), again(inputs[0, 0]))
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ def test_every_command_comes_out_of_a_driver(monkeypatch):
     decided = []
     decide = law.Drivers.__call__
 
-    def noted(self, q, dq, tau_J_d, target, added):
+    def noted(self, q, dq, tau_J_d, target, added=None):
         out = decide(self, q, dq, tau_J_d, target, added)
         decided.append(out[0].copy())
         return out

@@ -5,18 +5,24 @@ One of your own is a function of `Known` and its settings, or a class, that a ya
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from r2s.adaptation.believed import Believed, believed
 from r2s.adaptation.compensation import Compensation
+from r2s.adaptation.history import History, Network
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.listen import noise
 from r2s.adaptation.observer import Observer
+from r2s.errors import UserError
+from r2s.files import whole
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
+
+NETWORK = "network.npz"
 
 
 @dataclass(frozen=True)
@@ -53,3 +59,40 @@ def observer(known: Known, filter_s: float) -> Observer:
 def rls(known: Known) -> Compensation:
     """Return compensation by the recursive estimate: `adapt=rls`."""
     return Compensation(known.arm, known.noise)
+
+
+def history(known: Known, network: str | Path | None) -> History:
+    """Return a torque that was learnt from history: `adapt=history`.
+
+    Raises:
+        UserError: `network` is no run folder of stage=train adapt=history, or one for another arm or model.
+    """
+    path = Path(network or "") / NETWORK
+    if not network or not path.is_file():
+        raise UserError(f"network: '{network}' is no run folder of stage=train adapt=history")
+    return History(known.arm, load_network(path, known.arm))
+
+
+def save_network(path: Path, arm: Believed, network: Network) -> None:
+    """Write a network, with the friction of the arm that it was taught for, by which it is known again."""
+    arrays = {"mean": network.mean, "scale": network.scale, "size": network.size, "table": arm.table}
+    arrays |= {f"layer_{k}": a for k, a in enumerate(network.layers)}
+    with whole(path) as part:
+        np.savez(part, **arrays)  # type: ignore[arg-type]
+
+
+def load_network(path: Path, arm: Believed) -> Network:
+    """Return the network of a file for this arm.
+
+    Raises:
+        UserError: the file is damaged, or the network was taught for another arm or model.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            arrays = dict(saved)
+    except (OSError, ValueError) as error:
+        raise UserError(f"network: {path} cannot be read: {' '.join(str(error).split())}") from None
+    if not np.array_equal(arrays["table"], arm.table):
+        raise UserError(f"network: {path.parent} was taught for another model; train it with this calibration=")
+    layers = tuple(arrays[f"layer_{k}"] for k in range(len(arrays) - 4))
+    return Network(arrays["mean"], arrays["scale"], arrays["size"], layers)

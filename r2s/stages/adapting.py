@@ -1,15 +1,17 @@
 """What works under a policy on an arm: the adapter of conf/adapt, with what was identified of that arm."""
 
 import filecmp
+import time
 from dataclasses import replace
 from pathlib import Path
 
 from r2s.errors import UserError
-from r2s.stages.build import loaded, part, plain
+from r2s.stages.build import called, loaded, make_robot, make_task, open_run, part, plain, set_threads
 
 RECORDINGS = ("train.npz", "validation.npz")  # of an identification
 PARAMETERS = "parameters.yaml"
 COMPARES = "commanded"  # torque: what adapters compare motion with
+BESIDE = ("calibration", "training")  # of conf/adapt, what is no argument of the adapter
 
 
 def calibrated(calibration, robot):
@@ -59,7 +61,7 @@ def make_adapter(cfg, robot, source):
     if cfg.arm.get("load"):  # what the arm was told of is no surprise
         told = moment(robot, payload_of(plain(cfg.arm)["load"], "arm.load"))
         dynamics = replace(dynamics, told=told)
-    return part(cfg.adapt, "adapt", Known(robot, dynamics, posterior, unloaded), beside=["calibration"])
+    return part(cfg.adapt, "adapt", Known(robot, dynamics, posterior, unloaded), beside=BESIDE)
 
 
 def calibration_of(cfg, source):
@@ -82,3 +84,44 @@ def calibration_of(cfg, source):
     first = Path(first)
     same = (first / PARAMETERS).is_file() and filecmp.cmp(first / PARAMETERS, source / PARAMETERS, shallow=False)
     return first if same else source
+
+
+def is_taught(cfg):
+    """Return whether conf/adapt is learnt."""
+    return "training" in cfg.adapt
+
+
+def teach(cfg, overrides, keep):
+    """Train the network of conf/adapt for the arm of `calibration=`; keep(cfg, folder) copies what was identified."""
+    from r2s.adaptation.adapters import NETWORK, save_network
+    from r2s.adaptation.believed import believed
+    from r2s.learning import history
+    from r2s.learning.randomization import identified
+    from r2s.progress import Progress
+    from r2s.tasks.track import TrackTask
+
+    if not cfg.calibration:
+        raise UserError(f"adapt={cfg.adapt.name}: it is taught for one arm; give calibration=RUN_FOLDER")
+    set_threads(cfg)
+    robot = make_robot(cfg)
+    center, _, _ = calibrated(cfg.calibration, robot)
+    task = make_task(cfg, robot, center)
+    if not isinstance(task, TrackTask) or task.base != "model":
+        raise UserError(f"task: adapt={cfg.adapt.name} is taught on task=track with task.base=model")
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.adapt.training).items()}
+    lessons = called(history.Lessons, "adapt.training", settings)
+    draw = identified(robot, center, cfg.calibration)
+    with open_run(cfg, overrides, parents=[str(cfg.calibration)]) as run:
+        keep(cfg, run.folder)
+        began, progress = time.process_time(), Progress("listen to arms that carry something")
+
+        def shown(k, n):
+            progress(k / n, f"{k * lessons.arms} episodes")
+
+        network, explained = history.teach(robot, task, center, draw, lessons, cfg.seed, shown)
+        progress.close()
+        save_network(run.folder / NETWORK, believed(robot, center), network)
+        seconds = time.process_time() - began
+        run.summary({"adapter": cfg.adapt.name, "explained": explained, "processor_s": seconds})
+        print(f"of what arms lacked that it had not seen it tells {100 * explained:.1f} %; {seconds:.0f} s of a core")
+    print(f"written: {run.folder}")

@@ -19,6 +19,9 @@ STEPS = (
 )
 STOPPED = 3  # exit status of a step that a stopped arm has ended, as of r2s/cli.py
 MODELS = ("identified", "nominal")
+# with adapt=, what else goes to the arm: computed torque on the identified model, and its policy with the adapter
+COMPUTED, ADAPTED = "computed", "adapted"
+ROWS = {COMPUTED: "computed torque", ADAPTED: "identified model + adapter"}
 WHY = {
     "calibration": "it identifies for itself",
     "policy": "it trains its policies itself",
@@ -91,12 +94,18 @@ def front_door() -> list[str]:
     return [sys.executable, *program, *(word for path in own for word in ("--config-dir", path))]
 
 
-def check_free(root: Path, name: str) -> None:
+def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of what is trained, and of what goes to the arm."""
+    if cfg.adapt.name == "none":
+        return MODELS, MODELS
+    return (*MODELS, COMPUTED), (*MODELS, COMPUTED, ADAPTED)
+
+
+def check_free(root: Path, name: str, cfg: Any) -> None:
     """Raise UserError if a folder that a step of the chain `name` would write is there already."""
-    steps = [
-        root / "identify" / name,
-        *(root / stage / f"{name}_{m}" for stage in ("train", "transfer") for m in MODELS),
-    ]
+    steps = [root / "identify" / name]
+    for stage, each in zip(("train", "transfer"), labels(cfg), strict=True):
+        steps += [root / stage / f"{name}_{m}" for m in each]
     if taken := [str(folder) for folder in steps if folder.exists()]:
         raise UserError(f"name: {name} is taken, {taken[0]} is there already; give another name=")
 
@@ -104,32 +113,49 @@ def check_free(root: Path, name: str) -> None:
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
     """Return what a chain runs, one {label: words of a command} per step: identify, train, transfer.
 
-    The two trainings have the same recipe, time and machine, so that what differs on the arm is the model.
+    The two trainings have the same recipe, time and machine, so that what differs on the arm is the model. With an
+    adapter what the arm carries is not there while it is identified: nobody announces it.
 
     Args:
         cfg: of the pipeline. name: of this chain; its steps are named after it.
         overrides: what the user typed; each step gets what it reads.
     """
     root, choice = Path(cfg.root), chosen(overrides, cfg)
-    both = cfg.threads or os.cpu_count() or 2
+    both, adapts = cfg.threads or os.cpu_count() or 2, cfg.adapt.name != "none"
 
-    def step(stage: str, label: str, *words: str, calibration: str | None = None) -> list[str]:
+    def without(*heads: str) -> list[str]:
+        return [o for o in overrides if not o.lstrip("+~").startswith(tuple(f"{h}{c}" for h in heads for c in "=."))]
+
+    def step(
+        stage: str, label: str, *words: str, calibration: str | None = None, typed: Sequence[str] = overrides
+    ) -> list[str]:
         config = cfg.copy()
         config.stage, config.calibration = stage, calibration
         full = f"{name}_{label}" if stage != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
         head = [f"root={root}", f"stage={stage}", f"name={full}", f"threads={threads}"]
-        return [*handed_on(overrides, config), *head, *words]
+        return [*handed_on(typed, config), *head, *words]
 
     budget = [f"budget.minutes={cfg.pipeline.train_minutes}"] if cfg.pipeline.train_minutes else []
     known = f"calibration={root / 'identify' / name}"
+    trained = {
+        "identified": step("train", "identified", *budget, known, calibration=known),
+        "nominal": step("train", "nominal", *budget, *choice),
+    }
+    if adapts:
+        reference = without("algo", "dr", "reward", "evaluation.env_steps", "compile", "matmul", "device")
+        words = "algo=computed_torque", "dr=none", known
+        trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=reference)
+    transferred = {}
+    for label in labels(cfg)[1]:
+        policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
+        transferred[label] = step(
+            "transfer", label, policy, typed=overrides if label == ADAPTED else without("adapt")
+        )
     return [
-        {"identify": step("identify", "identify")},
-        {
-            "identified": step("train", "identified", *budget, known, calibration=known),
-            "nominal": step("train", "nominal", *budget, *choice),
-        },
-        {m: step("transfer", m, f"policy={root / 'train' / f'{name}_{m}'}") for m in MODELS},
+        {"identify": step("identify", "identify", typed=without("arm.payload", "arm.load") if adapts else overrides)},
+        trained,
+        transferred,
     ]
 
 
@@ -154,20 +180,21 @@ def pipeline(cfg, overrides):
             "dr: the nominal training of stage=pipeline has no calibration to draw from; another dr= does"
         )
     if cfg.name and not (root / "pipeline" / cfg.name).exists():
-        check_free(root, cfg.name)
+        check_free(root, cfg.name, cfg)
     with open_run(cfg, overrides) as run:
         name = run.folder.name
-        check_free(root, name)
+        check_free(root, name, cfg)
         os.environ.setdefault(GROUP, name)  # its steps belong together
         for what, step in zip(STEPS, commands(cfg, name, overrides), strict=True):
             print(what, file=sys.stderr)
             run_step(step)
         identified = root / "identify" / name
-        trained, transferred = ({m: root / s / f"{name}_{m}" for m in MODELS} for s in ("train", "transfer"))
+        trained = {m: root / "train" / f"{name}_{m}" for m in MODELS}
+        transferred = {m: root / "transfer" / f"{name}_{m}" for m in labels(cfg)[1]}
         rows = {}
         for label, folder in transferred.items():
             for where, row in read_summary(folder, "transfer").items():
-                rows[f"{label} model, {where}"] = row
+                rows[f"{ROWS.get(label, f'{label} model')}, {where}"] = row
         run.summary({"identify": read_summary(identified, "identify"), "reach": rows})
         pages.pipeline(run, robot, identified, trained, transferred, rows)
         reach_table(console(), rows, "policies trained on the identified and on the nominal model")

@@ -4,6 +4,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from r2s.errors import check_number
+from r2s.stages.adapting import is_taught, teach
 from r2s.stages.build import (
     Evaluation,
     called,
@@ -27,6 +28,7 @@ WHY = {
     "inertia": "calibration= says what the links are",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
+    "adapt": "adapters work on an arm, with stage=transfer; of them adapt=history is trained",
     "arm": "a training meets no arm; stage=transfer does",
     "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
     "data": "only stage=identify records or reads a motion",
@@ -38,6 +40,8 @@ CALIBRATION = ("parameters.yaml", "posterior.npz")  # of an identification, kept
 
 def reads(cfg):
     """Return the keys of the config that this stage reads."""
+    if is_taught(cfg):
+        return {"robot", "task", "calibration", "adapt"}
     keys = {"robot", "dr", "algo", "task", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
@@ -64,6 +68,8 @@ def train(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.tasks.rewards import Curriculum
 
+    if is_taught(cfg):
+        return teach(cfg, overrides, keep_calibration)
     if not is_learner(cfg):
         return reference(cfg, overrides)
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))

@@ -1,0 +1,234 @@
+"""The league of adapters (docs/adaptation.md): one frozen controller, what nobody announced, and who copes.
+
+`python benchmarks/adapters.py [root=RUNS] [task=reach] [policy=FOLDER] [adapters=NAME,...] [episodes=N] TWIN ...`
+TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to
+2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
+under computed torque, or under a training's policy; adapt=history with a network of its own (two minutes of a core).
+Rows go to ROOT/bench/adapters.csv, each only once, and the table of what is there is printed: means over twins and
+episodes with paired 95 % bootstrap intervals.
+
+Conditions: a payload of 0, 0.5, 1.0, 1.5 kg put on at U(0.5, 1.5) s, its centre uniform within 7.5 cm; friction that
+has warmed to 0.8 of what it was when the arm was identified; commands that come 5 ms later. Judged is from 1 s after
+the payload, the same seconds of the same episodes in all conditions.
+"""
+
+import sys
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from common import ROBOT, ROOT, conf, markdown, side_by_side
+
+from r2s.adaptation import adapters as made
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.hidden_arm import HiddenArm
+from r2s.arm.interface import ArmState
+from r2s.arm.twins import twin
+from r2s.learning.batch import ArmBatch
+from r2s.learning.computed_torque import computed_torque
+from r2s.learning.evaluate import fixed_episodes
+from r2s.learning.policy import load_policy
+from r2s.physics.payload import FARTHEST_M, Payload, ball
+from r2s.physics.robot import SIM_DT
+from r2s.stages.adapting import BESIDE, calibrated
+from r2s.tasks.episode import HOLD_S, rollout
+from r2s.tasks.reach import ReachTask
+from r2s.tasks.track import TrackTask
+
+CONDITIONS: dict[str, dict] = {f"{m:g} kg": {"mass": m} for m in (0.0, 0.5, 1.0, 1.5)}
+CONDITIONS |= {"friction 0.8": {"friction": 0.8}, "5 ms later": {"late": 5}}
+TASKS = {"track": TrackTask, "reach": ReachTask}
+SETTLE_S = 1.0
+KEY = ["twin", "under", "condition", "adapter", "episode"]
+
+
+class Late:
+    """An arm whose commands come `cycles` cycles later."""
+
+    def __init__(self, arm: HiddenArm, cycles: int):
+        self.arm, self.robot, self._cycles = arm, arm.robot, cycles
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Place the arm; see `Arm`."""
+        self._line = deque(np.zeros((self._cycles, self.robot.n)))
+        self._last = np.zeros(self.robot.n)
+        self.arm.move_to(q)
+        return self.read()
+
+    def read(self) -> ArmState:
+        """Return the state; the last command is the one that was given."""
+        return replace(self.arm.read(), tau_J_d=self._last)
+
+    def command(self, tau: np.ndarray) -> None:
+        """Give a command for a later cycle."""
+        self._line.append(np.array(tau))
+        now, step = self.arm.read().tau_J_d, self.robot.dtau_max * SIM_DT  # which lags where one was lost
+        self.arm.command(now + np.clip(self._line.popleft() - now, -step, step))
+        self._last = np.array(tau)
+
+    def stop(self) -> None:
+        """End the motion."""
+        self.arm.stop()
+
+
+def opened(
+    make: int, seed: int, friction: float = 1.0, late: int = 0, **_: float
+) -> tuple[HiddenArm, HiddenArm | Late]:
+    """Return a twin, and what commands it."""
+    arm = twin(ROBOT, make=make, seed=seed)
+    warm(arm, friction)
+    return arm, Late(arm, late) if late else arm
+
+
+def warm(arm: HiddenArm, friction: float) -> None:
+    """Multiply the friction of a twin, but for what goes with its load."""
+    if friction != 1.0:
+        from r2s.arm import elastic_joints, elastic_twin
+        from r2s.arm import twin as rigid
+
+        elastic = isinstance(arm, elastic_twin.ElasticTwin)
+        rows = (
+            [elastic_joints.C_NEG, elastic_joints.C_POS, elastic_joints.VISCOUS]
+            if elastic
+            else [rigid.C_NEG, rigid.C_POS, rigid.S2]
+        )
+        arm._hidden[rows] *= friction  # type: ignore[attr-defined]
+
+
+def carried(rng: np.random.Generator, mass: float) -> Payload:
+    """Return a payload: when it is put on and its centre are the same whatever its mass."""
+    way, far, on = rng.normal(size=3), FARTHEST_M * rng.uniform() ** (1 / 3), float(rng.uniform(0.5, 1.5))
+    return Payload(np.array(mass), far * way / np.linalg.norm(way), ball(np.array(mass)), on)
+
+
+def one(name: str, task, under: str, condition: str, adapter: str, known, policy, episodes, networks) -> list[dict]:
+    """Return a row per episode of one twin, condition and adapter."""
+    make, seed = (int(x) for x in name.split("_"))
+    given, rows, (starts, goals, predicted) = CONDITIONS[condition], [], episodes
+    arm, commanded = opened(make, seed, **given)
+    works = None if adapter == "none" else made_of(adapter, known, networks / f"net_m{name}")
+    driven = DrivenArm(commanded, task, known.dynamics.level, adapter=works)
+    for k in range(len(goals)):
+        thing = carried(np.random.default_rng([make, seed, k]), given.get("mass", 0.0))
+        arm.carry(thing if thing.mass > 0 else None)
+        done = rollout(policy, driven, task, starts[k : k + 1], goals[k : k + 1])
+        after = done.t >= thing.on_s + SETTLE_S
+        error = 1e3 * done.distance[0, after]
+        ended = not np.isfinite(done.distance[0]).all()
+        held = done.distance[0, -round(HOLD_S * task.ctrl_hz) :].max()
+        gap = 1e3 * np.linalg.norm(done.ee[0, after] - predicted.ee[k, after], axis=-1)
+        rows.append(
+            {"twin": name, "under": under, "condition": condition, "adapter": adapter, "episode": k}
+            | {"rmse": np.sqrt((error**2).mean()), "within_5mm": (error < 5).mean(), "reached": held < 0.01}
+            | {"gap": np.sqrt((gap**2).mean()), "stopped": int(ended)}
+            | {"us": 1e6 * np.median(driven.timing.adapter) if works else 0.0}
+        )
+    return rows
+
+
+def made_of(adapter: str, known, network: Path):
+    """Return an adapter with the settings of conf/adapt."""
+    settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", *BESIDE)}
+    if "network" in settings:
+        settings["network"] = network
+    return getattr(made, adapter)(known, **settings)
+
+
+def paired(frame: pd.DataFrame, of: str, root: bool) -> pd.DataFrame:
+    """Return mean and 95 % interval of a measure, a row per condition and a column per adapter.
+
+    Twins are drawn, and of each twin its episodes, the same for all adapters. root: of the mean of squares.
+    """
+    rng, cells = np.random.default_rng(0), {}
+    for condition, part in frame.groupby("condition", sort=False):
+        wide = part.pivot_table(index=["twin", "episode"], columns="adapter", values=of, sort=False)
+        wide = wide.astype(float).dropna()
+        each = [w.to_numpy() ** (2 if root else 1) for _, w in wide.groupby("twin")]
+        draws = []
+        for _ in range(2000):
+            twins = [each[i] for i in rng.integers(len(each), size=len(each))]
+            draws.append(np.concatenate([t[rng.integers(len(t), size=len(t))] for t in twins]).mean(0))
+        power = 0.5 if root else 1.0
+        low, high = np.quantile(np.array(draws) ** power, [0.025, 0.975], axis=0)
+        middle = np.concatenate(each).mean(0) ** power
+        scale, digits = (1, 2) if root else (100, 0)
+        cells[condition] = {
+            a: f"{scale * m:.{digits}f} [{scale * x:.{digits}f}, {scale * y:.{digits}f}]"
+            for a, m, x, y in zip(wide.columns, middle, low, high, strict=True)
+        }
+    return pd.DataFrame(cells).T
+
+
+def told(frame: pd.DataFrame, task: str) -> str:
+    """Return the table of one task as markdown."""
+    success = ("within_5mm", "within 5 mm, % of time") if task == "track" else ("reached", "within 1 cm, %")
+    wanted = [("rmse", "RMSE, mm", True)] * (task == "track") + [(*success, False), ("gap", "path gap, mm", True)]
+    parts = []
+    for of, label, root in wanted:
+        table = paired(frame, of, root)
+        parts.append(table.rename(columns=lambda a, label=label: f"{label}: {a}"))
+    table = pd.concat(parts, axis=1)
+    names = frame["adapter"].unique()
+    table = table[[c for a in names for c in table.columns if c.endswith(f": {a}")]]
+    cost = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'us'].mean():.0f}" for a in names)
+    stops = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'stopped'].sum():.0f}" for a in names)
+    return f"{markdown(table.T.rename_axis(task))}\n\nµs a cycle: {cost}. Stops: {stops}."
+
+
+def main() -> None:
+    """Identify what is missing, run what is not there yet, print the table."""
+    words = dict(w.split("=", 1) for w in sys.argv[1:] if "=" in w)
+    root = Path(words.get("root", ROOT / "runs"))
+    names = [w for w in sys.argv[1:] if "=" not in w] or ["1_0", "1_1", "2_0"]
+    kind, count = words.get("task", "track"), int(words.get("episodes", 6))
+    under = Path(words["policy"]).name if "policy" in words else f"computed torque, {kind}"
+    wanted = words.get("adapters", "none,observer,rls").split(",")
+    path = root / "bench" / "adapters.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    side_by_side(
+        ["stage=identify", "arm=twin", f"arm.make={n[0]}", f"arm.seed={n[2:]}", f"root={root}", f"name=m{n}"]
+        for n in names
+        if not (root / "identify" / f"m{n}" / "posterior.npz").is_file()
+    )
+    taught = ["adapt=history", "task=track", f"root={root}"]
+    side_by_side(
+        [*taught, f"calibration={root / 'identify' / f'm{n}'}", f"name=net_m{n}"]
+        for n in names
+        if "history" in wanted and not (root / "train" / f"net_m{n}" / made.NETWORK).is_file()
+    )
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in conf(f"task/{kind}").items()}
+    bare = TASKS[kind](**settings)
+    starts, goals = fixed_episodes(ROBOT, bare, count)
+    for name in names:
+        known = made.Known(ROBOT, *calibrated(root / "identify" / f"m{name}", ROBOT))
+        task = bare.believing(ROBOT, known.dynamics)
+
+        def policy(task=task, known=known):
+            if "policy" in words:
+                return load_policy(Path(words["policy"]), ROBOT, task)
+            return computed_torque(ROBOT, task, known.dynamics)
+
+        predicted = rollout(policy(), ArmBatch(ROBOT, task, known.dynamics, count, 1), task, starts, goals)
+        for condition in CONDITIONS:
+            for adapter in wanted:
+                old = pd.read_csv(path) if path.is_file() else pd.DataFrame(columns=KEY)
+                same = (old["twin"] == name) & (old["under"] == under) & (old["condition"] == condition)
+                if (same & (old["adapter"] == adapter)).sum() >= count:
+                    continue
+                began = time.process_time()
+                rows = one(
+                    name, task, under, condition, adapter, known, policy(), (starts, goals, predicted), root / "train"
+                )
+                pd.concat([old, pd.DataFrame(rows)] if len(old) else [pd.DataFrame(rows)]).to_csv(path, index=False)
+                rmse = np.sqrt(np.mean([r["rmse"] ** 2 for r in rows]))
+                seconds = time.process_time() - began
+                print(f"{name} {condition}, {adapter}: {rmse:.2f} mm ({seconds:.0f} s of a core)", flush=True)
+    frame = pd.read_csv(path)
+    print(told(frame[(frame["under"] == under) & frame["twin"].isin(names)], kind))
+
+
+if __name__ == "__main__":
+    main()
