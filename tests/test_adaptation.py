@@ -166,6 +166,38 @@ def test_a_payload_put_on_or_taken_off_is_seen_within_a_fifth_of_a_second():
     assert abs(known[-1].mass) < known[-1].mass_half + 1e-9
 
 
+@pytest.mark.parametrize("on", [None, 0.0])
+def test_what_was_put_on_during_a_rest_is_told_as_soon_as_the_arm_moves(on):
+    """A rest lets the estimate go, so no sudden change has to explain it; without a payload nothing is told."""
+    arm = believed(robot(), truth())
+    free = balances(arm, recording(noise=2e-3))
+    estimator = Estimator(arm, learnt(arm, None, free, free))
+    listen(robot(), estimator, recording(noise=2e-3))
+    estimator.begin()
+    for _ in range(600):
+        estimator(robot().q_home, np.zeros(7), np.zeros(7))
+    assert estimator.now.rests
+    since = estimator.now.t
+    listen(robot(), estimator, recording(on=on, noise=2e-3))
+    assert len(estimator.changes) == (on is not None)
+    assert all(since < at < since + 0.2 for at in estimator.changes)
+
+
+def test_a_gear_that_swings_is_no_torque():
+    """Speeds that swing at 55 Hz, as motors do behind elastic gears, leave a tenth of what moments would make of it.
+
+    Between two moments T apart a swing of v rad/s changes momentum by up to 2 M v, so a torque of 2 M v / T comes and
+    goes.
+    """
+    arm, data, v = believed(robot(), truth()), recording(), 0.03
+    swings = replace(data, dq=data.dq + v * np.sin(2 * np.pi * 55 * data.t)[:, None] * np.eye(7)[0])
+    plain, swung = (np.array([b.y[0] for b in balances(arm, d)]) for d in (data, swings))
+    mass, bias = np.empty((7, 7)), np.empty(7)
+    own = links_of(robot(), robot().mass, robot().com, robot().inertia)
+    equations(own, np.zeros(3), robot().q_home, np.zeros(7), mass, bias, np.empty((7, WORK)))
+    assert np.abs(swung - plain).max() < 0.1 * 2 * mass[0, 0] * v / (SPAN * SIM_DT)
+
+
 def test_an_interval_is_wide_at_rest_and_narrow_in_motion():
     """At rest breakaway b at the lever r hides b / (r g): no interval is below the best joint's."""
     arm, noise = quiet()

@@ -12,16 +12,19 @@ Slotine, RA-L 3(1), 2018).
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from r2s.adaptation.balance import Balance, Kept, observe
 from r2s.adaptation.believed import Believed
-from r2s.adaptation.kalman import THRESHOLD, Filter, Noise, jump, update
+from r2s.adaptation.kalman import JUMP, RESTS, THRESHOLD, Filter, Noise, T, jump, update
 from r2s.adaptation.momentum import BODY
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
 Z = 1.96  # standard deviations of a 95 % interval
 LEAST_KG = 0.02  # below that nobody asks where its centre is
+AFTER = round(0.5 / T)  # spans of motion after a rest, in which what is carried now and before are compared
+OTHER = chi2.isf(T / 3600.0, JUMP)  # squared distance that two estimates of one thing have once in an hour of tests
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class Estimator:
         self.changes: list[float] = []
         self._filter = Filter.fresh(noise)
         self._cycle, self._changed = 0, False
+        self._before = self._carried()
+        self._moved = 0  # spans since a rest, as far as they count
         self._now: Estimate | None = None
         self.begin()
 
@@ -91,11 +96,34 @@ class Estimator:
         if not observe(self._arm, self._kept, q, dq, tau, b):
             return False
         update(self._filter, self._noise, b)
-        self._changed, self._now = bool(self._filter.odds[0] > THRESHOLD), None
+        jumped, other = bool(self._filter.odds[0] > THRESHOLD), self._is_other()
+        self._changed, self._now = jumped or other, None
         if self._changed:
             self.changes.append(self._cycle * SIM_DT)
+            self._moved = AFTER
+        if jumped:
             jump(self._filter, self._noise)
         return True
+
+    def _carried(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mass and first moments of what is carried (4,), and their covariance (4, 4)."""
+        return self._filter.x[:JUMP].copy(), self._filter.P[:JUMP, :JUMP].copy()
+
+    def _is_other(self) -> bool:
+        """Say whether what is carried after a rest is not what it was before.
+
+        A rest lets the estimate go, as anything may be put on unseen, so that no sudden change has to explain it.
+        """
+        if self._filter.counts[2] >= RESTS:
+            self._moved = 0
+            return False
+        if self._moved >= AFTER:
+            self._before = self._carried()
+            return False
+        self._moved += 1
+        now, before = self._carried(), self._before
+        off = now[0] - before[0]
+        return bool(off @ np.linalg.solve(now[1] + before[1], off) > OTHER)
 
     @property
     def now(self) -> Estimate:
