@@ -361,6 +361,7 @@ MISTAKES = {
     "stage=identify data.excitation=nowhere.csv": r"nowhere.csv",
     "stage=identify data=recording data.path=LOG data.torque=commanded data.ramps=nowhere.npz": r"no file nowhere",
     "dr=identified": r"give calibration=RUN_FOLDER",
+    "stage=pipeline pipeline.train_minutes=0": r"pipeline.train_minutes: 0 is not allowed; a number in \(0, inf\) is",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
     "robot.ee=end_efector": r"robot.ee: no site, body or link 'end_efector'.*did you mean 'end_effector'",
