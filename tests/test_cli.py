@@ -361,6 +361,8 @@ MISTAKES = {
     "stage=identify data.excitation=nowhere.csv": r"nowhere.csv",
     "stage=identify data=recording data.path=LOG data.torque=commanded data.ramps=nowhere.npz": r"no file nowhere",
     "dr=identified": r"give calibration=RUN_FOLDER",
+    "task=track robot.torque_fraction=null": r"robot.torque_fraction: None is not allowed; a number in \[1e-6, 1\]",
+    "robot.torque_fraction=[0.3,nan]": r"robot.torque_fraction: nan is not allowed; a number in \[1e-6, 1\] is",
     "stage=pipeline pipeline.train_minutes=0": r"pipeline.train_minutes: 0 is not allowed; a number in \(0, inf\) is",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
