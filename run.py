@@ -3,7 +3,11 @@
 r2s/cli.py composes the config and calls one stage of r2s/stages.
 """
 
-from r2s.cli import main
+import sys
 
 if __name__ == "__main__":
+    try:
+        from r2s.cli import main
+    except KeyboardInterrupt:  # before there is anything to say
+        sys.exit(130)
     main()

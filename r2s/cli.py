@@ -260,6 +260,15 @@ def said_in_one_line():
 
 
 def main():
+    """Do what was typed; Ctrl-C before a run has begun is one line too."""
+    try:
+        compose_and_run()
+    except KeyboardInterrupt:
+        print("\ninterrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+def compose_and_run():
     """Compose and run; a user's mistake is one line and exit status 2."""
     import hydra
     from hydra._internal.utils import get_args_parser

@@ -42,6 +42,8 @@ def test_an_axis_is_what_was_typed():
         ({"measure": "retrn_paper"}, r"tune.measure: 'retrn_paper' .*did you mean 'return_paper'"),
         ({"trials": 0}, r"tune.trials: 0 is not allowed"),
         ({"workers": 0.5}, r"tune.workers: 0.5 is not allowed"),
+        ({"against": "/nowhere/grid_*"}, r"tune.against: '/nowhere/grid_\*' finds nothing"),
+        ({"against": 5}, r"tune.against: 5 finds nothing"),
     ],
 )
 def test_a_space_that_is_none_is_one_line(change, said):

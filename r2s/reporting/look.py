@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -75,13 +76,31 @@ def open_native(recordings: Sequence[Path]) -> None:
 
 
 def show_in_browser(recordings: Sequence[Path], port: int) -> None:
-    """Serve the viewer to browsers on this computer alone, at `port`, until Ctrl-C."""
+    """Serve the viewer to browsers on this computer alone, at `port`, until Ctrl-C.
+
+    Raises:
+        UserError: something else listens at one of the two ports, or the viewer failed.
+    """
+    if taken := [p for p in (port, port + 1) if _answers(p)]:
+        raise UserError(
+            f"look: something listens at port {taken[0]} already; --port {port + 2} or another is allowed"
+        )
     words = ["--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), "--port", str(port + 1)]
     with _viewer([*words, *map(str, recordings)]) as process:
-        time.sleep(0.5)
+        while process.poll() is None and not all(map(_answers, (port, port + 1))):
+            time.sleep(0.1)
         if process.poll() is None:
             source = f"rerun%2Bhttp://{LOOPBACK}:{port + 1}/proxy"
             print(f"look: http://{LOOPBACK}:{port}/?url={source} (Ctrl-C ends it)", flush=True)
+
+
+def _answers(port: int) -> bool:
+    """Return whether something listens at a port of this computer."""
+    try:
+        socket.create_connection((LOOPBACK, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
 
 
 @contextmanager

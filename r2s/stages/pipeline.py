@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from r2s.errors import Stopped, UserError
+from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
 from r2s.stages.build import CONF, GROUP, PACKAGE, console, make_robot, open_run, unread
 
@@ -33,7 +33,7 @@ WHY = {
 def reads(cfg):
     """Return the keys of the config that the steps read, but for those that the chain sets itself."""
     keys = {"pipeline", *identify.reads(cfg), *train.reads(cfg), *transfer.reads(cfg)} - {"calibration", "policy"}
-    return keys - {"budget"} if cfg.pipeline.train_minutes else keys
+    return keys if cfg.pipeline.train_minutes is None else keys - {"budget"}
 
 
 def handed_on(overrides: Sequence[str], step: Any) -> list[str]:
@@ -136,7 +136,8 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
         head = [f"root={root}", f"stage={stage}", f"name={full}", f"threads={threads}"]
         return [*handed_on(typed, config), *head, *words]
 
-    budget = [f"budget.minutes={cfg.pipeline.train_minutes}"] if cfg.pipeline.train_minutes else []
+    minutes = cfg.pipeline.train_minutes
+    budget = [] if minutes is None else [f"budget.minutes={minutes}"]
     known = f"calibration={root / 'identify' / name}"
     trained = {
         "identified": step("train", "identified", *budget, known, calibration=known),
@@ -174,6 +175,10 @@ def pipeline(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.runs import read_summary
 
+    if cfg.pipeline.train_minutes is None:
+        train.make_budget(cfg)
+    else:  # said now, not after the arm was identified
+        check_number("pipeline.train_minutes", cfg.pipeline.train_minutes, "(0, inf)")
     robot, root = make_robot(cfg), Path(cfg.root)
     if "calibration" in cfg.dr:
         raise UserError(

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ class Tune:
         against: glob of trainings to be compared with, such as those of a grid.
 
     Raises:
-        UserError: a number outside its range, or a space that is none.
+        UserError: a number outside its range, a space that is none, or a glob that finds nothing.
     """
 
     trials: int
@@ -57,6 +58,11 @@ class Tune:
             raise UserError(
                 f"tune.measure: '{self.measure}' is not allowed; {choices(MEASURES)} are"
                 f"{nearest(str(self.measure), MEASURES)}"
+            )
+        if self.against is not None and not (isinstance(self.against, str) and glob(self.against)):
+            raise UserError(
+                f"tune.against: {self.against!r} finds nothing; run folders of stage=train are allowed, such as "
+                "'runs/train/grid_*'"
             )
         if not isinstance(self.space, Mapping) or not self.space:
             raise UserError(f"tune.space: {self.space!r} is no space; {{option: [values] or log(low, high)}} is")
