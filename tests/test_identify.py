@@ -30,7 +30,7 @@ from r2s.identification.search.genetic import Genetic
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
 from r2s.identification.torque_residual import TorqueResidual
-from r2s.identification.uncertainty import _settled, posterior
+from r2s.identification.uncertainty import _inside, _settled, posterior
 from r2s.identification.windows import cut_windows, replay
 from r2s.learning.randomization import Identified as Draws
 from r2s.learning.randomization import physical
@@ -712,6 +712,35 @@ def test_what_trades_stays_known_together():
         assert steps.std(0).min() > 0.03
         assert steps.sum(1).std() == pytest.approx(1e-3, rel=0.3)
         assert (np.abs(u + steps - 0.5) <= 0.5).all()
+
+
+def test_of_two_values_that_are_both_out_one_comes_back():
+    """Only a difference is told; a draw that leaves the cube with both values stops one, and keeps the difference."""
+    told = np.array([1e3, -1e3])
+    u, step = np.array([1.0, 0.5]), np.array([0.7, 0.6])
+    kept = _inside(u, step[None], np.outer(told, told) + np.eye(2))[0]
+    assert (np.abs(u + kept - 0.5) <= 0.5).all()
+    assert kept[0] - kept[1] == pytest.approx(step[0] - step[1], abs=1e-5)
+
+
+def test_a_joint_that_slides_has_all_of_its_friction(arm, wrong, clean):
+    """In rows of one slide of a joint Coulomb friction is its whole level, however slowly the joint slides."""
+    short = clean.select(clean.t < 3.0)
+    space = searched(arm, of_family(wrong, "coulomb"), BOUNDS, ["offset"], short)
+    residual = TorqueResidual(arm, space, short, slowest=0.02)
+    level = np.array([0.8, 0.7, 0.6])
+    alone = replace(space.nominal, phi=np.stack([level, 0 * level, 0 * level], -1))
+    friction = residual.predict(alone) - residual.predict(replace(alone, phi=0 * alone.phi))
+    whole = np.broadcast_to(level, friction.shape)[residual.seen]
+    np.testing.assert_allclose(np.abs(friction[residual.seen]), whole, rtol=1e-9)
+
+
+def test_a_search_on_the_level_of_torque_makes_no_replays(arm, wrong, clean, monkeypatch):
+    """Values and intervals are both of the residual that the search minimised."""
+    monkeypatch.delattr("r2s.identification.identify.ReplayResidual")
+    result = run(arm, wrong, clean.select(clean.t < 3.0), [TORQUE])
+    assert (result.found.low <= result.x + 1e-12).all()
+    assert (result.x <= result.found.high + 1e-12).all()
 
 
 def test_what_is_left_out_is_not_fitted(clean):
