@@ -101,7 +101,8 @@ def test_a_motion_takes_time(panda, task, dynamics, move_s):
 def test_what_a_training_reads_is_nothing_to_a_controller():
     """Also where an experiment has set it for all algorithms."""
     target = "r2s.learning.computed_torque.Oracle"
-    cfg = OmegaConf.create({"stage": "train", "calibration": None, "algo": {"_target_": target, "name": "oracle"}})
+    algo = {"_target_": target, "name": "oracle"}
+    cfg = OmegaConf.create({"stage": "train", "calibration": None, "algo": algo, "adapt": {"name": "none"}})
     cfg.algo.update({"move_s": 0.6, "batch_size": 32, "n_envs": 8})
     assert unread("algo.move_s", cfg) is None
     assert unread("algo", cfg) is None

@@ -16,6 +16,7 @@ from r2s.identification.static_friction import SURE
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, STRIBECK
 from r2s.physics.rigid_body import put_links
+from r2s.physics.robot import SIM_DT
 
 EXTRA = conf("config")["identify"]["extra"]["commanded"]
 PHI = np.array([[1.2, 0.05, 0.3], [0.9, -0.05, 0.2], [0.5, 0.1, 0.1]])
@@ -72,15 +73,16 @@ def test_a_term_that_is_there_enters(arm):  # noqa: F811
 def test_rotors_that_are_there_enter_and_leave_the_links_alone(arm):  # noqa: F811
     """A command feels them on the motor's side: no link has to stand in, whose inertia joints share.
 
-    The inertia that each joint moves is right within 2 %. Rotors are within four standard deviations of their draws,
-    and those that motion tells (the first joint's is a part of its link) within a fifth.
+    The inertia that each joint moves is right within 2 %. Rotors are within four standard deviations of their draws
+    and a millisecond of viscous friction, which a step adds that takes it from its end; those that motion tells (the
+    first joint's is a part of its link) are within a fifth.
     """
     rotors = np.array([0.15, 0.1, 0.03])
     truth = replace(coulomb_arm(arm), armature=rotors)
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
     found = run(arm, start, recorded(arm, truth, 8.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
     at = found.space.where("armature")
-    assert np.all(np.abs(found.x[at] - rotors) < 4 * found.found.samples[:, at].std(0))
+    assert np.all(np.abs(found.x[at] - rotors) < 4 * found.found.samples[:, at].std(0) + SIM_DT * PHI[:, 2])
     np.testing.assert_allclose(found.x[at][1:], rotors[1:], rtol=0.2)
     moved = []
     for d in (found.dynamics, truth):
