@@ -109,6 +109,8 @@ def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
     """
     try:
         array = np.array(value, dtype=float)
+        if any(isinstance(x, bool | np.bool_) for x in np.ravel(np.array(value, dtype=object))):
+            raise ValueError  # yaml's true is no 1
     except (TypeError, ValueError):
         raise UserError(f"{name} is not a number, nor one for each of {joints}") from None
     array = np.full(n, float(array)) if array.ndim == 0 else array

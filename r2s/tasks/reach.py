@@ -51,7 +51,7 @@ class ReachTask(Usual):
         cycles = round(1 / SIM_DT)
         if not isinstance(self.ctrl_hz, int) or self.ctrl_hz < 1 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; what divides {cycles} is, such as 50")
-        check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, inf)")
+        check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, 600]")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.start_spread", self.start_spread, "[0, inf)")
 

@@ -74,7 +74,7 @@ class TrackTask(Usual):
         if not isinstance(self.ctrl_hz, int) or not 50 <= self.ctrl_hz <= 200 or cycles % self.ctrl_hz:
             raise UserError(f"task.ctrl_hz: {self.ctrl_hz!r} is not allowed; 50, 100, 125 and 200 are")
         check_number("task.ramp_s", self.ramp_s, "(0, inf)")
-        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, inf)")
+        check_number("task.episode_s", self.episode_s, f"[{2 * self.ramp_s:g}, 60]")  # plans are kept whole
         check_number("task.boost", self.boost, "(0, inf)")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.residual", self.residual, "(0, 1]")
