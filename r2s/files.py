@@ -1,10 +1,14 @@
 """Files that are there only once they are whole, and those that come with r2s."""
 
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# what reading an array file raises that is cut off, altered, or another thing
+DAMAGED = (KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 OWN = "r2s:"  # a path that begins so is one of the package's own files, wherever that is installed
 
 

@@ -14,17 +14,15 @@ import platform
 import re
 import shutil
 import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol, Self
-from zipfile import BadZipFile
 
 import numpy as np
 
 from r2s.errors import Stopped, UserError
-from r2s.files import whole
+from r2s.files import DAMAGED, whole
 from r2s.provenance import git, machine, packages, sha256
 
 
@@ -251,15 +249,7 @@ def load_arrays(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {k: file[k] for k in file.files}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        RuntimeError,
-        KeyError,
-        BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGED as error:
         seen = " ".join(str(error).split())
         raise UserError(f"resume: {path} is damaged ({seen}); remove it, and this step is done again") from None
 

@@ -13,7 +13,7 @@ from r2s.adaptation.adapters import NETWORK, Known, history, load_network, obser
 from r2s.adaptation.balance import SPAN, Balance
 from r2s.adaptation.believed import believed
 from r2s.adaptation.compensation import RATE_S, thing, weigh
-from r2s.adaptation.history import SPANS, History, Network, Seen
+from r2s.adaptation.history import SPANS, History, Network, Seen, inputs
 from r2s.adaptation.kalman import BODY, Filter
 from r2s.adaptation.noise import noise_of
 from r2s.adaptation.observer import Observer
@@ -293,13 +293,21 @@ def test_the_history_s_network_is_shown_what_lacks():
 
 def test_a_network_is_kept_for_the_model_that_it_was_taught_for(tmp_path):
     rng = np.random.default_rng(0)
-    layers = rng.normal(size=(6, 4)), rng.normal(size=4), rng.normal(size=(4, 7)), rng.normal(size=7)
-    network = Network(rng.normal(size=6), np.ones(6), np.ones(7), layers)
+    d = inputs(7)
+    layers = rng.normal(size=(d, 4)), rng.normal(size=4), rng.normal(size=(4, 7)), rng.normal(size=7)
+    network = Network(rng.normal(size=d), np.ones(d), np.ones(7), layers)
     save_network(tmp_path / NETWORK, known().arm, network)
-    kept, x = load_network(tmp_path / NETWORK, known().arm), rng.normal(size=6)
+    kept, x = load_network(tmp_path / NETWORK, known().arm), rng.normal(size=d)
     assert np.array_equal(kept(x), network(x))
     with pytest.raises(UserError, match=r"was taught for another model; train it with this calibration="):
         load_network(tmp_path / NETWORK, believed(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019"))))
+    good = (tmp_path / NETWORK).read_bytes()
+    (tmp_path / NETWORK).write_bytes(good[: len(good) // 2])
+    with pytest.raises(UserError, match=r"^network: .* cannot be read: "):
+        load_network(tmp_path / NETWORK, known().arm)
+    save_network(tmp_path / NETWORK, known().arm, network._replace(layers=layers[:2]))
+    with pytest.raises(UserError, match=r"^network: .* cannot be read: "):
+        load_network(tmp_path / NETWORK, known().arm)
     for wrong in (None, tmp_path / "nothing"):
         with pytest.raises(UserError, match=r"^network: '.*' is no run folder of stage=train adapt=history"):
             history(known(), wrong)

@@ -11,12 +11,12 @@ import numpy as np
 
 from r2s.adaptation.believed import Believed, believed
 from r2s.adaptation.compensation import Compensation
-from r2s.adaptation.history import History, Network
+from r2s.adaptation.history import History, Network, inputs
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.listen import noise
 from r2s.adaptation.observer import Observer
 from r2s.errors import UserError
-from r2s.files import whole
+from r2s.files import DAMAGED, whole
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -90,9 +90,13 @@ def load_network(path: Path, arm: Believed) -> Network:
     try:
         with np.load(path, allow_pickle=False) as saved:
             arrays = dict(saved)
-    except (OSError, ValueError) as error:
+        layers = tuple(arrays[f"layer_{k}"] for k in range(len(arrays) - 4))
+        network, table = Network(arrays["mean"], arrays["scale"], arrays["size"], layers), arrays["table"]
+        n = len(arm.level)
+        if network(np.zeros(inputs(n))).shape != (n,):
+            raise ValueError(f"it does not tell {n} torques")
+    except DAMAGED as error:
         raise UserError(f"network: {path} cannot be read: {' '.join(str(error).split())}") from None
-    if not np.array_equal(arrays["table"], arm.table):
+    if not np.array_equal(table, arm.table):
         raise UserError(f"network: {path.parent} was taught for another model; train it with this calibration=")
-    layers = tuple(arrays[f"layer_{k}"] for k in range(len(arrays) - 4))
-    return Network(arrays["mean"], arrays["scale"], arrays["size"], layers)
+    return network

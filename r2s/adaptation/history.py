@@ -15,6 +15,11 @@ from r2s.adaptation.believed import Believed
 SPANS = 25  # of the history: 0.5 s
 
 
+def inputs(n: int) -> int:
+    """Return how many numbers `Seen` shows of an arm of n joints."""
+    return (SPANS + 4) * n
+
+
 class Network(NamedTuple):
     """A perceptron with tanh between its layers; inputs (d,), outputs (n,) Nm.
 

@@ -1,7 +1,5 @@
 """parameters.yaml and posterior.npz: what carries an identification to the other stages."""
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, check_number, nearest
-from r2s.files import whole
+from r2s.files import DAMAGED, whole
 from r2s.identification.parameters import (
     TIMING,
     WHOLE_ARM,
@@ -174,16 +172,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
             names, samples = file["names"].tolist(), file["samples"]
         if samples.shape != (len(samples), len(names)):
             raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        OSError,
-        EOFError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGED as error:
         seen = " ".join(str(error).split())
         raise UserError(f"dr=identified: {path} is not a posterior.npz of r2s ({seen})") from None
     if names != space.names:

@@ -91,7 +91,7 @@ class Curriculum:
                 check_number(f"reward.{name}", number, interval)
 
     def __call__(self, progress: float) -> np.ndarray:
-        """Return the (4,) weights at `progress`, the fraction of the training budget that is spent."""
+        """Return the (5,) weights at `progress`, the fraction of the training budget that is spent."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
         pairs = (getattr(self, name) for name in TERMS[1:])

@@ -14,6 +14,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.model_torque import ModelTorque
 from r2s.tasks.reach import OBSERVED, ReachTask, observe
+from r2s.tasks.rewards import PAPER
 from r2s.tasks.task import Episodes, State, Usual
 from r2s.tasks.timed_path import KINDS, Paths, V, X, curve
 
@@ -118,7 +119,7 @@ class TrackTask(Usual):
     @property
     def paper_weights(self) -> np.ndarray:
         """(5,), of what is reported: error and smoothness."""
-        return np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+        return PAPER
 
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm, the most that a target asks for."""
