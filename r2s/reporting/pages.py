@@ -230,7 +230,7 @@ def pipeline(
         for path in sorted(folder.glob("episodes_*.npz")):
             where = path.stem.removeprefix("episodes_")
             if where != "mujoco":
-                episodes[f"{where}, {label} model"] = unstack(path)
+                episodes[f"{where}, {label}"] = unstack(path)
     curves = {label: pd.read_csv(folder / "evaluations.csv") for label, folder in trained.items()}
     with np.load(identified / "torque.npz", allow_pickle=False) as saved:
         predicted = {k: saved[k] for k in ("nominal", "identified")}

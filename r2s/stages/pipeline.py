@@ -195,11 +195,11 @@ def pipeline(cfg, overrides):
             run_step(step)
         identified = root / "identify" / name
         trained = {m: root / "train" / f"{name}_{m}" for m in MODELS}
-        transferred = {m: root / "transfer" / f"{name}_{m}" for m in labels(cfg)[1]}
+        transferred = {ROWS.get(m, f"{m} model"): root / "transfer" / f"{name}_{m}" for m in labels(cfg)[1]}
         rows = {}
         for label, folder in transferred.items():
             for where, row in read_summary(folder, "transfer").items():
-                rows[f"{ROWS.get(label, f'{label} model')}, {where}"] = row
+                rows[f"{label}, {where}"] = row
         run.summary({"identify": read_summary(identified, "identify"), "reach": rows})
         pages.pipeline(run, robot, identified, trained, transferred, rows)
         reach_table(console(), rows, "policies trained on the identified and on the nominal model")
