@@ -20,7 +20,7 @@ from r2s.identification.smooth_motion import SmoothMotion
 from r2s.identification.torque_residual import TorqueResidual
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import WIDTH_DQ
-from r2s.physics.rigid_body import GRAVITY, regressor
+from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot, load_robot
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
@@ -41,7 +41,7 @@ def columns(robot: Robot, recording: Recording) -> tuple[np.ndarray, np.ndarray]
     """Return A (T n, P) and tau (T n,): all standard parameters, Coulomb, viscous, offset and rotor of each joint."""
     m = SmoothMotion.of(recording, CUTOFF_HZ, ROWS_HZ)
     samples, n = m.q.shape
-    parts = [regressor(robot, m.q, m.dq, m.ddq, GRAVITY).reshape(samples, n, -1)]
+    parts = [regressor(robot, m.q, m.dq, m.ddq, robot.gravity).reshape(samples, n, -1)]
     for x in (m.filtered(np.tanh(m.fast / WIDTH_DQ)), m.dq, np.ones_like(m.q), m.ddq):
         parts.append(x[:, :, None] * np.eye(n))
     return np.concatenate(parts, -1).reshape(samples * n, -1), m.tau.ravel()

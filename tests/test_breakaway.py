@@ -14,7 +14,7 @@ from r2s.arm.ramp import MARGIN, ramp
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twin import Twin
 from r2s.errors import UserError
-from r2s.identification.breakaway import Breakaway, breakaway
+from r2s.identification.breakaway import Breakaway, Slide, breakaway
 from r2s.identification.checks import check_ramps
 from r2s.identification.repeatability import REPEATS, certainty
 from r2s.physics.dynamics import nominal_dynamics
@@ -225,6 +225,39 @@ def test_creep_is_not_taken_for_letting_go():
         x = ramps.recording.q[:, 1] - ramps.recording.q[0, 1]
         assert t[np.argmax(x > 3e-4)] < 0.5  # where a threshold would see motion
         assert breakaway(ramps).value[0] == pytest.approx(1.2, rel=0.05)
+
+
+def falling(U=0.9, level=0.6, viscous=0.3, fall=0.04, inertia=0.8, rate=0.15):
+    """One joint whose friction falls from U to level over `fall` rad/s, by steps of 0.02 ms; and how it slides."""
+    fine, every = 2e-5, 50
+    u = np.maximum(np.arange(0.0, U / rate + 2.5, fine) - 0.5, 0.0) * rate
+    v, x = 0.0, 0.0
+    angles = []
+    for now in u:
+        if now > U:
+            v += fine * (now - level - (U - level) * np.exp(-((v / fall) ** 2)) - viscous * v) / inertia
+            x += fine * v
+        angles.append(x)
+        if x > 0.012:
+            break
+    seen = np.array(angles)[::every]
+    seen = np.round((seen + 2e-5 * np.random.default_rng(3).standard_normal(len(seen))) / 2e-5) * 2e-5
+    t, q = 1e-3 * np.arange(len(seen)), np.zeros((len(seen), 2))
+    q[:, 1] = -seen
+    tau = np.zeros_like(q)
+    tau[:, 1] = -u[::every][: len(seen)]
+    known = Slide(*(np.array([k]) for k in (1.05 / inertia, level, viscous, fall)))
+    return Ramps(Recording(t, q, 0 * q, tau, "commanded"), joint=1, sign=-1), known
+
+
+def test_friction_that_falls_slowly_is_let_go_of_in_time_once_the_slide_is_known():
+    """An inertia that is 5 % off does not matter; the slide of a lighter joint is not taken."""
+    ramps, known = falling()
+    alone, told = breakaway(ramps), breakaway(ramps, slide=known)
+    assert -alone.value[0] > 0.9 + 2e-3
+    assert -told.value[0] == pytest.approx(0.9, abs=5e-4)
+    for other in (replace(known, kappa=30 * known.kappa), replace(known, kappa=np.array([np.nan]))):
+        assert breakaway(ramps, slide=other).value[0] == alone.value[0]
 
 
 def test_what_does_not_move_is_listed_and_the_rest_survives():

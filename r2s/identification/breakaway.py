@@ -13,6 +13,11 @@ stretched over the creep length z (the loading curve of Dahl, J. Dyn. Sys. Meas.
 after release is less than U (Stribeck; the dead zone of eq. 6 nullifies it altogether, and has z = 0): `jump` is that
 difference as an acceleration. Thus creep, however far it goes, is motion that stiction still balances, and breakaway
 is the command from which it no longer can. No model of the arm is needed.
+
+Where friction falls over a range of velocities (Stribeck), motion begins so slowly that `jump`, which is sudden,
+reads the release late: by 4 to 22 mNm on an arm of known truth. Once an arm is identified, `Slide` says how its
+joints move from release on, with jump (1 - exp(-(v / fall)^2)) in place of `jump`, and U alone is left to find: to
+0.2 mNm there. It counts where it explains the motion as well as positions are known.
 """
 
 from dataclasses import dataclass
@@ -32,8 +37,12 @@ STEP = 1e-3  # s, the longest step of the fitted motion
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), and of rest (rad) and drift (rad/s) beside it
 LOW = np.log(1e-2), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
 HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
+RIGID = 1e-8  # rad, a creep length that is none
 DRIFT = 3e-4  # rad/s: a joint at rest may still settle so fast
 SIDES = "negative", "positive"
+SURE = 0.1  # of log kappa, where it is of an identified arm
+EXPLAINED = 1.5  # times what positions scatter at rest: a known slide that leaves more is not this joint's
+BACK = 0.0, 0.03, 0.1  # below the last command, in terms of its rise: where a search for U starts
 DAMPING = np.log(10.0), 1.5  # log lambda and its spread: a weak prior, where the motion is too short to tell
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # creep length, rad; time since release, in terms of the guess
 
@@ -86,7 +95,26 @@ class Breakaway:
         return words
 
 
-def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED) -> Breakaway:
+@dataclass(frozen=True, eq=False)
+class Slide:
+    """How the joints of K ramps slide once they have let go, in each ramp's direction, by an identified model.
+
+    Attributes:
+        kappa: (K,) rad/s^2 per Nm, one over the inertia, the other joints at rest.
+        level: (K,) Nm, the command that balances a slow slide above `fall`: Coulomb's level, without what else pulls.
+        viscous: (K,) Nm s/rad.
+        fall: (K,) rad/s, over which friction falls from breakaway to `level` as exp(-(v / fall)^2).
+    """
+
+    kappa: np.ndarray
+    level: np.ndarray
+    viscous: np.ndarray
+    fall: np.ndarray
+
+
+def breakaway(
+    ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED, slide: Slide | None = None
+) -> Breakaway:
     """Estimate the command at which each ramped joint let go, from t, q and tau alone.
 
     Of each ramp the rows count up to where the joint is `moved` away from its first position; what follows (a
@@ -98,6 +126,7 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
             0.5 to 3 ms is the error to expect from an encoder of 2e-5 rad, the most where the inertia is largest.
         delay: s, from a command to its torque. lag: s, of the first-order lag after it: both shift the result.
         moved: rad, well beyond creep; the ramps must go at least as far.
+        slide: how these joints slide, where that is identified.
 
     Raises:
         UserError: a delay, lag or distance out of range.
@@ -117,7 +146,11 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
             most[k] = max(_delayed(t, u, delay, lag).max(), 0.0)
         if x[end - 1] < moved or end < MIN_ROWS:
             continue
-        value[k], misfit[k] = _release(t[:end], x[:end], _delayed(t, u, delay, lag)[:end])
+        seen = t[:end], x[:end], _delayed(t, u, delay, lag)[:end]
+        if slide is not None and not np.isnan(slide.kappa[k]):
+            value[k], misfit[k] = _release_of(*seen, slide.kappa[k], slide.level[k], slide.viscous[k], slide.fall[k])
+        if np.isnan(value[k]):
+            value[k], misfit[k] = _release(*seen)
         value[k] *= sign
         blur[k] = RELEASE_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
     shape = r.n_joints, 2
@@ -127,14 +160,14 @@ def breakaway(ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: floa
         for side, sign in enumerate((-1, 1)):
             own = (ramps.joint == j) & (ramps.sign == sign)
             there = own & ~np.isnan(value)
-            seen = value[there]
-            count[j, side], ramped[j, side] = len(seen), own.sum()
-            if len(seen):
+            told = value[there]
+            count[j, side], ramped[j, side] = len(told), own.sum()
+            if len(told):
                 resolution[j, side] = np.sqrt((blur[there] ** 2).mean())
             elif own.any():
                 tried[j, side] = sign * most[own].max()
-            command[j, side] = seen.mean() if len(seen) else np.nan
-            spread[j, side] = seen.std(ddof=1) if len(seen) > 1 else np.nan
+            command[j, side] = told.mean() if len(told) else np.nan
+            spread[j, side] = told.std(ddof=1) if len(told) > 1 else np.nan
     cells = command, spread, count, ramped, tried, resolution
     return Breakaway(*cells, value, misfit, ramps.joint, ramps.sign, ramps.pose)
 
@@ -158,13 +191,12 @@ def _release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]
     far, span = x[-1], u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
-    near = int(np.flatnonzero(x < far / 9)[-1])
+    near, used = _parts(x)
     guess = 1.5 * (t[-1] - t[near])  # since release, if x grew as its square
-    used = slice(near // 4, None)  # at first the arm may still settle from the motion before
     low, high = np.array([u[0] + 1e-3 * span, *LOW]), np.array([u[-1], *HIGH])
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        motion = p[5] + p[6] * t + _slide(t, u, p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3]), p[4])
+        motion = p[5] + p[6] * t + _slide(t, u, p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3]), p[4], 0.0)
         priors = (p[3] - DAMPING[0]) / DAMPING[1], p[6] / DRIFT
         return np.concatenate([(motion - x)[used] / ENCODER, priors])
 
@@ -184,10 +216,44 @@ def _release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]
     return (float(best.x[0]) if best.x[0] > u[0] + 5e-3 * span else np.nan), misfit
 
 
+def _release_of(
+    t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
+) -> tuple[float, float]:
+    """Fit the known slide of a `Slide`; return U, Nm, NaN where that is not how the joint moves, and misfit, rad."""
+    span = u[-1] - u[0]
+    if span <= 0:
+        return np.nan, np.nan
+    near, used = _parts(x)
+    rest = x[near // 4 : near + 1]
+    noise = max(ENCODER, float(rest[: len(rest) // 2 + 1].std()))
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        k = kappa * np.exp(p[1])
+        motion = p[2] + p[3] * t + _slide(t, u, p[0], k, RIGID, k * viscous, k * max(p[0] - level, 0.0), fall)
+        return np.concatenate([(motion - x)[used] / noise, [p[1] / SURE, p[3] / DRIFT]])
+
+    fits = []
+    low, high = [u[0], -1.0, *LOW[-2:]], [u[-1], 1.0, *HIGH[-2:]]
+    for back in BACK:
+        first = np.array([u[-1] - (back + 1e-3) * span, 0.0, np.median(rest), 0.0])
+        scale, step = [0.02 * span, 0.5 * SURE, ENCODER, DRIFT], [1e-5, 1e-4, 1e-3, 1e-3]
+        fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
+    best = min(fits, key=lambda fit: fit.cost)
+    left = float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
+    return (float(best.x[0]) if left < EXPLAINED else np.nan), left * noise
+
+
+def _parts(x: np.ndarray) -> tuple[int, slice]:
+    """Return the last row before x (T,) clearly moves, and the rows that are used."""
+    near = int(np.flatnonzero(x < x[-1] / 9)[-1])
+    return near, slice(near // 4, None)  # at first the arm may still settle from the motion before
+
+
 @njit(cache=True)
-def _slide(t, u, U, kappa, z, damping, jump):
+def _slide(t, u, U, kappa, z, damping, jump, fall):
     """Return x (T,) of the motion that this module's docstring describes; u is linear between samples.
 
+    With fall = 0 the jump is sudden.
     Each step solves for the coming velocity, so that creep lengths far below the encoder's noise stay stable.
     """
     x = np.zeros(len(t))
@@ -200,12 +266,19 @@ def _slide(t, u, U, kappa, z, damping, jump):
             before = u[k] + i * rise
             after = before + rise
             beyond = min(max((max(before, after) - U) / max(abs(rise), 1e-12), 0.0), 1.0)  # share of the step
-            push = v + h * (kappa * (0.5 * (before + after) - U) + jump * beyond)
+            push = v + h * kappa * (0.5 * (before + after) - U)
+            drop = h * jump * beyond
             hold = h * kappa * (U - u[0])
             w = v
             for _ in range(60):
                 e = hold * np.exp(-max(at + 0.5 * h * (v + w), 0.0) / z)
-                change = (w * (1.0 + h * damping) - push - e) / (1.0 + h * damping + e * 0.5 * h / z)
+                left, steeper = 0.0, 0.0  # of the friction that is yet to fall
+                if fall > 0.0:
+                    ratio = 0.5 * (v + w) / fall
+                    left = np.exp(-ratio * ratio)
+                    steeper = min(drop * left * ratio / fall, 0.5)
+                off = w * (1.0 + h * damping) - push - e - drop * (1.0 - left)
+                change = off / (1.0 + h * damping + e * 0.5 * h / z - steeper)
                 w -= change
                 if abs(change) < 1e-10:
                     break

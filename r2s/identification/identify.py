@@ -150,8 +150,14 @@ def identify(
             nthread=nthread,
         )
     beside: list[Known] = []
-    if ramps is not None and edges is not None and "rise" in space.blocks:
+    rises = ramps is not None and edges is not None and "rise" in space.blocks
+    if rises:
         beside.append(StaticFriction(robot, ramps, edges))
+
+    def told_by_ramps(d: Dynamics) -> Breakaway:
+        slide = StaticFriction(robot, ramps, edges).slide(d) if rises and not d.family.has_memory else None
+        return breakaway(ramps, delay=float(d.delay), lag=float(d.lag), slide=slide)
+
     kept = np.zeros(robot.n, dtype=bool)
     if settings.keep_nominal:
         kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
@@ -178,6 +184,10 @@ def identify(
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
         problem.adapt(u, fitted=k == len(searches) - 1 or on_level(search))
+    if rises and not nominal.family.has_memory:  # how the arm slides is known by now, and by that when it let go
+        edges = told_by_ramps(space.dynamics(space.from_unit(u)))
+        beside[:] = [StaticFriction(robot, ramps, edges)]
+        problem = problem_of(data, quick)
     if data is quick and commanded and PRESLIDING in space.blocks:
 
         def bends() -> dict[str, np.ndarray]:
@@ -204,7 +214,7 @@ def identify(
             problem.fix(lag)
     dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:
-        edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag))
+        edges = told_by_ramps(dynamics)
         command = _commands(edges, dynamics)
         dynamics = replace(space, break_command=command).dynamics(space.from_unit(u))
         dynamics = replace(dynamics, breakaway=StaticFriction(robot, ramps, edges).edges(dynamics))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from r2s.identification.breakaway import Breakaway
+from r2s.identification.breakaway import Breakaway, Slide
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import LinkInertia, regressor
@@ -21,6 +21,7 @@ class StaticFriction:
     def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
         kept = np.flatnonzero(~np.isnan(edges.value))
         q = np.stack([ramps.recording.q[s.start] for s in ramps.recording.stretches])[kept]
+        self._kept, self._ramps = kept, len(edges.value)
         self.joint, self.side = edges.joint[kept], (edges.sign[kept] > 0).astype(int)
         self.command, own = edges.value[kept], np.arange(len(kept))
         still = np.zeros_like(q)
@@ -28,6 +29,8 @@ class StaticFriction:
         self._gravity, self._nominal = gravity, LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(gravity @ self._nominal)
         self._q = q[own, self.joint]
+        unit = np.eye(robot.n)[self.joint]
+        self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
     def net(self, d: Dynamics) -> np.ndarray:
         """Return (..., K) Nm: all that acted on the joint but friction as it let go."""
@@ -36,6 +39,18 @@ class StaticFriction:
         drag = d.drag[..., self.joint, :]
         pull = d.offset[..., self.joint] + drag[..., 0] * np.sin(self._q) + drag[..., 1] * np.cos(self._q)
         return self.command + pull - left
+
+    def slide(self, d: Dynamics) -> Slide:
+        """Return how joints slide in all ramps, by a family with a Stribeck rise; NaN where one did not let go."""
+        phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
+        sign = np.where(self.side, 1.0, -1.0)
+        level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
+        viscous = phi["viscous"] * (1 + sign * phi.get("viscous_asymmetry", 0.0))
+        inertia = self._inertia @ LinkInertia(d.mass, d.com, d.inertia).standard().ravel() + d.armature[self.joint]
+        out = np.full((4, self._ramps), np.nan)
+        pull = sign * (self.net(d) - self.command)
+        out[:, self._kept] = 1 / inertia, level - pull, viscous, phi["stribeck_velocity"]
+        return Slide(*out)
 
     def edges(self, d: Dynamics) -> np.ndarray:
         """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; d's own without any."""
