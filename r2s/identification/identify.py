@@ -149,14 +149,11 @@ def identify(
             batch=min(len(space.start) + 1, 64),
             nthread=nthread,
         )
-    beside: list[Known] = []
-    rises = ramps is not None and edges is not None and "rise" in space.blocks
-    if rises:
-        beside.append(StaticFriction(robot, ramps, edges))
-
-    def told_by_ramps(d: Dynamics) -> Breakaway:
-        slide = StaticFriction(robot, ramps, edges).slide(d) if rises and not d.family.has_memory else None
-        return breakaway(ramps, delay=float(d.delay), lag=float(d.lag), slide=slide)
+    still = None
+    if ramps is not None and edges is not None and "rise" in space.blocks:
+        still = StaticFriction(robot, ramps, edges)
+    beside: list[Known] = [] if still is None else [still]
+    falls = None if nominal.family.has_memory else still  # bristles creep, and a slide has none
 
     kept = np.zeros(robot.n, dtype=bool)
     if settings.keep_nominal:
@@ -184,9 +181,10 @@ def identify(
         u = v
         # what a first search leaves is not noise: weights come from what the last one could not explain
         problem.adapt(u, fitted=k == len(searches) - 1 or on_level(search))
-    if rises and not nominal.family.has_memory:  # how the arm slides is known by now, and by that when it let go
-        edges = told_by_ramps(space.dynamics(space.from_unit(u)))
-        beside[:] = [StaticFriction(robot, ramps, edges)]
+    if ramps is not None and falls is not None:  # how the arm slides is known by now, and by that when it let go
+        arm = space.dynamics(space.from_unit(u))
+        edges = breakaway(ramps, delay=float(arm.delay), lag=float(arm.lag), slide=falls.slide(arm))
+        beside[:] = [falls := StaticFriction(robot, ramps, edges)]
         problem = problem_of(data, quick)
     if data is quick and commanded and PRESLIDING in space.blocks:
 
@@ -214,7 +212,8 @@ def identify(
             problem.fix(lag)
     dynamics = space.dynamics(space.from_unit(u))
     if commanded and ramps is not None:
-        edges = told_by_ramps(dynamics)
+        slide = None if falls is None else falls.slide(dynamics)
+        edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag), slide=slide)
         command = _commands(edges, dynamics)
         dynamics = replace(space, break_command=command).dynamics(space.from_unit(u))
         dynamics = replace(dynamics, breakaway=StaticFriction(robot, ramps, edges).edges(dynamics))
