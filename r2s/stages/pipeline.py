@@ -94,6 +94,23 @@ def front_door() -> list[str]:
     return [sys.executable, *program, *(word for path in own for word in ("--config-dir", path))]
 
 
+def composed(words: Sequence[str], what: str) -> Any:
+    """Return the config of the command that front_door() and these words make.
+
+    Raises:
+        UserError: there is none; `what` was typed wrongly.
+    """
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return compose("config", list(words))  # by the Hydra that runs this job, which knows the user's own folder
+    except (HydraException, OmegaConfBaseException) as error:
+        said = " ".join(str(error).split()).split(" Config search path")[0].replace("In 'config': ", "")
+        raise UserError(f"{what}: {said}") from None
+
+
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of what is trained, and of what goes to the arm."""
     if cfg.adapt.name == "none":
