@@ -21,6 +21,7 @@ RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 NONE_NEEDED = ("tracker", "experiment")  # groups of which a run may have no option
+GROWS = ("tune.space",)  # what + adds to: an axis that conf/stage/tune.yaml has not
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
@@ -82,7 +83,7 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
     for word in words:
         parsed = OverridesParser.create().parse_override(word)
         names.append(parsed.key_or_group)
-        if parsed.is_add() and parsed.key_or_group not in groups:  # Hydra would take it
+        if parsed.is_add() and parsed.key_or_group not in (*groups, *GROWS):  # Hydra would take it
             raise UnknownOption
         if not parsed.is_sweep_override() and not parsed.is_delete() and parsed.key_or_group in groups:
             check_option(parsed.key_or_group, parsed.value(), groups[parsed.key_or_group])
