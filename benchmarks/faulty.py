@@ -88,11 +88,15 @@ def command(words: Sequence[str], at: Path = ROOT) -> Callable[[], None]:
 def ended(pid: int, limit_s: float = 3600.0) -> int:
     """Wait for a process and return its exit status, negative for a signal; what takes longer than the limit ends."""
     until = time.monotonic() + limit_s
-    while time.monotonic() < until:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.005)
+    try:
+        while time.monotonic() < until:
+            done, status = os.waitpid(pid, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.005)
+    except KeyboardInterrupt:  # it is in a group of its own
+        os.killpg(pid, signal.SIGKILL)
+        raise
     os.killpg(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
     return -signal.SIGALRM
