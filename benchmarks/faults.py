@@ -29,7 +29,7 @@ from faulty import command, ended, forked, one_line, preload, say
 
 SEED = 19
 KEPT = ROOT / "runs" / "faults"
-KILLS = {"train": 12, "identify": 8, "transfer": 6, "compare": 6, "sweep": 5, "tune": 3}
+KILLS = {"train": 10, "tune": 6, "identify": 7, "transfer": 6, "compare": 6, "sweep": 5}
 TOY = ["+experiment=toy", "threads=1"]
 QUICK = [*TOY, "budget.env_steps=960", "evaluation.env_steps=320", "algo.learning_starts=160"]
 QUICK += ["evaluation.episodes=2", "algo.batch_size=16", "algo.hidden=[16,16]"]

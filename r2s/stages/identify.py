@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number
@@ -270,7 +271,7 @@ class Parts:
     robot: Any
     nominal: Any
     searches: list[Any]
-    inputs: list[str]
+    inputs: list[Path | str]
     motion: Any = None
     train: Any = None
     validation: Any = None
@@ -298,7 +299,7 @@ def make_parts(cfg):
         given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
         file = called(File, "data", given)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
-        inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
+        inputs: list[Path | str] = [f for p in (file.path, file.validation) if p for f in files_of(p)]
         ramps = read_user_ramps(robot, file) if file.ramps else None
         inputs += [file.ramps] if file.ramps else []
         return Parts(robot, nominal, searches, inputs, None, train, validation, ramps)
