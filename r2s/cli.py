@@ -25,7 +25,7 @@ GROWS = ("tune.space",)  # what + adds to: an axis that conf/stage/tune.yaml has
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
-def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool) -> None:
+def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool = False) -> None:
     """Check what was typed; Hydra would stop too, with several lines.
 
     A sweep is checked before its first job, value by value.
