@@ -1,6 +1,7 @@
 """What the benchmarks share: the Panda, its published and its true values, settings from conf/, runs, tables."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,6 +14,44 @@ import yaml
 ROOT = Path(__file__).parent.parent
 OF_THE_TASK = ("torque_fraction", "reach")  # what a robot's yaml says of tasks
 sys.path.insert(0, str(ROOT))
+NUMBER = r"\d+(\.\d+)?"
+WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern; who is not here looks for itself
+    **dict.fromkeys(("bench", "gallery"), ()),
+    "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"\d_\d+"),
+    "algorithms": ("trials",),
+    "families": (r"\d+",),
+    "faults": ("kills", "places", "files", "mutations", "page"),
+    "known_truth": (r"\d+",),
+    "least_squares": (NUMBER,),
+    "payload": (r"(root|motions|make)=.+", r"\d+"),
+    "searches": (NUMBER,),
+    "transfer": ("page", "twins", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
+    "twins": (r"make=[12]", r"\d+"),
+}
+
+
+def check_words() -> None:
+    """End the script that was started, with one line, where a word after its name is not one that it takes."""
+    script = Path(sys.argv[0])
+    if script.resolve().parent != ROOT / "benchmarks" or script.stem not in WORDS:
+        return
+    for word in sys.argv[1:]:
+        if not any(re.fullmatch(pattern, word) for pattern in WORDS[script.stem]):
+            allowed = ", ".join(WORDS[script.stem]) or "nothing"
+            print(f"error: {script.name}: '{word}' is not allowed after its name; {allowed} is", file=sys.stderr)
+            sys.exit(2)
+
+
+def say(kind, error, trace) -> None:
+    """Say in one line, as r2s does, that somebody pressed Ctrl-C."""
+    if issubclass(kind, KeyboardInterrupt):
+        print("\ninterrupted; what was written stays, and is not done again", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+check_words()
+sys.excepthook = say
 
 from hydra.utils import instantiate  # noqa: E402
 

@@ -64,7 +64,14 @@ MENDED = """## What was found and mended
 | `r2s look --web`, ended by SIGTERM or by SIGINT to it alone, left the viewer's server behind | tests/test_look.py | r2s/reporting/look.py: a session of its own, which ends with the command |
 | `pipeline.train_minutes=-1` was told after the arm was identified, 0 was taken for null | typing | r2s/stages/pipeline.py |
 | Ctrl-C before a run had begun: a traceback | typing | r2s/cli.py, run.py |
-| `robot.torque_fraction` of nan, '', -1, 1e400, 1e-320 was taken, null with `task=track` never ended (7 of the 14 of the second 600) | mutations | r2s/stages/build.py |"""
+| `robot.torque_fraction` of nan, '', -1, 1e400, 1e-320 was taken, null with `task=track` never ended (7 of the 14 of the second 600) | mutations | r2s/stages/build.py |
+| `task.episode_s=1e308` and `friction.phi1=true` were taken | mutations | r2s/tasks/reach.py, r2s/tasks/track.py, r2s/physics/robot.py |
+| `+experiment=tune algo.tau=nan`, and what else only a training refuses, left a folder of the search and ended at its first trial (5 of those 14); an axis with a value that is none was told when a trial drew it | mutations | r2s/stages/tune.py: every value and both ends of every axis are composed and made as a training would make them, before the folder; so does stage=pipeline its identification and its training |
+| `+experiment=tune algo.gamma=5` was taken, and the axis of that name over it | typing | r2s/stages/tune.py: refused |
+| `+experiment=paper_grid` without `-m` began one training of an hour | typing | r2s/cli.py: refused, with the command that was meant |
+| `r2s list --faild`: argparse's two lines, without the nearest option; `r2s lst` named no command | typing | r2s/commands.py, r2s/cli.py |
+| an arm's address where nothing answers: libfranka waits a minute | typing | r2s/arm/franka.py: at most 6 s |
+| a benchmark took words that it does not know, and Ctrl-C was a traceback | typing | benchmarks/common.py |"""
 
 PINS = """## The pins
 

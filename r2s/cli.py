@@ -21,19 +21,22 @@ RESUMED = ("identify", "train", "tune")
 WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 NONE_NEEDED = ("tracker", "experiment")  # groups of which a run may have no option
+GROWS = ("tune.space",)  # what + adds to: an axis that conf/stage/tune.yaml has not
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
-def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
+def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool = False) -> None:
     """Check what was typed; Hydra would stop too, with several lines.
 
     A sweep is checked before its first job, value by value.
 
     Args:
         words: KEY=VALUE and GROUP=OPTION. config_dir: the user's own, as --config-dir says.
+        multirun: -m was typed.
 
     Raises:
-        UserError: an option that the config does not have, with the nearest that it has; or one that no job reads.
+        UserError: an option that the config does not have, with the nearest that it has; or one that no job reads;
+            a grid without -m.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -48,9 +51,11 @@ def check_overrides(words: Sequence[str], config_dir: str | None) -> None:
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("") if g != "hydra"}
         try:
             names, jobs = _jobs(words, own, groups)
-            configs = [compose("config", job) for job in jobs]
+            configs = [compose("config", job, return_hydra_config=True) for job in jobs]
         except (HydraException, OmegaConfBaseException, UnknownOption):
             raise _first_mistake(words, own, groups) from None
+        if not multirun and configs[0].hydra.sweeper.get("params"):
+            raise UserError(f"this is a grid of jobs, and only -m runs it: python run.py -m {' '.join(words)}")
         for cfg in configs:  # Hydra asks for it before the job does
             if cfg.get("stage") not in STAGES:
                 raise UserError(f"stage: {cfg.get('stage')} is not allowed; allowed: {choices(STAGES)}")
@@ -78,7 +83,7 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
     for word in words:
         parsed = OverridesParser.create().parse_override(word)
         names.append(parsed.key_or_group)
-        if parsed.is_add() and parsed.key_or_group not in groups:  # Hydra would take it
+        if parsed.is_add() and parsed.key_or_group not in (*groups, *GROWS):  # Hydra would take it
             raise UnknownOption
         if not parsed.is_sweep_override() and not parsed.is_delete() and parsed.key_or_group in groups:
             check_option(parsed.key_or_group, parsed.value(), groups[parsed.key_or_group])
@@ -131,7 +136,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
     """Return what is wrong with a word that Hydra does not take."""
     if "=" not in word:
-        return UserError(f"'{word}' is not KEY=VALUE{nearest(word, groups)}")
+        return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)
     bare = key.lstrip("+~")
     for option in [v.strip() for v in value.strip("[]").split(",")] if value.startswith("[") else [value]:
@@ -284,7 +289,7 @@ def compose_and_run():
     job = hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name="config")(run_job)
     try:
         if not (typed.help or typed.hydra_help or typed.cfg or typed.info):
-            check_overrides(typed.overrides, typed.config_dir)
+            check_overrides(typed.overrides, typed.config_dir, typed.multirun)
         with tempfile.TemporaryDirectory() as folder:
             if typed.multirun:  # a job that fails leaves the others alone
                 os.environ["R2S_FAILED"] = str(Path(folder) / "failed.txt")

@@ -5,10 +5,19 @@ folder.
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from r2s.errors import UserError, choices, nearest
 
 PORT = 9090
+
+
+class Parser(ArgumentParser):
+    """A parser that says a mistake as the rest of the command line does."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UserError."""
+        raise UserError(f"{self.prog.removeprefix('r2s ')}: {message}; see {self.prog} --help")
 
 
 def run_command(words: Sequence[str]) -> None:
@@ -20,7 +29,7 @@ def run_command(words: Sequence[str]) -> None:
     Raises:
         UserError: it cannot be done.
     """
-    parser = ArgumentParser(prog="r2s")
+    parser = Parser(prog="r2s")
     commands = parser.add_subparsers(dest="command", required=True)
     listing = commands.add_parser("list", help="the runs there are: status, what came of them, age")
     listing.add_argument("--root", default="runs", help="where run folders live")
@@ -35,7 +44,13 @@ def run_command(words: Sequence[str]) -> None:
     exporting = commands.add_parser("export", help="a policy that travels: a bundle that runs without r2s")
     exporting.add_argument("run", type=Path, metavar="RUN", help="the run folder of a finished training")
     exporting.add_argument("--to", type=Path, help="the new folder, also to=FOLDER; RUN/bundle unless told")
-    typed = parser.parse_args([f"--{w}" if w.startswith("to=") else w for w in words])
+    typed, unknown = parser.parse_known_args([f"--{w}" if w.startswith("to=") else w for w in words])
+    if unknown:
+        own = commands.choices[typed.command].format_usage().replace("[", " ").replace("]", " ").split()
+        options = [w for w in own if w.startswith("--")]
+        raise UserError(
+            f"{typed.command}: no argument '{unknown[0]}'; allowed: {choices(options)}{nearest(unknown[0], options)}"
+        )
     {"list": list_runs, "look": look, "export": export}[typed.command](typed)
 
 

@@ -364,6 +364,12 @@ MISTAKES = {
     "task=track robot.torque_fraction=null": r"robot.torque_fraction: None is not allowed; a number in \[1e-6, 1\]",
     "robot.torque_fraction=[0.3,nan]": r"robot.torque_fraction: nan is not allowed; a number in \[1e-6, 1\] is",
     "stage=pipeline pipeline.train_minutes=0": r"pipeline.train_minutes: 0 is not allowed; a number in \(0, inf\) is",
+    "stage=pipeline +experiment=toy algo.tau=nan": r"algo.tau: nan is not allowed; a number in \(0, 1\] is",
+    "+experiment=paper_grid": r"this is a grid of jobs, and only -m runs it: .* -m \+experiment=paper_grid",
+    "+experiment=[tune,toy] algo.tau=nan": r"algo.tau: nan is not allowed; a number in \(0, 1\] is",
+    "+experiment=[tune,toy] algo.lr=1e-3": r"algo.lr: tune.space looks for it; leave it out, or give tune.space=",
+    "+experiment=[tune,toy] tune.space={algo:[td3,td5]}": r"tune.space: Could not find 'algo/td5'",
+    "lst": r"'lst' is not KEY=VALUE; did you mean 'list'",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
     "robot.ee=end_efector": r"robot.ee: no site, body or link 'end_efector'.*did you mean 'end_effector'",
@@ -457,6 +463,8 @@ def logs(recording, tmp_path_factory) -> dict[str, Path]:
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistake_gets_one_line(mistake, logs, tmp_path):
     """What was wrong, in one line on stderr, exit status 2, and nothing half-written."""
+    if "tune" in mistake:
+        pytest.importorskip("optuna")
     command = re.sub("|".join(logs), lambda found: str(logs[found[0]]), mistake)
     done = r2s(*command.split(), f"root={tmp_path / 'runs'}")
     one_line(done, MISTAKES[mistake])

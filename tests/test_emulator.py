@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -22,7 +23,7 @@ import pytest
 import torch
 from conftest import ROOT, conf
 
-from r2s.arm import fci
+from r2s.arm import fci, franka
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.emulator.control import Control, Fault
 from r2s.arm.emulator.process import Emulator, main
@@ -361,6 +362,29 @@ def test_the_other_robot_and_nobody(client, servers, panda):
     with pytest.raises(UserError, match=f"arm={name}: no connection to 127.1.2.3: libfranka") as nobody:
         make(panda, "127.1.2.3")
     assert "\n" not in str(nobody.value)
+
+
+@pytest.mark.parametrize(
+    ("desk", "control", "there"),
+    [("silent", "silent", False), ("refused", "silent", True), ("open", "silent", True), ("silent", "refused", True)],
+)
+def test_an_address_that_is_silent_is_said_within_seconds(desk, control, there, monkeypatch):
+    """It would take libfranka a minute. Who refuses is there, also who answers at one port alone."""
+    answers, waited = {franka.DESK: desk, fci.PORT: control}, []
+
+    def create_connection(place, timeout):
+        waited.append(timeout)
+        if answers[place[1]] == "open":
+            return SimpleNamespace(close=lambda: None)
+        raise TimeoutError if answers[place[1]] == "silent" else ConnectionRefusedError
+
+    monkeypatch.setattr(franka.socket, "create_connection", create_connection)
+    if there:
+        assert franka.connect(lambda: "a robot", "panda", "172.16.0.2") == "a robot"
+    else:
+        with pytest.raises(UserError, match=r"arm=panda: no connection to 172.16.0.2: nothing there answers"):
+            franka.connect(pytest.fail, "panda", "172.16.0.2")
+    assert sum(waited) < 10
 
 
 @pytest.mark.parametrize("name", CLIENTS)

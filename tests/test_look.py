@@ -155,7 +155,12 @@ def test_without_a_screen_it_says_so_and_writes_pictures(root, monkeypatch, caps
 
 
 def test_what_cannot_be_looked_at_is_one_line(root, monkeypatch, capsys):
-    """A folder that is none, a run that was stopped, arms that differ."""
+    """An argument that is none, a folder that is none, a run that was stopped, arms that differ."""
+    for words, said in ((["list", "--faild"], "no argument '--faild'"), (["look"], "required: RUN; see r2s look")):
+        status, _, err = typed(*words, monkeypatch=monkeypatch, capsys=capsys)
+        assert status == 2
+        assert len(err.splitlines()) == 1
+        assert said in err
     for word, said in (("god", "did you mean 'good'"), ("halted", "it was stopped before its end")):
         run = str(root / "train" / word)
         status, _, err = typed("look", run, monkeypatch=monkeypatch, capsys=capsys)

@@ -15,7 +15,7 @@ from conftest import ROOT
 
 from r2s.errors import UserError
 from r2s.reporting.tuning import against_table, best_so_far
-from r2s.stages.tune import Tune, span, suggested
+from r2s.stages.tune import Tune, corners, span, suggested
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
 TOY = ["+experiment=[tune,toy]", "budget.env_steps=4000", "evaluation.env_steps=800", "algo.learning_starts=320"]
@@ -49,6 +49,13 @@ def test_an_axis_is_what_was_typed():
 def test_a_space_that_is_none_is_one_line(change, said):
     with pytest.raises(UserError, match=said):
         Tune(**TUNE | change)
+
+
+def test_corners_hold_every_value_and_both_ends():
+    """Each at least once, beside the first values of the other axes."""
+    space = {"algo": ["td3", "sac"], "algo.lr": "log(1e-4, 1e-2)", "algo.tau": [0.01]}
+    first = {"algo": "td3", "algo.lr": 1e-4, "algo.tau": 0.01}
+    assert corners(space) == [first, first | {"algo": "sac"}, first | {"algo.lr": 1e-2}]
 
 
 def test_what_is_drawn_lies_in_the_space():

@@ -6,6 +6,7 @@ package is not needed, and what brings the arm to its place on hardware is what 
 """
 
 import importlib
+import socket
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,8 @@ PULL = 15.0  # of tau_max per rad and s, of the integral that then overcomes bre
 PULL_SHARE = 0.15  # of tau_max, at most
 NEAR = 2e-3  # rad: there
 ACCEPTED = 1e-2  # rad: near enough when the time is over; friction of a real wrist
+DESK = 443  # port of the control box's own pages
+ANSWERS_S = 3.0  # a control box is at the other end of a cable
 MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
 
 
@@ -329,10 +332,28 @@ def package(name: str, extra: str) -> ModuleType:
 
 def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
     """Return the client's robot, or raise UserError with libfranka's reason."""
+    if not is_there(address):
+        raise UserError(f"arm={extra}: no connection to {address}: nothing there answers; is its cable in?")
     try:
         return make()
     except Exception as error:
         raise UserError(f"arm={extra}: no connection to {address}: {words(error)}") from None
+
+
+def is_there(address: str) -> bool:
+    """Return whether a computer answers at the address, also where it refuses; libfranka would wait for a minute.
+
+    The arm's own port comes last, where the other one is silent: who opens it is a client.
+    """
+    for port in (DESK, fci.PORT):
+        try:
+            socket.create_connection((address, port), ANSWERS_S).close()
+        except TimeoutError:
+            continue
+        except OSError:
+            pass  # refused; no such name, which libfranka says
+        return True
+    return False
 
 
 def words(error: BaseException) -> str:

@@ -91,6 +91,26 @@ def is_taught(cfg):
     return "training" in cfg.adapt
 
 
+def make_lessons(cfg):
+    """Return robot, task, identified dynamics and lessons of a network of conf/adapt that is to be taught.
+
+    Raises:
+        UserError: it cannot be taught with this config.
+    """
+    from r2s.learning.history import Lessons
+    from r2s.tasks.track import TrackTask
+
+    if not cfg.calibration:
+        raise UserError(f"adapt={cfg.adapt.name}: it is taught for one arm; give calibration=RUN_FOLDER")
+    robot = make_robot(cfg)
+    center, _, _ = calibrated(cfg.calibration, robot)
+    task = make_task(cfg, robot, center)
+    if not isinstance(task, TrackTask) or task.base != "model":
+        raise UserError(f"task: adapt={cfg.adapt.name} is taught on task=track with task.base=model")
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.adapt.training).items()}
+    return robot, task, center, called(Lessons, "adapt.training", settings)
+
+
 def teach(cfg, overrides, keep):
     """Train the network of conf/adapt for the arm of `calibration=`; keep(cfg, folder) copies what was identified."""
     from r2s.adaptation.adapters import NETWORK, save_network
@@ -98,18 +118,9 @@ def teach(cfg, overrides, keep):
     from r2s.learning import history
     from r2s.learning.randomization import identified
     from r2s.progress import Progress
-    from r2s.tasks.track import TrackTask
 
-    if not cfg.calibration:
-        raise UserError(f"adapt={cfg.adapt.name}: it is taught for one arm; give calibration=RUN_FOLDER")
     set_threads(cfg)
-    robot = make_robot(cfg)
-    center, _, _ = calibrated(cfg.calibration, robot)
-    task = make_task(cfg, robot, center)
-    if not isinstance(task, TrackTask) or task.base != "model":
-        raise UserError(f"task: adapt={cfg.adapt.name} is taught on task=track with task.base=model")
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.adapt.training).items()}
-    lessons = called(history.Lessons, "adapt.training", settings)
+    robot, task, center, lessons = make_lessons(cfg)
     draw = identified(robot, center, cfg.calibration)
     with open_run(cfg, overrides, parents=[str(cfg.calibration)]) as run:
         keep(cfg, run.folder)

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number
@@ -261,46 +262,71 @@ def make_settings(cfg, torque):
     return called(Settings, "identify", words | {"family": cfg.friction.family})
 
 
-def identify(cfg, overrides):
-    """Recording -> parameters.yaml, errors on training and validation motion, figures."""
+@dataclass(frozen=True)
+class Parts:
+    """What an identification begins with. What a config says wrongly of it is said while they are made, before any
+    folder. Of an arm `train`, `validation` and `ramps` are recorded later.
+    """
+
+    robot: Any
+    nominal: Any
+    searches: list[Any]
+    inputs: list[Path | str]
+    motion: Any = None
+    train: Any = None
+    validation: Any = None
+    ramps: Any = None
+
+
+def make_parts(cfg):
+    """Return the parts of the identification that a config asks for; a real arm is not touched.
+
+    Raises:
+        UserError: it asks for none that there can be.
+    """
     from r2s.excitation.motion import load
-    from r2s.identification.identify import identify as run_identify
-    from r2s.identification.parameter_file import save_parameters
-    from r2s.identification.prediction import prediction_errors
-    from r2s.physics.description import write_description
-    from r2s.progress import Progress
     from r2s.recordings.readers import files_of
-    from r2s.reporting import pages
-    from r2s.reporting.identification_tables import identification_table
 
     robot = make_robot(cfg)
     nominal = make_dynamics(cfg, robot)
     searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
-    # what is wrong is said before a folder is made
     check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
     if cfg.data.torque in cfg.identify.terms:
-        settings = make_settings(cfg, cfg.data.torque)
-    inputs, ramps, motion = [], None, None
+        make_settings(cfg, cfg.data.torque)
     if cfg.data.kind == "recording":
         own = {f.name for f in fields(File)}  # an experiment may set what other kinds of data have
         given = {k: v for k, v in plain(cfg.data).items() if k in own}
         given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
         file = called(File, "data", given)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
-        inputs = [f for p in (file.path, file.validation) if p for f in files_of(p)]
-        if file.ramps:
-            ramps = read_user_ramps(robot, file)
-            inputs.append(file.ramps)
-    else:
-        called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
-        ramp_poses(cfg, robot)
-        check_source(cfg, robot)
-        if cfg.data.excitation:
-            motion = load(cfg.data.excitation, robot)
-            inputs = [cfg.data.excitation]
-    with open_run(cfg, overrides, inputs) as run:
+        inputs: list[Path | str] = [f for p in (file.path, file.validation) if p for f in files_of(p)]
+        ramps = read_user_ramps(robot, file) if file.ramps else None
+        inputs += [file.ramps] if file.ramps else []
+        return Parts(robot, nominal, searches, inputs, None, train, validation, ramps)
+    called(Simulated if cfg.data.kind == "simulated" else Excitation, "data", plain(cfg.data))
+    ramp_poses(cfg, robot)
+    check_source(cfg, robot)
+    if not cfg.data.excitation:
+        return Parts(robot, nominal, searches, [])
+    return Parts(robot, nominal, searches, [cfg.data.excitation], load(cfg.data.excitation, robot))
+
+
+def identify(cfg, overrides):
+    """Recording -> parameters.yaml, errors on training and validation motion, figures."""
+    from r2s.identification.identify import identify as run_identify
+    from r2s.identification.parameter_file import save_parameters
+    from r2s.identification.prediction import prediction_errors
+    from r2s.physics.description import write_description
+    from r2s.progress import Progress
+    from r2s.reporting import pages
+    from r2s.reporting.identification_tables import identification_table
+
+    made = make_parts(cfg)
+    robot, nominal = made.robot, made.nominal
+    train, validation, ramps = made.train, made.validation, made.ramps
+    with open_run(cfg, overrides, made.inputs) as run:
         if cfg.data.kind != "recording":
-            train, validation, ramps = recorded(cfg, robot, run, motion)
+            train, validation, ramps = recorded(cfg, robot, run, made.motion)
         settings = make_settings(cfg, train.torque)
         progress = Progress("identify")
 
@@ -314,7 +340,7 @@ def identify(cfg, overrides):
             robot,
             nominal,
             train,
-            searches,
+            made.searches,
             settings,
             ramps=ramps,
             seed=cfg.seed,

@@ -94,6 +94,24 @@ def front_door() -> list[str]:
     return [sys.executable, *program, *(word for path in own for word in ("--config-dir", path))]
 
 
+def composed(words: Sequence[str], what: str) -> Any:
+    """Return the config of the command that front_door() and these words make.
+
+    Raises:
+        UserError: there is none; `what` was typed wrongly.
+    """
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return compose("config", list(words))  # by the Hydra that runs this job, which knows the user's own folder
+    except (HydraException, OmegaConfBaseException) as error:
+        said = " ".join(str(error).split()).removeprefix("In 'config': ")
+        said = said.split(" Config search path")[0].split(" To append")[0]
+        raise UserError(f"{what}: {said}") from None
+
+
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of what is trained, and of what goes to the arm."""
     if cfg.adapt.name == "none":
@@ -160,6 +178,13 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     ]
 
 
+def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
+    """Raise UserError where a step would refuse what was typed: said now, not after the arm was identified."""
+    first, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
+    identify.make_parts(composed(first["identify"], "stage=identify"))
+    train.check(composed(trained["nominal"], "stage=train"))  # the identified model is not there yet
+
+
 def chosen(overrides: Sequence[str], cfg: Any) -> list[str]:
     """Return the words by which a training gets the model that identification starts from."""
     from hydra.core.hydra_config import HydraConfig
@@ -175,9 +200,7 @@ def pipeline(cfg, overrides):
     from r2s.reporting.tables import reach_table
     from r2s.runs import read_summary
 
-    if cfg.pipeline.train_minutes is None:
-        train.make_budget(cfg)
-    else:  # said now, not after the arm was identified
+    if cfg.pipeline.train_minutes is not None:
         check_number("pipeline.train_minutes", cfg.pipeline.train_minutes, "(0, inf)")
     robot, root = make_robot(cfg), Path(cfg.root)
     if "calibration" in cfg.dr:
@@ -186,6 +209,7 @@ def pipeline(cfg, overrides):
         )
     if cfg.name and not (root / "pipeline" / cfg.name).exists():
         check_free(root, cfg.name, cfg)
+    check_steps(cfg, overrides)
     with open_run(cfg, overrides) as run:
         name = run.folder.name
         check_free(root, name, cfg)

@@ -1,10 +1,11 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from r2s.errors import check_number
-from r2s.stages.adapting import is_taught, teach
+from r2s.stages.adapting import is_taught, make_lessons, teach
 from r2s.stages.build import (
     Evaluation,
     called,
@@ -50,28 +51,35 @@ def reads(cfg):
     return keys
 
 
-def train(cfg, overrides):
-    """Train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
-    import copy
+@dataclass(frozen=True)
+class Parts:
+    """What a training is made of. What a config says wrongly of it is said while they are made, before any folder."""
 
+    robot: Any
+    task: Any
+    draw: Any
+    weights: Any
+    env: Any
+    evaluate: Any
+    algo: Any
+    loop: Any
+    budget: Any
+    episodes: int
+    device: str
+
+
+def make_parts(cfg):
+    """Return the parts of the training that a config asks for.
+
+    Raises:
+        UserError: it asks for none that there can be.
+    """
     import torch
 
-    from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import SELECTED, make_evaluation
-    from r2s.learning.policy import export_onnx, load_policy, save_policy
-    from r2s.learning.train import Listeners
-    from r2s.learning.train import train as run_train
-    from r2s.progress import Progress
-    from r2s.reporting import pages
-    from r2s.reporting.measures import in_short
-    from r2s.reporting.tables import reach_table
     from r2s.tasks.rewards import Curriculum
 
-    if is_taught(cfg):
-        return teach(cfg, overrides, keep_calibration)
-    if not is_learner(cfg):
-        return reference(cfg, overrides)
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     n_envs, loop, settings = split(cfg)
     budget = make_budget(cfg)
@@ -81,11 +89,43 @@ def train(cfg, overrides):
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
-    words = {"episodes": evaluation.episodes, "nthread": cfg.threads}
-    evaluate = make_evaluation(robot, task, draw, **words, seed=SELECTED)
+    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads, seed=SELECTED)
     torque = torch.from_numpy(task.share * task.torque(robot))
     scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
-    algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
+    algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque)
+    return Parts(robot, task, draw, weights, env, evaluate, algo, loop, budget, evaluation.episodes, device(cfg))
+
+
+def check(cfg):
+    """Raise UserError where stage=train would refuse this config before it makes a run folder."""
+    if is_taught(cfg):
+        make_lessons(cfg)
+    elif is_learner(cfg):
+        make_parts(cfg)
+    else:
+        make_reference(cfg)
+
+
+def train(cfg, overrides):
+    """Train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
+    import copy
+
+    from r2s.learning.checkpoint import Checkpoint
+    from r2s.learning.evaluate import make_evaluation
+    from r2s.learning.policy import export_onnx, load_policy, save_policy
+    from r2s.learning.train import Listeners
+    from r2s.learning.train import train as run_train
+    from r2s.progress import Progress
+    from r2s.reporting import pages
+    from r2s.reporting.measures import in_short
+    from r2s.reporting.tables import reach_table
+
+    if is_taught(cfg):
+        return teach(cfg, overrides, keep_calibration)
+    if not is_learner(cfg):
+        return reference(cfg, overrides)
+    made = make_parts(cfg)
+    robot, task, algo = made.robot, made.task, made.algo.to(made.device)
     best: dict = {}
     last: dict = {}
 
@@ -115,12 +155,12 @@ def train(cfg, overrides):
             progress(share, ", ".join([text, *in_short(row)]))
 
         run_train(
-            env,
+            made.env,
             algo,
-            evaluate,
-            weights,
-            loop,
-            budget,
+            made.evaluate,
+            made.weights,
+            made.loop,
+            made.budget,
             checkpoint=checkpoint,
             dump=run.folder / "dump.pt",
             listeners=Listeners(lambda row: run.log("metrics", row), evaluated, show),
@@ -129,7 +169,7 @@ def train(cfg, overrides):
         checkpoint.clear()
         policy = load_policy(run.folder, robot, task)
         export_onnx(run.folder / "policy.onnx", policy, robot, task)
-        judge = make_evaluation(robot, task, draw, **words)
+        judge = make_evaluation(robot, task, made.draw, episodes=made.episodes, nthread=cfg.threads)
         judged = {"best": best | task.measures(judge(policy))}
         judged["last"] = last | task.measures(judge(copy.deepcopy(algo.policy).cpu()))
         run.summary(judged | {"best on the goals it was chosen on": best})
@@ -190,20 +230,27 @@ def title(cfg):
     return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 
 
-def reference(cfg, overrides):
-    """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
+def make_reference(cfg):
+    """Return robot, task, controller, and how it is evaluated: of an algo that is not trained."""
     from r2s.learning.evaluate import make_evaluation
-    from r2s.reporting import pages
-    from r2s.reporting.tables import reach_table
 
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
     robot = make_robot(cfg)
     center = make_dynamics(cfg, robot)
-    task, draw, name = make_task(cfg, robot, center), make_draw(cfg, robot, center), cfg.algo.name
+    task, draw = make_task(cfg, robot, center), make_draw(cfg, robot, center)
     controller = make_controller(cfg, robot, task, center)
+    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
+    return robot, task, controller, evaluate
+
+
+def reference(cfg, overrides):
+    """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
+    from r2s.reporting import pages
+    from r2s.reporting.tables import reach_table
+
+    name, (robot, task, controller, evaluate) = cfg.algo.name, make_reference(cfg)
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         keep_calibration(cfg, run.folder)
-        evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
         done = evaluate(controller)
         row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | task.measures(done)
         run.log("evaluations", row)

@@ -13,8 +13,8 @@ from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.stages import train
-from r2s.stages.build import called, console, open_run, plain
-from r2s.stages.pipeline import front_door, handed_on
+from r2s.stages.build import called, console, open_run, plain, unread
+from r2s.stages.pipeline import composed, front_door, handed_on
 
 MEASURES = {"return_paper": "maximize", "success_1cm": "maximize", "success_5mm": "maximize"}
 MEASURES |= {"distance_median_m": "minimize", "path_rmse_mm": "minimize", "within_5mm": "maximize"}
@@ -104,6 +104,28 @@ def suggested(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
+def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return settings that hold every value of each axis, and both ends of an interval, at least once."""
+    values = {key: axis if isinstance(axis, list) else [*span(key, axis)[:2]] for key, axis in space.items()}
+    first = {key: own[0] for key, own in values.items()}
+    return [first, *({**first, key: value} for key, own in values.items() for value in own[1:])]
+
+
+def check_trainings(cfg, overrides, space):
+    """Raise UserError where a training would refuse what was typed, or an axis of the space."""
+    typed = {o.lstrip("+~").split("=")[0] for o in overrides}
+    if both := sorted(typed & set(space)):
+        raise UserError(
+            f"{both[0]}: tune.space looks for it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}"
+        )
+    for settings in corners(space):
+        step = composed(handed(cfg, overrides, settings), "tune.space")
+        for key in space:
+            if why := unread(key, step):
+                raise UserError(f"tune.space: {why}")
+        train.check(step)
+
+
 class Training:
     """One trial: a training that runs beside this process, and what its evaluations said."""
 
@@ -166,7 +188,7 @@ def tune(cfg, overrides):
 
     given = {k: v for k, v in plain(cfg.tune).items() if k in {f.name for f in fields(Tune)}}
     how = called(Tune, "tune", given)
-    train.make_budget(cfg)
+    check_trainings(cfg, overrides, how.space)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     with open_run(cfg, overrides) as run:
         study = optuna.create_study(
@@ -197,19 +219,21 @@ def tune(cfg, overrides):
     print(f"written: {run.folder} (look: {run.folder / 'report.md'})")
 
 
-def training(cfg, overrides, run, trial, space):
-    """Return the started training of a trial."""
-    from omegaconf import OmegaConf
-
+def handed(cfg, overrides, settings):
+    """Return the words of a training: what was typed and it reads, and the settings {option: value}."""
     step = cfg.copy()
     step.stage = "train"
-    handed = [o for o in handed_on(overrides, step) if not o.startswith(("resume=", "only_missing="))]
+    typed = [o for o in handed_on(overrides, step) if not o.startswith(("resume=", "only_missing="))]
+    return [*typed, *(f"{k}={v}" for k, v in settings.items()), "stage=train", "threads=1"]
+
+
+def training(cfg, overrides, run, trial, space):
+    """Return the started training of a trial."""
     name = f"{run.folder.name}_{trial.number}"
-    typed = [f"{k}={v}" for k, v in suggested(trial, space).items()]
-    head = [f"root={cfg.root}", "stage=train", f"name={name}", "threads=1", "only_missing=true"]
-    folder = Path(OmegaConf.select(cfg, "root")) / "train" / name
+    words = handed(cfg, overrides, suggested(trial, space))
+    folder = Path(cfg.root) / "train" / name
     folder.parent.mkdir(parents=True, exist_ok=True)
-    return Training(trial, folder, [*front_door(), *handed, *typed, *head])
+    return Training(trial, folder, [*front_door(), *words, f"root={cfg.root}", f"name={name}", "only_missing=true"])
 
 
 def search(study, how, start, progress, cfg):
