@@ -4,7 +4,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from r2s.errors import check_number
-from r2s.stages.adapting import is_taught, teach
+from r2s.stages.adapting import is_taught, is_told, teach, teach_latent, told_draw, told_of
 from r2s.stages.build import (
     Evaluation,
     called,
@@ -28,7 +28,7 @@ WHY = {
     "inertia": "calibration= says what the links are",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
-    "adapt": "adapters work on an arm, with stage=transfer; of them adapt=history is trained",
+    "adapt": "adapters work on an arm, with stage=transfer; of them history is trained, osi and rma with a policy",
     "arm": "a training meets no arm; stage=transfer does",
     "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
     "data": "only stage=identify records or reads a motion",
@@ -47,6 +47,7 @@ def reads(cfg):
         keys |= {"friction", "inertia"}
     if "n_envs" in cfg.algo:  # else it is a controller
         keys |= {"budget", "reward", "evaluation", "compile", "matmul", "device"}
+        keys |= {"adapt"} if is_told(cfg) else set()
     return keys
 
 
@@ -59,7 +60,7 @@ def train(cfg, overrides):
     from r2s.learning.checkpoint import Checkpoint
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import SELECTED, make_evaluation
-    from r2s.learning.policy import export_onnx, load_policy, save_policy
+    from r2s.learning.policy import export_onnx, load_policy, observation_scale, save_policy
     from r2s.learning.train import Listeners
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
@@ -78,13 +79,16 @@ def train(cfg, overrides):
     robot, model = make_robot(cfg), own_model(cfg)
     center = make_dynamics(model, robot)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
+    identified, told = draw, told_of(cfg, robot)
+    if told:
+        draw, settings = told_draw(cfg, robot, center, draw), settings | {"told": told}
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     words = {"episodes": evaluation.episodes, "nthread": cfg.threads}
     evaluate = make_evaluation(robot, task, draw, **words, seed=SELECTED)
     torque = torch.from_numpy(task.share * task.torque(robot))
-    scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
+    scale = observation_scale(robot, task, told)
     algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
     best: dict = {}
     last: dict = {}
@@ -126,13 +130,16 @@ def train(cfg, overrides):
             listeners=Listeners(lambda row: run.log("metrics", row), evaluated, show),
         )
         progress.close()
-        checkpoint.clear()
         policy = load_policy(run.folder, robot, task)
         export_onnx(run.folder / "policy.onnx", policy, robot, task)
         judge = make_evaluation(robot, task, draw, **words)
         judged = {"best": best | task.measures(judge(policy))}
         judged["last"] = last | task.measures(judge(copy.deepcopy(algo.policy).cpu()))
-        run.summary(judged | {"best on the goals it was chosen on": best})
+        more = {"best on the goals it was chosen on": best}
+        if told and told.latent:
+            more["student"] = teach_latent(cfg, run.folder, robot, task, center, identified, policy)
+        checkpoint.clear()
+        run.summary(judged | more)
         pages.training(run, robot)
         reach_table(console(), judged, f"{title(cfg)}; on goals that nothing was chosen on")
     print(f"written: {run.folder}")
