@@ -5,9 +5,13 @@
 TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to
 2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
 under computed torque, or under a training's policy; adapt=history with a network of its own (two minutes of a core).
-osi and rma are policies of their own, trained for env_steps=300000 where they are missing (osi_m1_0, rma_m1_0; see
-`told_words`); osi_untold and rma_untold are the same without their adapter. Rows go to ROOT/bench/adapters.csv, each only once, and the table of what is there is printed: means over twins and
-episodes with paired 95 % bootstrap intervals.
+osi and rma are policies of their own, trained for env_steps=300000 where they are missing, as osi_m1_0 and rma_m1_0
+(`told_words`); osi_untold and rma_untold are these without their adapter. Rows go to ROOT/bench/adapters.csv, each
+only once, and the table of what is there is printed: means over twins and episodes with paired 95 % bootstrap
+intervals. A long run, a quarter of an hour of a core for each policy:
+
+    python benchmarks/adapters.py adapters=none,observer,rls,history,osi,osi_untold,rma,rma_untold \
+        env_steps=1500000 1_0 1_1 2_0
 
 Conditions: a payload of 0, 0.5, 1.0, 1.5 kg put on at U(0.5, 1.5) s, its centre uniform within 7.5 cm; friction that
 has warmed to 0.8 of what it was when the arm was identified; commands that come 5 ms later. Judged is from 1 s after
@@ -147,6 +151,22 @@ def told_folder(root: Path, adapter: str, kind: str, name: str) -> Path:
     return root / "train" / f"{adapter}_m{name}{'' if kind == 'track' else f'_{kind}'}"
 
 
+def under_which(known, bare, folder: Path | str | None, adapter: str):
+    """Return what is known of an arm, the task, and what makes the policy of a run folder, or computed torque."""
+    if adapter in TOLD:
+        known = replace(known, policy=Path(folder))
+        bare = replace(bare, residual=RESIDUAL) if isinstance(bare, TrackTask) else bare
+    task = bare.believing(ROBOT, known.dynamics)
+
+    def policy():
+        if folder is None:
+            return computed_torque(ROBOT, task, known.dynamics)
+        found = load_policy(Path(folder), ROBOT, task)
+        return found.by_latent() if found.told and found.told.latent else found
+
+    return known, task, policy
+
+
 def made_of(adapter: str, known, network: Path):
     """Return an adapter with the settings of conf/adapt."""
     settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", *BESIDE)}
@@ -230,30 +250,13 @@ def main() -> None:
     for name in names:
         shared = made.Known(ROBOT, *calibrated(root / "identify" / f"m{name}", ROBOT))
 
-        def controlled(adapter, name=name, shared=shared):
-            """Return what is known, the task, what makes a policy, and what the model says of it."""
+        each = {}
+        for adapter in wanted:
             own = adapter.removesuffix("_untold")
-            if own in TOLD:
-                folder = told_folder(root, own, kind, name)
-                known = replace(shared, policy=folder)
-                changed = replace(bare, residual=RESIDUAL) if kind == "track" else bare
-                task = changed.believing(ROBOT, known.dynamics)
-
-                def policy():
-                    found = load_policy(folder, ROBOT, task)
-                    return found.by_latent() if found.told.latent else found
-            else:
-                known, task = shared, bare.believing(ROBOT, shared.dynamics)
-
-                def policy():
-                    if "policy" in words:
-                        return load_policy(Path(words["policy"]), ROBOT, task)
-                    return computed_torque(ROBOT, task, known.dynamics)
-
-            batch = ArmBatch(ROBOT, task, known.dynamics, count, 1)
-            return known, task, policy, rollout(policy(), batch, task, starts, goals)
-
-        each = {adapter: controlled(adapter) for adapter in wanted}
+            folder = told_folder(root, own, kind, name) if own in TOLD else words.get("policy")
+            known, task, policy = under_which(shared, bare, folder, own)
+            model = ArmBatch(ROBOT, task, known.dynamics, count, 1)
+            each[adapter] = known, task, policy, rollout(policy(), model, task, starts, goals)
         for condition in CONDITIONS:
             for adapter in wanted:
                 known, task, policy, predicted = each[adapter]

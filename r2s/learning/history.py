@@ -37,13 +37,15 @@ class Lessons:
     """What a network is taught with.
 
     Attributes:
-        arms: at once. rounds: of them, an episode each. payload: least and most kg, put on at any time in half of an
-            episode. friction: least and most of what was identified. late: s, the most by which commands come later.
+        arms: at once. rounds: of them, an episode each. parts: of an episode, each with another arm.
+        payload: least and most kg, put on at any time in the first half of a part. friction: least and most of what
+            was identified. late: s, the most by which commands come later.
         hidden: units of each of two layers. epochs: passes over all. paths: drawn in all.
     """
 
     arms: int = 64
     rounds: int = 12
+    parts: int = 1
     payload: tuple[float, float] = (0.0, 1.5)
     friction: tuple[float, float] = (0.7, 1.2)
     late: float = 0.005
@@ -53,7 +55,7 @@ class Lessons:
 
     def __post_init__(self):
         check_changes(self.payload, self.friction, self.late)
-        for name in ("arms", "rounds", "hidden", "epochs", "paths"):
+        for name in ("arms", "rounds", "parts", "hidden", "epochs", "paths"):
             check_number(f"training.{name}", getattr(self, name), "[1, inf)", whole=True)
 
 
@@ -133,11 +135,12 @@ def heard(
         lessons: see there. plans: goals, to choose from. seed: of the draws. lesson: what is answered.
     """
     rng, m, n = np.random.default_rng([seed, 17]), lessons.arms, robot.n
-    bare, full = drawn(robot, draw, lessons, rng)
-    answers = [[lesson.answer(d.one(k)) for k in range(m)] for d in (bare, full)]
+    arms = [d for _ in range(lessons.parts) for d in drawn(robot, draw, lessons, rng)]  # bare, laden, bare, ...
+    answers = [[lesson.answer(d.one(k)) for k in range(m)] for d in arms]
     goals = plans[rng.integers(len(plans), size=m)]
-    helps, on = rng.uniform(0, 1.1, m).clip(0, 1), rng.integers(0, task.steps // 2, m)
-    sim, torque = Simulator(robot, bare, m, 1), task.torque(robot)
+    part = task.steps // lessons.parts
+    helps, on = rng.uniform(0, 1.1, m).clip(0, 1), rng.integers(0, part // 2, (lessons.parts, m))
+    sim, torque = Simulator(robot, arms[0], m, 1), task.torque(robot)
     sim.drive(limits(robot, torque))
     sim.reset(task.begin(np.tile(robot.q_home, (m, 1)), goals), np.zeros((m, n)))
     actuation = Actuation(robot, m, cutoff_hz=task.cutoff_hz)
@@ -147,9 +150,12 @@ def heard(
     (filtered, before), right = np.zeros((2, m, n)), np.zeros((m, lesson.count))
     holds, never, limited = np.zeros(m, dtype=int), np.zeros(m, dtype=bool), np.zeros(m)
     for step in range(task.steps):
-        if (new := np.flatnonzero(on == step)).size:
-            sim.set_dynamics(some(full, new), new)
-            holds[new] = 1
+        now = min(step // part, lessons.parts - 1)
+        laden = step - now * part >= on[now]
+        for which in (0, 1):
+            if (new := np.flatnonzero((laden == which) & (holds != 2 * now + which))).size:
+                sim.set_dynamics(some(arms[2 * now + which], new), new)
+                holds[new] = 2 * now + which
         t = np.full(m, step / task.ctrl_hz)
         share = (sim.limited - limited) / task.substeps
         state = State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, actuation.last, never, share)
