@@ -1,11 +1,17 @@
 """The league of adapters (docs/adaptation.md): one frozen controller, what nobody announced, and who copes.
 
-`python benchmarks/adapters.py [root=RUNS] [task=reach] [policy=FOLDER] [adapters=NAME,...] [episodes=N] TWIN ...`
+`python benchmarks/adapters.py [root=RUNS] [task=reach] [policy=FOLDER] [adapters=NAME,...] [episodes=N]
+[env_steps=N] TWIN ...`
 TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to
 2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
 under computed torque, or under a training's policy; adapt=history with a network of its own (two minutes of a core).
-Rows go to ROOT/bench/adapters.csv, each only once, and the table of what is there is printed: means over twins and
-episodes with paired 95 % bootstrap intervals.
+osi and rma are policies of their own, trained for env_steps=300000 where they are missing, as osi_m1_0 and rma_m1_0
+(`told_words`); osi_untold and rma_untold are these without their adapter. Rows go to ROOT/bench/adapters.csv, each
+only once, and the table of what is there is printed: means over twins and episodes with paired 95 % bootstrap
+intervals. A long run, a quarter of an hour of a core for each policy:
+
+    python benchmarks/adapters.py adapters=none,observer,rls,history,osi,osi_untold,rma,rma_untold \
+        env_steps=1500000 1_0 1_1 2_0
 
 Conditions: a payload of 0, 0.5, 1.0, 1.5 kg put on at U(0.5, 1.5) s, its centre uniform within 7.5 cm; friction that
 has warmed to 0.8 of what it was when the arm was identified; commands that come 5 ms later. Judged is from 1 s after
@@ -42,6 +48,8 @@ CONDITIONS: dict[str, dict] = {f"{m:g} kg": {"mass": m} for m in (0.0, 0.5, 1.0,
 CONDITIONS |= {"friction 0.8": {"friction": 0.8}, "5 ms later": {"late": 5}}
 TASKS = {"track": TrackTask, "reach": ReachTask}
 SETTLE_S = 1.0
+TOLD = ("osi", "rma")  # adapters that come with a policy
+RESIDUAL = 0.5  # of those on task=track: with a tenth no action holds 1.5 kg
 KEY = ["twin", "under", "condition", "adapter", "episode"]
 
 
@@ -109,7 +117,8 @@ def one(name: str, task, under: str, condition: str, adapter: str, known, policy
     make, seed = (int(x) for x in name.split("_"))
     given, rows, (starts, goals, predicted) = CONDITIONS[condition], [], episodes
     arm, commanded = opened(make, seed, **given)
-    works = None if adapter == "none" else made_of(adapter, known, networks / f"net_m{name}")
+    silent = adapter == "none" or adapter.endswith("_untold")
+    works = None if silent else made_of(adapter, known, networks / f"net_m{name}")
     driven = DrivenArm(commanded, task, known.dynamics.level, adapter=works)
     for k in range(len(goals)):
         thing = carried(np.random.default_rng([make, seed, k]), given.get("mass", 0.0))
@@ -129,10 +138,39 @@ def one(name: str, task, under: str, condition: str, adapter: str, known, policy
     return rows
 
 
+def told_words(adapter: str, kind: str, root: Path, name: str, env_steps: int) -> list[str]:
+    """Return the command that trains the policy of osi or rma for a twin."""
+    words = [f"adapt={adapter}", f"task={kind}", f"calibration={root / 'identify' / f'm{name}'}", "dr=identified"]
+    words += [f"task.residual={RESIDUAL}"] * (kind == "track")
+    words += ["budget.minutes=null", f"budget.env_steps={env_steps}", f"root={root}"]
+    return [*words, f"name={told_folder(root, adapter, kind, name).name}"]
+
+
+def told_folder(root: Path, adapter: str, kind: str, name: str) -> Path:
+    """Return the run folder of that policy."""
+    return root / "train" / f"{adapter}_m{name}{'' if kind == 'track' else f'_{kind}'}"
+
+
+def under_which(known, bare, folder: Path | str | None, adapter: str):
+    """Return what is known of an arm, the task, and what makes the policy of a run folder, or computed torque."""
+    if adapter in TOLD:
+        known = replace(known, policy=Path(folder))
+        bare = replace(bare, residual=RESIDUAL) if isinstance(bare, TrackTask) else bare
+    task = bare.believing(ROBOT, known.dynamics)
+
+    def policy():
+        if folder is None:
+            return computed_torque(ROBOT, task, known.dynamics)
+        found = load_policy(Path(folder), ROBOT, task)
+        return found.by_latent() if found.told and found.told.latent else found
+
+    return known, task, policy
+
+
 def made_of(adapter: str, known, network: Path):
     """Return an adapter with the settings of conf/adapt."""
     settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", *BESIDE)}
-    if "network" in settings:
+    if "network" in settings and adapter not in TOLD:
         settings["network"] = network
     return getattr(made, adapter)(known, **settings)
 
@@ -199,21 +237,29 @@ def main() -> None:
         for n in names
         if "history" in wanted and not (root / "train" / f"net_m{n}" / made.NETWORK).is_file()
     )
+    own = [a for a in TOLD if {a, f"{a}_untold"} & set(wanted)]
+    side_by_side(
+        told_words(a, kind, root, n, int(words.get("env_steps", 300_000)))
+        for n in names
+        for a in own
+        if not (told_folder(root, a, kind, n) / "summary.json").is_file()
+    )
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in conf(f"task/{kind}").items()}
     bare = TASKS[kind](**settings)
     starts, goals = fixed_episodes(ROBOT, bare, count)
     for name in names:
-        known = made.Known(ROBOT, *calibrated(root / "identify" / f"m{name}", ROBOT))
-        task = bare.believing(ROBOT, known.dynamics)
+        shared = made.Known(ROBOT, *calibrated(root / "identify" / f"m{name}", ROBOT))
 
-        def policy(task=task, known=known):
-            if "policy" in words:
-                return load_policy(Path(words["policy"]), ROBOT, task)
-            return computed_torque(ROBOT, task, known.dynamics)
-
-        predicted = rollout(policy(), ArmBatch(ROBOT, task, known.dynamics, count, 1), task, starts, goals)
+        each = {}
+        for adapter in wanted:
+            own = adapter.removesuffix("_untold")
+            folder = told_folder(root, own, kind, name) if own in TOLD else words.get("policy")
+            known, task, policy = under_which(shared, bare, folder, own)
+            model = ArmBatch(ROBOT, task, known.dynamics, count, 1)
+            each[adapter] = known, task, policy, rollout(policy(), model, task, starts, goals)
         for condition in CONDITIONS:
             for adapter in wanted:
+                known, task, policy, predicted = each[adapter]
                 old = pd.read_csv(path) if path.is_file() else pd.DataFrame(columns=KEY)
                 same = (old["twin"] == name) & (old["under"] == under) & (old["condition"] == condition)
                 if (same & (old["adapter"] == adapter)).sum() >= count:

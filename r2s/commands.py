@@ -110,6 +110,8 @@ def export(typed: Namespace) -> None:
     center = make_dynamics(trained, robot)
     task = make_task(trained, robot, center)
     policy, to = load_policy(source, robot, task), typed.to or source / "bundle"
+    if policy.told:
+        raise UserError(f"export: the policy of {source} is told of its arm by an adapter, which no bundle has")
     places = [path.stem for group in ("simulator", "arm") for path in (CONF / group).glob("*.yaml")]
     write_bundle(to, source, robot, task, center, policy, plain(trained), places)
     print(f"written: {to}")

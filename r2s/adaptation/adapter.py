@@ -1,6 +1,6 @@
 """What works under a frozen policy: it hears every cycle of an arm, and adds a torque to what the policy asks for."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,3 +22,14 @@ class Adapter(Protocol):
             q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity, the command that was sent in it.
         """
         ...
+
+
+@runtime_checkable
+class Tells(Protocol):
+    """An `Adapter` that tells a policy of its arm, one that was trained to be told (telling.py).
+
+    Attributes:
+        told: (c,), the newest, an array of its own each time; zeros where a motion begins.
+    """
+
+    told: np.ndarray

@@ -15,14 +15,17 @@ from r2s.adaptation.history import History, Network, inputs
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.listen import noise
 from r2s.adaptation.observer import Observer
+from r2s.adaptation.telling import Latent, Telling
 from r2s.errors import UserError
 from r2s.files import DAMAGED, whole
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.payload import hand
 from r2s.physics.robot import Robot
+from r2s.provenance import sha256
 from r2s.recordings.recording import Recording
 
-NETWORK = "network.npz"
+NETWORK, POLICY = "network.npz", "policy.pt"
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,14 @@ class Known:
         robot, dynamics: what is believed of it.
         posterior: the space and draws of its parameters. unloaded: its two recordings of commanded torque, without a
             payload. None where they are not there, as of `r2s.adaptation.listen.estimator`.
+        policy: run folder of the policy that the adapter works under; None: of none.
     """
 
     robot: Robot
     dynamics: Dynamics
     posterior: tuple[ParameterSpace, np.ndarray] | None = None
     unloaded: tuple[Recording, Recording] | None = None
+    policy: Path | None = None
 
     @cached_property
     def arm(self) -> Believed:
@@ -61,6 +66,25 @@ def rls(known: Known) -> Compensation:
     return Compensation(known.arm, known.noise)
 
 
+def osi(known: Known) -> Telling:
+    """Return what tells a policy the recursive estimate: `adapt=osi`."""
+    place, axes = hand(known.robot)
+    mass, moments = known.dynamics.told[0], known.dynamics.told[1:]
+    return Telling(known.arm, known.noise, np.concatenate([[mass], (moments - mass * place) @ axes]))
+
+
+def rma(known: Known, network: str | Path | None) -> Latent:
+    """Return what tells a policy a latent of the history: `adapt=rma`; network: None is that of the policy.
+
+    Raises:
+        UserError: `network` is no run folder of stage=train adapt=rma, or one of another policy, arm or model.
+    """
+    folder = Path(network or known.policy or "")
+    if not (folder / NETWORK).is_file():
+        raise UserError(f"network: '{folder}' is no run folder of stage=train adapt=rma")
+    return Latent(known.arm, load_network(folder / NETWORK, known.arm, known.policy))
+
+
 def history(known: Known, network: str | Path | None) -> History:
     """Return a torque that was learnt from history: `adapt=history`.
 
@@ -73,30 +97,44 @@ def history(known: Known, network: str | Path | None) -> History:
     return History(known.arm, load_network(path, known.arm))
 
 
-def save_network(path: Path, arm: Believed, network: Network) -> None:
-    """Write a network, with the friction of the arm that it was taught for, by which it is known again."""
+def save_network(path: Path, arm: Believed, network: Network, policy: Path | None = None) -> None:
+    """Write a network, with the friction of the arm that it was taught for, by which it is known again.
+
+    policy: the run folder of the one whose latent it says; None: it says torques.
+    """
     arrays = {"mean": network.mean, "scale": network.scale, "size": network.size, "table": arm.table}
+    arrays["policy"] = np.array(_of(policy))
     arrays |= {f"layer_{k}": a for k, a in enumerate(network.layers)}
     with whole(path) as part:
         np.savez(part, **arrays)  # type: ignore[arg-type]
 
 
-def load_network(path: Path, arm: Believed) -> Network:
-    """Return the network of a file for this arm.
+def load_network(path: Path, arm: Believed, policy: Path | None = None) -> Network:
+    """Return the network of a file for this arm; policy: as of `save_network`.
 
     Raises:
-        UserError: the file is damaged, or the network was taught for another arm or model.
+        UserError: the file is damaged, or the network was taught for another arm, model or policy.
     """
     try:
         with np.load(path, allow_pickle=False) as saved:
             arrays = dict(saved)
-        layers = tuple(arrays[f"layer_{k}"] for k in range(len(arrays) - 4))
+        layers = tuple(arrays[f"layer_{k}"] for k in range(sum(name.startswith("layer_") for name in arrays)))
         network, table = Network(arrays["mean"], arrays["scale"], arrays["size"], layers), arrays["table"]
+        of = str(arrays.get("policy", ""))  # those that were written before policies had latents have none
         n = len(arm.level)
-        if network(np.zeros(inputs(n))).shape != (n,):
-            raise ValueError(f"it does not tell {n} torques")
+        count = len(network.size) if of else n
+        if network(np.zeros(inputs(n))).shape != (count,):
+            raise ValueError(f"it does not tell {count} numbers")
     except DAMAGED as error:
         raise UserError(f"network: {path} cannot be read: {' '.join(str(error).split())}") from None
     if not np.array_equal(table, arm.table):
         raise UserError(f"network: {path.parent} was taught for another model; train it with this calibration=")
+    if of != _of(policy):
+        other = "says the latent of another policy" if of and policy else "is of another kind of adapter"
+        raise UserError(f"network: {path.parent} {other}; the folder of this policy has its own")
     return network
+
+
+def _of(policy: Path | None) -> str:
+    """Return by what a policy is known again; "" of none."""
+    return sha256(policy / POLICY) if policy is not None else ""

@@ -133,6 +133,11 @@ class DrivenArm:
         self.done += self.halted is None
         return self._read()
 
+    @property
+    def told(self) -> np.ndarray | None:
+        """(c,), what the adapter tells a policy, None: nothing."""
+        return self._driven.told
+
     def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
         """Return the arm's state, what the low-pass let through (n,) Nm, whether the episode was stopped, and in how
         many cycles of it the driver's law changed what was asked for.
@@ -199,7 +204,7 @@ class DrivenArm:
     def _read(self) -> State:
         s, effort, stopped, limited = self.read()
         share = (limited - self._limited) / self._substeps
-        state, self._limited = as_state(self._kinematics, s, effort, stopped, share), limited
+        state, self._limited = as_state(self._kinematics, s, effort, stopped, share, self.told), limited
         self._told = time.perf_counter()
         return state
 
@@ -216,10 +221,18 @@ def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
     return speeds[every - 1 :: every]
 
 
-def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
-    """Return what a task is told of one arm; effort (n,) Nm, stopped and limited as of `State`."""
+def as_state(
+    kinematics: Kinematics,
+    s: ArmState,
+    effort: np.ndarray,
+    stopped: bool,
+    limited: float,
+    told: np.ndarray | None = None,
+) -> State:
+    """Return what a task is told of one arm; effort (n,) Nm, told (c,), stopped and limited as of `State`."""
     ee, jacobian = kinematics(s.q)
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
         tau=s.tau_J_d[None], effort=effort[None], stopped=np.array([stopped]), limited=np.array([limited]),
+        told=None if told is None else told[None],
     )  # fmt: skip

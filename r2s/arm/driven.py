@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from r2s.adaptation.adapter import Adapter
+from r2s.adaptation.adapter import Adapter, Tells
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
 from r2s.physics.rigid_body import InverseInertia
@@ -27,6 +27,7 @@ class Driven:
 
     Attributes:
         arm, driver: which. state: of the current cycle. sent: (n,) Nm, the last command.
+        told: (c,), what the adapter tells the policy, the newest; None: it tells nothing.
         clock: s, perf_counter before and after the driver's last decision, and after the adapter's.
 
     Args:
@@ -46,10 +47,16 @@ class Driven:
         self.arm, self.driver = arm, driver
         self._adapter, self._hears = adapter, False
         self._added: np.ndarray | None = None
+        self._tells = adapter if isinstance(adapter, Tells) else None
         self._log, self._over = log, False
         self._inverse = InverseInertia(arm.robot)
         self.state: ArmState
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
+
+    @property
+    def told(self) -> np.ndarray | None:
+        """What the adapter tells."""
+        return None if self._tells is None else self._tells.told
 
     def place(self, q: np.ndarray) -> ArmState:
         """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.adaptation.adapter import Adapter
+from r2s.adaptation.adapter import Adapter, Tells
 from r2s.arm.deploy import DrivenArm, Stop, Timing, as_state
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
 from r2s.physics.rigid_body import Kinematics
@@ -93,7 +93,8 @@ class LiveArm:
         self.halted: str | None = None
         self._kinematics = Kinematics(robot)
         self._operator: Callable[[str], bool] | None = None
-        self._target, self._state, self._over = Slot(robot.n), Slot(5 * robot.n + 4), Slot(1)
+        words = len(adapter.told) if isinstance(adapter, Tells) else 0
+        self._target, self._state, self._over = Slot(robot.n), Slot(5 * robot.n + 4 + words), Slot(1)
         driver = {"friction": friction, "soft_start_s": soft_start_s, "rotors": rotors, "adapter": adapter}
         self._given = open_arm, task, driver, self._target, self._state, self._over
 
@@ -149,7 +150,7 @@ class LiveArm:
         self._due = max(self._due + substeps, (self.cycle // substeps + 1) * substeps)
         looked = 0
         while True:
-            cycle, _, _, stopped, _ = self._look()
+            cycle, _, _, stopped, *_ = self._look()
             if stopped or cycle >= self._due:
                 return self._read()
             looked += 1
@@ -164,19 +165,21 @@ class LiveArm:
         self.timing.driver, self.timing.adapter, self.timing.period = timing.driver, timing.adapter, timing.period
         return np.array([stopped])
 
-    def _look(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
-        """Return cycle, state, effort, whether the arm has stopped, and in how many cycles the law acted."""
+    def _look(self) -> tuple[int, ArmState, np.ndarray, bool, int, np.ndarray | None]:
+        """Return cycle, state, effort, whether it has stopped, in how many cycles the law acted, and what is told."""
         while (seen := self._state.read()) is None:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
         t, cycle, stopped, limited = seen[1][:4]
-        q, dq, tau_J, tau_J_d, effort = seen[1][4:].reshape(5, self._n)
-        return int(cycle), ArmState(t, q, dq, tau_J, tau_J_d), effort, bool(stopped), int(limited)
+        rows, told = np.split(seen[1][4:], [5 * self._n])
+        q, dq, tau_J, tau_J_d, effort = rows.reshape(5, self._n)
+        state = ArmState(t, q, dq, tau_J, tau_J_d)
+        return int(cycle), state, effort, bool(stopped), int(limited), told if len(told) else None
 
     def _read(self) -> State:
-        cycle, s, effort, stopped, limited = self._look()
+        cycle, s, effort, stopped, limited, told = self._look()
         share = (limited - self._limited[1]) / max(cycle - self._limited[0], 1)
-        state, self._limited = as_state(self._kinematics, s, effort, stopped, share), (cycle, limited)
+        state, self._limited = as_state(self._kinematics, s, effort, stopped, share, told), (cycle, limited)
         self._told = time.perf_counter()
         return state
 
@@ -271,4 +274,5 @@ def _said(over: Slot) -> bool:
 
 def _publish(driven: DrivenArm, cycle: int, state: Slot) -> None:
     s, effort, stopped, limited = driven.read()
-    state.write(np.concatenate([[s.t, cycle, stopped, limited], s.q, s.dq, s.tau_J, s.tau_J_d, effort]))
+    told = [] if driven.told is None else driven.told
+    state.write(np.concatenate([[s.t, cycle, stopped, limited], s.q, s.dq, s.tau_J, s.tau_J_d, effort, told]))

@@ -37,12 +37,21 @@ class ArmBatch:
         self.sim.drive(limits(robot, self._torque))
         self.actuation = Actuation(robot, width, cutoff_hz=task.cutoff_hz, soft_start_s=soft_start_s)
         self.speeds = None
+        self._told: np.ndarray | None = None
+        self._from = np.zeros(width)  # s, when it is told
         self._limited = np.zeros(width)  # cycles before the last step
         self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
         """Give the arms `ids` new dynamics, delay and lag."""
         self.sim.set_dynamics(dynamics, ids)
+
+    def tell(self, told: np.ndarray, from_s: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Tell policies told (m, c) of the arms `ids` (all by default) from from_s (m,) s of their episodes on."""
+        if self._told is None:
+            self._told = np.zeros((self.width, told.shape[1]))
+        at = slice(None) if ids is None else ids
+        self._told[at], self._from[at] = told, from_s
 
     def push(self, tau: np.ndarray) -> None:
         """Let something else push the joints with tau (width, n) Nm from now on."""
@@ -60,7 +69,8 @@ class ArmBatch:
         """Return the present state of all arms; its arrays are views."""
         sim, effort, t = self.sim, self.actuation.last, self._steps * self._period
         limited = (sim.limited - self._limited) / self._substeps
-        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, effort, self._stopped, limited)
+        told = None if self._told is None else np.where((t >= self._from)[:, None], self._told, 0.0)
+        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, effort, self._stopped, limited, told)
 
     def step(self, target: np.ndarray) -> State:
         """Go on for one control period with the target torques (width, n) Nm; return the state then.
@@ -83,13 +93,16 @@ class ArmBatch:
     def state(self) -> dict:
         """Return copies of all that the next steps depend on, for `set_state`."""
         parts = {name: getattr(self, name).state() for name in ("sim", "actuation")}
-        return parts | {"_steps": self._steps.copy(), "_limited": self._limited.copy()}
+        told = {} if self._told is None else {"_told": self._told.copy(), "_from": self._from.copy()}
+        return parts | {"_steps": self._steps.copy(), "_limited": self._limited.copy()} | told
 
     def set_state(self, state: Mapping) -> None:
         """Go back to what `state` returned; the same targets then lead to the same states, bit for bit."""
         for name in ("sim", "actuation"):
             getattr(self, name).set_state(state[name])
         self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
+        if "_told" in state:
+            self.tell(state["_told"], state["_from"])
 
 
 def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:

@@ -15,10 +15,10 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s.learning.batch import ArmBatch, check_finite
-from r2s.learning.randomization import Pushes
+from r2s.learning.randomization import Pushes, Tells
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
-from r2s.tasks.task import State, Task
+from r2s.tasks.task import State, Task, observed
 
 GROUPS = 8  # of arms that are reset together: a reset of four costs hardly more than one of one
 
@@ -32,7 +32,7 @@ class TaskEnv(EnvBase):
     Args:
         robot, task: the arm and what is asked of it.
         draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator. One that
-            `Pushes` is asked for torques at every step as well.
+            `Pushes` is asked for torques at every step as well; one that `Tells`, for what a policy is told.
         nsim: arms. nthread: 0 is all.
         seed: of goals, starts and draws.
         stagger: let the first episodes of eight groups of arms end at different times, not those of all at once.
@@ -55,7 +55,9 @@ class TaskEnv(EnvBase):
         self.robot, self.task, self.draw, self.nsim = robot, task, draw, nsim
         own, of_goals = np.random.SeedSequence(seed).spawn(2)
         self.rng = np.random.default_rng(own)
-        self.arms = ArmBatch(robot, task, draw(self.rng, nsim), nsim, nthread)
+        first = draw(self.rng, nsim)
+        self.arms = ArmBatch(robot, task, first, nsim, nthread)
+        self._tell(first)
         self.weights = task.paper_weights
         self._torque = task.torque(robot)
         self._stagger = stagger
@@ -63,7 +65,8 @@ class TaskEnv(EnvBase):
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
         self._reference, self._now = np.ones(nsim), self.arms.read()
-        shape, wide = (nsim,), len(task.observation_scale(robot)[0])
+        told = self._now.told
+        shape, wide = (nsim,), len(task.observation_scale(robot)[0]) + (0 if told is None else told.shape[1])
         self.observation_spec = Composite(
             observation=Unbounded((nsim, wide), dtype=torch.float32),
             reward_terms=Unbounded((nsim, len(self.weights)), dtype=torch.float32),
@@ -93,7 +96,9 @@ class TaskEnv(EnvBase):
 
     def _restart(self, ids: np.ndarray) -> State:
         """Draw arms, starts and goals for `ids`; return the state of all arms."""
-        self.arms.set_dynamics(self.draw(self.rng, len(ids)), ids)
+        drawn = self.draw(self.rng, len(ids))
+        self.arms.set_dynamics(drawn, ids)
+        self._tell(drawn, ids)
         q = self.task.starts(self.robot, self.rng, len(ids))
         goals = self._pool[self.rng.integers(len(self._pool), size=len(ids))]
         state = self.place(self.task.begin(q, goals), goals, ids)
@@ -101,6 +106,11 @@ class TaskEnv(EnvBase):
             self._count[ids] = ids * GROUPS // self.nsim * self.task.steps // GROUPS
             self._stagger = False
         return state
+
+    def _tell(self, drawn: Dynamics, ids: np.ndarray | None = None) -> None:
+        """Tell policies of the arms `ids` what is to be told of their dynamics, if anything is."""
+        if isinstance(self.draw, Tells):
+            self.arms.tell(*self.draw.said(self.rng, drawn), ids)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Return the step and the state after it, of which episodes that were cut off have begun anew.
@@ -121,7 +131,7 @@ class TaskEnv(EnvBase):
         distance, _ = self.task.judge(state, np.zeros_like(self._dq), self.goal, self._reference)
         return TensorDict(
             {
-                "observation": torch.from_numpy(self.task.observe(state, self.goal, self._torque)),
+                "observation": torch.from_numpy(observed(self.task, state, self.goal, self._torque)),
                 "reward_terms": torch.zeros(self.nsim, len(self.weights)),
                 "distance": torch.from_numpy(distance[:, None].astype(np.float32)),
                 "done": none,
@@ -155,7 +165,7 @@ class TaskEnv(EnvBase):
         ddq = (state.dq - self._dq) * self.task.ctrl_hz
         self._dq[:] = state.dq
         distance, terms = self.task.judge(state, ddq, self.goal, self._reference)
-        observation = self.task.observe(state, self.goal, self._torque)
+        observation = observed(self.task, state, self.goal, self._torque)
         check_finite("observation", observation, self._count)
         check_finite("reward", terms, self._count)
         cut = torch.from_numpy((self._count >= self.task.steps)[:, None])

@@ -1,8 +1,12 @@
-"""Train `adapt=history`: arms that differ from the identified one follow paths; a network learns what they lack."""
+"""Arms that differ from the identified one are heard; a network learns what they lack (`adapt=history`) from that.
+
+Another `Lesson` makes another network of the same: student.py.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,19 +15,19 @@ from r2s.adaptation.balance import SPAN
 from r2s.adaptation.believed import believed
 from r2s.adaptation.history import Network, Seen
 from r2s.errors import check_number
-from r2s.learning.randomization import Draw, carried, check_payload
+from r2s.learning.altered import altered, check_changes
+from r2s.learning.randomization import Draw, carried
 from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import AXES, Dynamics
 from r2s.physics.limits import limits
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.simulator import Simulator
 from r2s.tasks.model_torque import ModelTorque
-from r2s.tasks.task import State
+from r2s.tasks.task import State, Task
 from r2s.tasks.track import TrackTask
 
 QUIET, LOUD = 1e-3, 4e-3  # rad/s, of the speeds' noise before their filter
 FILTER_HZ = 90.0  # of it
-LEVEL = ("coulomb", "viscous", "phi1")  # parameters of friction families that a warmth multiplies
 HELD_OUT = 0.1  # of the arms
 BATCH, RATE = 512, 2e-3
 
@@ -33,13 +37,15 @@ class Lessons:
     """What a network is taught with.
 
     Attributes:
-        arms: at once. rounds: of them, an episode each. payload: least and most kg, put on at any time in half of an
-            episode. friction: least and most of what was identified. late: s, the most by which commands come later.
+        arms: at once. rounds: of them, an episode each. parts: of an episode, each with another arm.
+        payload: least and most kg, put on at any time in the first half of a part. friction: least and most of what
+            was identified. late: s, the most by which commands come later.
         hidden: units of each of two layers. epochs: passes over all. paths: drawn in all.
     """
 
     arms: int = 64
     rounds: int = 12
+    parts: int = 1
     payload: tuple[float, float] = (0.0, 1.5)
     friction: tuple[float, float] = (0.7, 1.2)
     late: float = 0.005
@@ -48,62 +54,112 @@ class Lessons:
     paths: int = 48
 
     def __post_init__(self):
-        check_payload(self.payload)
-        for name in ("arms", "rounds", "hidden", "epochs", "paths"):
+        check_changes(self.payload, self.friction, self.late)
+        for name in ("arms", "rounds", "parts", "hidden", "epochs", "paths"):
             check_number(f"training.{name}", getattr(self, name), "[1, inf)", whole=True)
-        check_number("training.late", self.late, "[0, 0.01]")
 
 
 def drawn(robot: Robot, draw: Draw, lessons: Lessons, rng: np.random.Generator) -> tuple[Dynamics, Dynamics]:
     """Return arms as `draw` has them with other friction and delay, without and with a payload."""
-    m = lessons.arms
-    base = draw(rng, m)
-    names = base.family.names[: base.phi.shape[-1]]
-    scale = np.where([n in LEVEL for n in names], rng.uniform(*lessons.friction, (m, robot.n, 1)), 1.0)
-    late = base.delay + rng.uniform(0, lessons.late, m)
-    base = replace(base, phi=base.phi * scale, delay=late)
-    return base, carried(robot, base, lessons.payload, rng, m)
+    base = altered(robot, draw, lessons.friction, lessons.late, rng, lessons.arms)
+    return base, carried(robot, base, lessons.payload, rng, lessons.arms)
 
 
-def lacking(robot: Robot, center: Dynamics, arm: Dynamics) -> Callable[..., np.ndarray]:
-    """Return (q, dq, ddq (k, n)) -> (k, n) Nm, what this arm needs more than the one of `center`."""
-    own, model = ModelTorque(robot, arm), ModelTorque(robot, center)
-    return lambda q, dq, ddq: own(q, dq, ddq, dq) - model(q, dq, ddq, dq)
+Answer = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # q, dq, ddq (n,) -> (k,)
+
+
+class Lesson(Protocol):
+    """What a network is to answer, and how an arm moves that has an answer.
+
+    Attributes:
+        count: numbers of an answer.
+    """
+
+    @property
+    def count(self) -> int: ...  # noqa: D102 (said above)
+
+    def answer(self, arm: Dynamics) -> Answer:
+        """Return the right answers for one arm."""
+        ...
+
+    def target(self, state: State, goals: np.ndarray, torque: np.ndarray, answers: np.ndarray) -> np.ndarray:
+        """Return (m, n) Nm, what arms that were given answers (m, k) are commanded."""
+        ...
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """The `Lesson` of what an arm lacks: it moves by computed torque, and what is answered is added."""
+
+    robot: Robot
+    task: TrackTask
+    center: Dynamics
+
+    @property
+    def count(self) -> int:
+        """One of each joint."""
+        return self.robot.n
+
+    def answer(self, arm: Dynamics) -> Answer:
+        """Return q, dq, ddq (n,) -> (n,) Nm, what this arm needs more than the one of `center`."""
+        own, model = ModelTorque(self.robot, arm), ModelTorque(self.robot, self.center)
+
+        def lacks(*motion: np.ndarray) -> np.ndarray:
+            q, dq, ddq = (x[None] for x in motion)
+            return (own(q, dq, ddq, dq) - model(q, dq, ddq, dq))[0]
+
+        return lacks
+
+    def target(self, state: State, goals: np.ndarray, torque: np.ndarray, answers: np.ndarray) -> np.ndarray:
+        """Return (m, n) Nm."""
+        none = np.zeros_like(state.q)
+        return np.clip(self.task.target(none, state, goals, torque), -torque, torque) + answers
 
 
 def heard(
-    robot: Robot, task: TrackTask, center: Dynamics, draw: Draw, lessons: Lessons, plans: np.ndarray, seed: int
+    robot: Robot,
+    task: Task,
+    center: Dynamics,
+    draw: Draw,
+    lessons: Lessons,
+    plans: np.ndarray,
+    seed: int,
+    lesson: Lesson,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs (arms, spans, d) and what lacked (arms, spans, n) Nm, of an episode of each arm.
+    """Return inputs (arms, spans, d) and answers (arms, spans, k), of an episode of each arm.
 
-    Arms are commanded by computed torque with the model; of what lacks a share that is drawn for each arm is added,
-    as an adapter would, so that there is motion with and without one.
+    Of the right answer each arm has a share that is drawn, so that there is motion with and without one.
 
     Args:
-        robot, task: the arm, and which paths it follows, with `center` as its model. draw: arms about `center`.
-        lessons: see there. plans: to choose from. seed: of the draws.
+        robot, task: the arm, and what is asked of it. center: what is believed of it. draw: arms about `center`.
+        lessons: see there. plans: goals, to choose from. seed: of the draws. lesson: what is answered.
     """
     rng, m, n = np.random.default_rng([seed, 17]), lessons.arms, robot.n
-    bare, full = drawn(robot, draw, lessons, rng)
-    lacks = [[lacking(robot, center, d.one(k)) for k in range(m)] for d in (bare, full)]
+    arms = [d for _ in range(lessons.parts) for d in drawn(robot, draw, lessons, rng)]  # bare, laden, bare, ...
+    answers = [[lesson.answer(d.one(k)) for k in range(m)] for d in arms]
     goals = plans[rng.integers(len(plans), size=m)]
-    helps, on = rng.uniform(0, 1.1, m).clip(0, 1), rng.integers(0, task.steps // 2, m)
-    sim, torque = Simulator(robot, bare, m, 1), task.torque(robot)
+    part = task.steps // lessons.parts
+    helps, on = rng.uniform(0, 1.1, m).clip(0, 1), rng.integers(0, part // 2, (lessons.parts, m))
+    sim, torque = Simulator(robot, arms[0], m, 1), task.torque(robot)
     sim.drive(limits(robot, torque))
     sim.reset(task.begin(np.tile(robot.q_home, (m, 1)), goals), np.zeros((m, n)))
     actuation = Actuation(robot, m, cutoff_hz=task.cutoff_hz)
     noise, factor = rng.uniform(QUIET, LOUD, (m, n)), low_pass_factor(FILTER_HZ)
     seen = [Seen(believed(robot, center)) for _ in range(m)]
     rows: list[list] = [[] for _ in range(m)]
-    filtered, before, more, none = (np.zeros((m, n)) for _ in range(4))
-    holds, never = np.zeros(m, dtype=int), np.zeros(m, dtype=bool)
+    (filtered, before), right = np.zeros((2, m, n)), np.zeros((m, lesson.count))
+    holds, never, limited = np.zeros(m, dtype=int), np.zeros(m, dtype=bool), np.zeros(m)
     for step in range(task.steps):
-        if (new := np.flatnonzero(on == step)).size:
-            sim.set_dynamics(some(full, new), new)
-            holds[new] = 1
+        now = min(step // part, lessons.parts - 1)
+        laden = step - now * part >= on[now]
+        for which in (0, 1):
+            if (new := np.flatnonzero((laden == which) & (holds != 2 * now + which))).size:
+                sim.set_dynamics(some(arms[2 * now + which], new), new)
+                holds[new] = 2 * now + which
         t = np.full(m, step / task.ctrl_hz)
-        state = State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, none, never, none[:, 0])
-        target = np.clip(task.target(none, state, goals, torque), -torque, torque) + helps[:, None] * more
+        share = (sim.limited - limited) / task.substeps
+        state = State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, actuation.last, never, share)
+        target, limited = lesson.target(state, goals, torque, helps[:, None] * right), sim.limited.copy()
         for _ in range(task.substeps):
             filtered += factor * (sim.dq + noise * rng.normal(size=(m, n)) - filtered)
             q = sim.q.copy()
@@ -114,8 +170,8 @@ def heard(
                 if inputs is not None:
                     ddq = (sim.dq[k] - before[k]) / (SPAN * SIM_DT)
                     before[k] = sim.dq[k]
-                    more[k] = lacks[holds[k]][k](sim.q[k][None], sim.dq[k][None], ddq[None])[0]
-                    rows[k].append((inputs, more[k].copy()))
+                    right[k] = answers[holds[k]][k](sim.q[k], sim.dq[k], ddq)
+                    rows[k].append((inputs, right[k].copy()))
         sim.kinematics()
     return np.array([[x for x, _ in row] for row in rows]), np.array([[y for _, y in row] for row in rows])
 
@@ -174,9 +230,23 @@ def teach(
     progress: called with the rounds that were heard, and all.
     """
     task = task.believing(robot, center)
+    return learn(robot, task, center, draw, lessons, seed, progress, Lacking(robot, task, center))
+
+
+def learn(
+    robot: Robot,
+    task: Task,
+    center: Dynamics,
+    draw: Draw,
+    lessons: Lessons,
+    seed: int,
+    progress: Callable[[int, int], None],
+    lesson: Lesson,
+) -> tuple[Network, float]:
+    """Return the network that learnt `lesson`, and what it explains; other arguments as of `teach`."""
     plans, heard_of = task.goals(robot, np.random.default_rng([seed, 3]), lessons.paths), []
     for k in range(lessons.rounds):
-        heard_of.append(heard(robot, task, center, draw, lessons, plans, seed + 1000 * k))
+        heard_of.append(heard(robot, task, center, draw, lessons, plans, seed + 1000 * k, lesson))
         progress(k + 1, lessons.rounds)
-    inputs, lacks = (np.concatenate([h[i] for h in heard_of]) for i in (0, 1))
-    return fit(inputs, lacks, lessons, seed)
+    inputs, answers = (np.concatenate([h[i] for h in heard_of]) for i in (0, 1))
+    return fit(inputs, answers, lessons, seed)

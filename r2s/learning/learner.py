@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from r2s.errors import UserError, check_number
-from r2s.learning.networks import Actor, Critics, Normalizer, Policy
+from r2s.learning.networks import Actor, Critics, Normalizer, Policy, Told
 
 
 class Learner(nn.Module, ABC):
@@ -28,6 +28,7 @@ class Learner(nn.Module, ABC):
         gamma: discount. tau: step of the target networks. lr: of Adam, for all.
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER): where the
             critics hardly tell actions apart, the small one wins, instead of full torque one way and the other.
+        told: what the policy is told, at the end of its observations; critics see it as it is. None: nothing.
 
     Raises:
         UserError: a setting of the wrong kind or out of range.
@@ -48,6 +49,7 @@ class Learner(nn.Module, ABC):
         tau: float,
         lr: float,
         action_l2: float,
+        told: Told | None = None,
     ):
         super().__init__()
         check_hidden(hidden)
@@ -59,7 +61,7 @@ class Learner(nn.Module, ABC):
         check_number("action_l2", action_l2, "[0, inf)")
         obs_dim, act_dim = len(scale[0]), len(torque)
         self.normalizer = Normalizer(*scale)
-        self.actor = Actor(obs_dim, act_dim, tuple(hidden))
+        self.actor = Actor(obs_dim, act_dim, tuple(hidden), told=told)
         self.critics = Critics(obs_dim, act_dim, tuple(hidden), n_critics, outputs)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("torque", torque.float())

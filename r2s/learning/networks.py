@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,36 +25,82 @@ class Normalizer(nn.Module):
         return ((x - self.mean) / self.std).clamp(-10.0, 10.0)
 
 
+class Told(NamedTuple):
+    """What a policy is told of its arm beside what it observes: the last `numbers` of its observations.
+
+    Attributes:
+        numbers: how many. Zeros say that the arm is as it is believed to be.
+        latent: of how many the layers are shown, which an `Encoder` makes of them; 0: of the numbers themselves.
+    """
+
+    numbers: int
+    latent: int = 0
+
+    @property
+    def shown(self) -> int:
+        """How many numbers the layers are shown."""
+        return self.latent or self.numbers
+
+
+class Encoder(nn.Module):
+    """What is told in fewer numbers, (B, c) -> (B, latent) in (-2, 2); zeros, nothing told, are zeros there."""
+
+    def __init__(self, told: Told, hidden: int = 32):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(told.numbers, hidden), nn.ReLU(), nn.Linear(hidden, told.latent), nn.Tanh()
+        )
+
+    def forward(self, told: Tensor) -> Tensor:
+        """Return the latent."""
+        return self.layers(told) - self.layers(torch.zeros_like(told[:1]))
+
+
 class Actor(nn.Module):
-    """Gaussian before tanh: observation (B, d) -> loc, scale (B, n).
+    """Gaussian before tanh: observation (B, d) -> loc, scale (B, n); `told`: see there, None: nothing.
 
     A deterministic algorithm uses `mode` alone and leaves the n outputs of the scale as they are: so every policy is
     the same file, and the networks that are compared have the same size.
     """
 
     def __init__(
-        self, obs_dim: int, act_dim: int, hidden: tuple[int, ...], log_std: tuple[float, float] = (-5.0, 2.0)
+        self,
+        obs_dim: int,
+        act_dim: int,
+        hidden: tuple[int, ...],
+        log_std: tuple[float, float] = (-5.0, 2.0),
+        told: Told | None = None,
     ):
         super().__init__()
-        sizes = [obs_dim, *hidden]
+        sizes = [obs_dim - told.numbers + told.shown if told else obs_dim, *hidden]
         layers: list[nn.Module] = []
         for i, o in pairwise(sizes):
             layers += [nn.Linear(i, o), nn.ReLU()]
         self.body = nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * act_dim))
-        self.log_std = log_std
+        self.log_std, self.told = log_std, told
+        self.encoder = Encoder(told) if told and told.latent else None
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return loc, scale of the Gaussian whose tanh is the action."""
-        loc, log_std = self.body(observation).chunk(2, -1)
+        loc, log_std = self.body(self._shown(observation)).chunk(2, -1)
         return loc, log_std.clamp(*self.log_std).exp()
 
     def mode(self, observation: Tensor) -> Tensor:
         """Return the deterministic action (B, n), tanh of loc."""
-        return torch.tanh(self.body(observation).chunk(2, -1)[0])
+        return torch.tanh(self.body(self._shown(observation)).chunk(2, -1)[0])
+
+    def _shown(self, observation: Tensor) -> Tensor:
+        if self.encoder is None or self.told is None:
+            return observation
+        own, told = observation.split([observation.shape[-1] - self.told.numbers, self.told.numbers], -1)
+        return torch.cat([own, self.encoder(told)], -1)
 
 
 class Policy(nn.Module):
-    """What goes onto the arm: observation in SI units (B, d) -> torque target (B, n) Nm."""
+    """What goes onto the arm: observation in SI units (B, d) -> torque target (B, n) Nm.
+
+    One that may be told of its arm, and is not, takes it for what it is believed to be.
+    """
 
     torque_scale: Tensor
 
@@ -64,7 +111,36 @@ class Policy(nn.Module):
 
     def action(self, observation: Tensor) -> Tensor:
         """Return the deterministic action (B, n) in [-1, 1]."""
+        told = self.told
+        if told and observation.shape[-1] == len(self.normalizer.mean) - told.numbers:
+            observation = torch.cat([observation, observation.new_zeros(len(observation), told.numbers)], -1)
         return self.actor.mode(self.normalizer(observation))
+
+    @property
+    def told(self) -> Told | None:
+        """What it is told; None: it is told nothing."""
+        return self.actor.told
+
+    @torch.no_grad()
+    def latent(self, told: Tensor) -> Tensor:
+        """Return the latent (B, l) of what is told (B, c), in SI units."""
+        assert self.told is not None
+        assert self.actor.encoder is not None
+        own = self.normalizer.mean.new_zeros(len(told), len(self.normalizer.mean) - self.told.numbers)
+        return self.actor.encoder(self.normalizer(torch.cat([own, told], -1))[:, own.shape[-1] :])
+
+    def by_latent(self) -> "Policy":
+        """Return the policy that is told the latent itself; its layers are shared."""
+        assert self.told is not None
+        assert self.told.latent
+        own, latent = len(self.normalizer.mean) - self.told.numbers, self.told.latent
+        mean, std = (
+            torch.cat([x[:own], torch.full((latent,), fill)])
+            for x, fill in ((self.normalizer.mean, 0.0), (self.normalizer.std, 1.0))
+        )
+        actor = Actor(own + latent, len(self.torque_scale), (), self.actor.log_std, Told(latent))
+        actor.body = self.actor.body
+        return Policy(Normalizer(mean, std), actor, self.torque_scale)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return torque targets in Nm, without gravity, before the driver's filters and limits."""

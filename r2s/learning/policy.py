@@ -6,27 +6,39 @@ import logging
 import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from r2s.adaptation.telling import SAID, said_scale
 from r2s.errors import UserError
 from r2s.files import whole
 from r2s.learning.checkpoint import load_tensors, save_tensors
-from r2s.learning.networks import Actor, Normalizer, Policy
+from r2s.learning.networks import Actor, Normalizer, Policy, Told
 from r2s.physics.robot import Robot
 from r2s.tasks.task import Task
 
 
-def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
-    """Return an untrained policy of this arm and task."""
-    mean, std = (torch.from_numpy(x) for x in task.observation_scale(robot))
+def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...], told: Told | None = None) -> Policy:
+    """Return an untrained policy of this arm and task; told: what it is told beside, None: nothing."""
+    mean, std = observation_scale(robot, task, told)
     torque = torch.from_numpy(task.share * task.torque(robot)).float()
-    return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden), torque)
+    return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden, told=told), torque)
+
+
+def observation_scale(robot: Robot, task: Task, told: Told | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean and standard deviation (d,) of what a policy observes, and then of what it is told."""
+    mean, std = task.observation_scale(robot)
+    if told:
+        mean = np.concatenate([mean, np.zeros(told.numbers)])
+        std = np.concatenate([std, said_scale(robot.n)])
+    return torch.from_numpy(mean), torch.from_numpy(std)
 
 
 def save_policy(folder: Path, policy: Policy) -> None:
     """Write policy.pt: the state dict and the sizes that it fits."""
     linear = [m.out_features for m in policy.actor.body if isinstance(m, torch.nn.Linear)]
-    save_tensors(folder / "policy.pt", {"state": policy.state_dict(), "hidden": linear[:-1]})
+    told = {"told": list(policy.told)} if policy.told else {}
+    save_tensors(folder / "policy.pt", {"state": policy.state_dict(), "hidden": linear[:-1]} | told)
 
 
 def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
@@ -40,7 +52,8 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
         raise UserError(f"policy: no policy.pt in {folder}")
     saved = load_tensors(path, "policy")
     try:
-        policy = make_policy(robot, task, tuple(saved["hidden"]))
+        told = Told(*saved["told"]) if "told" in saved else None
+        policy = make_policy(robot, task, tuple(saved["hidden"]), told)
         policy.load_state_dict(saved["state"])
     except KeyError as error:
         raise UserError(f"policy: {path} is not what r2s wrote: it has no {error}") from None
@@ -84,7 +97,7 @@ def _facts(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
     return {
         "robot": robot.name,
         "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
-        "observation": task.observed,
+        "observation": task.observed + (f"; told: {SAID}" if policy.told else ""),
         "policy_hz": str(task.ctrl_hz),
         "q_min_rad": " ".join(f"{q:g}" for q in robot.q_min),
         "q_max_rad": " ".join(f"{q:g}" for q in robot.q_max),

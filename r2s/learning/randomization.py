@@ -102,6 +102,15 @@ class Pushes(Protocol):
         ...
 
 
+@runtime_checkable
+class Tells(Protocol):
+    """Draws of which policies are told something."""
+
+    def said(self, rng: np.random.Generator, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is told (m, c) of arms that were drawn, and from when (m,) s of their episodes on."""
+        ...
+
+
 @dataclass(frozen=True)
 class Forces:
     """Every arm is the centre, and random torques push its joints: Valassakis et al. 2020, arXiv 2008.06686.

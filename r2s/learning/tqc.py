@@ -14,14 +14,14 @@ from torch import Tensor
 
 from r2s.errors import check_number
 from r2s.learning.learner import EntropyLearner
-from r2s.learning.networks import sample_tanh
+from r2s.learning.networks import Told, sample_tanh
 
 
 class TQC(EntropyLearner):
     """Learner of a stochastic policy, with quantile critics whose highest atoms are left out.
 
     Args:
-        scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.learning.networks.Learner.
+        scale, torque, hidden, gamma, tau, lr, action_l2, told: see r2s.learning.networks.Learner.
         n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
         alpha_init, target_entropy: see r2s.learning.networks.EntropyLearner.
 
@@ -44,6 +44,7 @@ class TQC(EntropyLearner):
         alpha_init: float = 0.01,
         target_entropy: float | None = None,
         action_l2: float = 0.0,
+        told: Told | None = None,
     ):
         check_number("n_quantiles", n_quantiles, "[1, inf)", whole=True)
         check_number("drop_per_critic", drop_per_critic, f"[0, {n_quantiles})", whole=True)
@@ -57,6 +58,7 @@ class TQC(EntropyLearner):
             tau=tau,
             lr=lr,
             action_l2=action_l2,
+            told=told,
             alpha_init=alpha_init,
             target_entropy=target_entropy,
         )

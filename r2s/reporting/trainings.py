@@ -92,6 +92,8 @@ def _read(folder: Path) -> Trained:
     read = set(READ)
     if config.get("calibration"):
         read -= {"friction", "inertia"}  # identified values stand over them
+    if (config.get("adapt") or {}).get("told"):
+        read.add("adapt")
     if name in CONTROLLERS:
         read -= {"budget", "reward"}
     typed = {}

@@ -1,17 +1,19 @@
 """What works under a policy on an arm: the adapter of conf/adapt, with what was identified of that arm."""
 
 import filecmp
+import inspect
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from r2s.errors import UserError
-from r2s.stages.build import called, loaded, make_robot, make_task, open_run, part, plain, set_threads
+from r2s.errors import UserError, check_number
+from r2s.stages.build import called, loaded, make_robot, make_task, open_run, part, plain, set_threads, target
 
 RECORDINGS = ("train.npz", "validation.npz")  # of an identification
 PARAMETERS = "parameters.yaml"
 COMPARES = "commanded"  # torque: what adapters compare motion with
-BESIDE = ("calibration", "training")  # of conf/adapt, what is no argument of the adapter
+BESIDE = ("calibration", "training", "told", "latent")  # of conf/adapt, what is no argument of the adapter
 
 
 def calibrated(calibration, robot):
@@ -48,6 +50,11 @@ def make_adapter(cfg, robot, source):
     name = f"adapt={cfg.adapt.name}"
     if cfg.arm.name == "none":
         raise UserError(f"{name}: an adapter acts on an arm, and arm=none is none; another arm=, or adapt=none")
+    if is_told(cfg) and (own := trained_with(source)) != cfg.adapt.name:
+        raise UserError(
+            f"{name}: the policy of {source} was trained with adapt={own}, and is told nothing of this kind; "
+            f"give one of stage=train {name}"
+        )
     folder = calibration_of(cfg, source)
     torque = (loaded(folder / PARAMETERS).get("source") or {}).get("torque", COMPARES)
     if torque != COMPARES:
@@ -61,7 +68,7 @@ def make_adapter(cfg, robot, source):
     if cfg.arm.get("load"):  # what the arm was told of is no surprise
         told = moment(robot, payload_of(plain(cfg.arm)["load"], "arm.load"))
         dynamics = replace(dynamics, told=told)
-    return part(cfg.adapt, "adapt", Known(robot, dynamics, posterior, unloaded), beside=BESIDE)
+    return part(cfg.adapt, "adapt", Known(robot, dynamics, posterior, unloaded, source), beside=BESIDE)
 
 
 def calibration_of(cfg, source):
@@ -87,8 +94,62 @@ def calibration_of(cfg, source):
 
 
 def is_taught(cfg):
-    """Return whether conf/adapt is learnt."""
-    return "training" in cfg.adapt
+    """Return whether conf/adapt is learnt by itself, under any policy."""
+    return "training" in cfg.adapt and not is_told(cfg)
+
+
+def is_told(cfg):
+    """Return whether a policy has to be trained with conf/adapt: it is told something."""
+    return bool(cfg.adapt.get("told"))
+
+
+def trained_with(source):
+    """Return the adapter that the policy of a run folder is told by; none, where it is told nothing."""
+    config = loaded(source / "config.yaml")
+    return config.adapt.name if "adapt" in config and is_told(config) else "none"
+
+
+def told_of(cfg, robot):
+    """Return what a policy is told with conf/adapt, `Told`; None: nothing."""
+    from r2s.adaptation.telling import said_count
+    from r2s.learning.networks import Told
+
+    if not is_told(cfg):
+        return None
+    if "latent" in cfg.adapt:
+        check_number("adapt.latent", cfg.adapt.latent, "[1, 64]", whole=True)
+    return Told(said_count(robot.n), cfg.adapt.get("latent", 0))
+
+
+def lessons_of(cfg):
+    """Return adapt.training as `Lessons`."""
+    from r2s.learning.history import Lessons
+
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.adapt.training).items()}
+    return called(Lessons, "adapt.training", settings)
+
+
+def told_draw(cfg, robot, center, draw):
+    """Return arms as `draw` has them, changed, of which a policy is told: with adapt.training.
+
+    Raises:
+        UserError: conf/dr changes arms in ways that it is not told of, or policies of conf/algo are told nothing.
+    """
+    from r2s.learning.altered import Altered
+    from r2s.learning.randomization import Pushes
+
+    if isinstance(draw, Pushes):
+        raise UserError(
+            f"dr: a policy of adapt={cfg.adapt.name} is not told of random forces; another dr= is allowed"
+        )
+    if cfg.dr.get("payload") is not None:
+        raise UserError(f"dr.payload: with adapt={cfg.adapt.name} it is adapt.training.payload=; leave it out")
+    if "told" not in inspect.signature(target(cfg.algo, "algo")).parameters:
+        raise UserError(
+            f"algo={cfg.algo.name}: its policies are told nothing; with adapt={cfg.adapt.name} tqc is allowed"
+        )
+    lessons = lessons_of(cfg)
+    return Altered(robot, center, draw, lessons.payload, lessons.friction, lessons.late)
 
 
 def make_lessons(cfg):
@@ -97,7 +158,6 @@ def make_lessons(cfg):
     Raises:
         UserError: it cannot be taught with this config.
     """
-    from r2s.learning.history import Lessons
     from r2s.tasks.track import TrackTask
 
     if not cfg.calibration:
@@ -107,8 +167,7 @@ def make_lessons(cfg):
     task = make_task(cfg, robot, center)
     if not isinstance(task, TrackTask) or task.base != "model":
         raise UserError(f"task: adapt={cfg.adapt.name} is taught on task=track with task.base=model")
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.adapt.training).items()}
-    return robot, task, center, called(Lessons, "adapt.training", settings)
+    return robot, task, center, lessons_of(cfg)
 
 
 def teach(cfg, overrides, keep):
@@ -117,22 +176,42 @@ def teach(cfg, overrides, keep):
     from r2s.adaptation.believed import believed
     from r2s.learning import history
     from r2s.learning.randomization import identified
-    from r2s.progress import Progress
 
     set_threads(cfg)
     robot, task, center, lessons = make_lessons(cfg)
     draw = identified(robot, center, cfg.calibration)
     with open_run(cfg, overrides, parents=[str(cfg.calibration)]) as run:
         keep(cfg, run.folder)
-        began, progress = time.process_time(), Progress("listen to arms that carry something")
-
-        def shown(k, n):
-            progress(k / n, f"{k * lessons.arms} episodes")
-
-        network, explained = history.teach(robot, task, center, draw, lessons, cfg.seed, shown)
-        progress.close()
+        began = time.process_time()
+        with listening(lessons) as shown:
+            network, explained = history.teach(robot, task, center, draw, lessons, cfg.seed, shown)
         save_network(run.folder / NETWORK, believed(robot, center), network)
         seconds = time.process_time() - began
         run.summary({"adapter": cfg.adapt.name, "explained": explained, "processor_s": seconds})
         print(f"of what arms lacked that it had not seen it tells {100 * explained:.1f} %; {seconds:.0f} s of a core")
     print(f"written: {run.folder}")
+
+
+@contextmanager
+def listening(lessons):
+    """Give what shows how far a network's lessons are."""
+    from r2s.progress import Progress
+
+    progress = Progress("listen to arms that carry something")
+    yield lambda k, n: progress(k / n, f"{k * lessons.arms} episodes")
+    progress.close()
+
+
+def teach_latent(cfg, folder, robot, task, center, draw, policy):
+    """Train what says the latent of a policy, into its run folder; return a row of the summary."""
+    from r2s.adaptation.adapters import NETWORK, save_network
+    from r2s.adaptation.believed import believed
+    from r2s.learning import student
+
+    began, lessons = time.process_time(), lessons_of(cfg)
+    with listening(lessons) as shown:
+        network, explained = student.teach_latent(robot, task, center, draw, policy, lessons, cfg.seed, shown)
+    save_network(folder / NETWORK, believed(robot, center), network, folder)
+    seconds = time.process_time() - began
+    print(f"of the latent of arms that it had not seen it tells {100 * explained:.1f} %; {seconds:.0f} s of a core")
+    return {"explained": explained, "processor_s": seconds}

@@ -10,6 +10,7 @@ from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
+from r2s.stages.adapting import is_taught, is_told
 from r2s.stages.build import CONF, GROUP, PACKAGE, console, make_robot, open_run, unread
 
 STEPS = (
@@ -116,7 +117,8 @@ def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of what is trained, and of what goes to the arm."""
     if cfg.adapt.name == "none":
         return MODELS, MODELS
-    return (*MODELS, COMPUTED), (*MODELS, COMPUTED, ADAPTED)
+    learnt = (ADAPTED,) if is_told(cfg) or is_taught(cfg) else ()  # a policy that is told, or a network
+    return (*MODELS, COMPUTED, *learnt), (*MODELS, COMPUTED, ADAPTED)
 
 
 def check_free(root: Path, name: str, cfg: Any) -> None:
@@ -149,6 +151,8 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     ) -> list[str]:
         config = cfg.copy()
         config.stage, config.calibration = stage, calibration
+        if typed is not overrides:  # without an adapter, as identify is whatever was typed
+            config.adapt = {"name": "none"}
         full = f"{name}_{label}" if stage != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
         head = [f"root={root}", f"stage={stage}", f"name={full}", f"threads={threads}"]
@@ -157,20 +161,25 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     minutes = cfg.pipeline.train_minutes
     budget = [] if minutes is None else [f"budget.minutes={minutes}"]
     known = f"calibration={root / 'identify' / name}"
+    bare = without("adapt")
     trained = {
-        "identified": step("train", "identified", *budget, known, calibration=known),
-        "nominal": step("train", "nominal", *budget, *choice),
+        "identified": step("train", "identified", *budget, known, calibration=known, typed=bare),
+        "nominal": step("train", "nominal", *budget, *choice, typed=bare),
     }
     if adapts:
-        reference = without("algo", "dr", "reward", "evaluation.env_steps", "compile", "matmul", "device")
+        reference = without("adapt", "algo", "dr", "reward", "evaluation.env_steps", "compile", "matmul", "device")
         words = "algo=computed_torque", "dr=none", known
         trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=reference)
+    if ADAPTED in labels(cfg)[0]:
+        own = budget if is_told(cfg) else []
+        trained[ADAPTED] = step("train", ADAPTED, *own, known, calibration=known)
     transferred = {}
     for label in labels(cfg)[1]:
-        policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
-        transferred[label] = step(
-            "transfer", label, policy, typed=overrides if label == ADAPTED else without("adapt")
-        )
+        source = MODELS[0] if label == ADAPTED and not is_told(cfg) else label
+        given = [f"policy={root / 'train' / f'{name}_{source}'}"]
+        if label == ADAPTED and is_taught(cfg):
+            given.append(f"adapt.network={root / 'train' / f'{name}_{ADAPTED}'}")
+        transferred[label] = step("transfer", label, *given, typed=overrides if label == ADAPTED else bare)
     return [
         {"identify": step("identify", "identify", typed=without("arm.payload", "arm.load") if adapts else overrides)},
         trained,

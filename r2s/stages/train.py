@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import check_number
-from r2s.stages.adapting import is_taught, make_lessons, teach
+from r2s.stages.adapting import is_taught, is_told, make_lessons, teach, teach_latent, told_draw, told_of
 from r2s.stages.build import (
     Evaluation,
     called,
@@ -29,7 +29,7 @@ WHY = {
     "inertia": "calibration= says what the links are",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
-    "adapt": "adapters work on an arm, with stage=transfer; of them adapt=history is trained",
+    "adapt": "adapters work on an arm, with stage=transfer; of them history is trained, osi and rma with a policy",
     "arm": "a training meets no arm; stage=transfer does",
     "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
     "data": "only stage=identify records or reads a motion",
@@ -48,6 +48,7 @@ def reads(cfg):
         keys |= {"friction", "inertia"}
     if "n_envs" in cfg.algo:  # else it is a controller
         keys |= {"budget", "reward", "evaluation", "compile", "matmul", "device"}
+        keys |= {"adapt"} if is_told(cfg) else set()
     return keys
 
 
@@ -56,8 +57,11 @@ class Parts:
     """What a training is made of. What a config says wrongly of it is said while they are made, before any folder."""
 
     robot: Any
+    center: Any
     task: Any
+    identified: Any
     draw: Any
+    told: Any
     weights: Any
     env: Any
     evaluate: Any
@@ -78,6 +82,7 @@ def make_parts(cfg):
 
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import SELECTED, make_evaluation
+    from r2s.learning.policy import observation_scale
     from r2s.tasks.rewards import Curriculum
 
     evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
@@ -86,14 +91,18 @@ def make_parts(cfg):
     robot, model = make_robot(cfg), own_model(cfg)
     center = make_dynamics(model, robot)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
+    identified, told = draw, told_of(cfg, robot)
+    if told:
+        draw, settings = told_draw(cfg, robot, center, draw), settings | {"told": told}
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads, seed=SELECTED)
     torque = torch.from_numpy(task.share * task.torque(robot))
-    scale = tuple(torch.from_numpy(s) for s in task.observation_scale(robot))
+    scale = observation_scale(robot, task, told)
     algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque)
-    return Parts(robot, task, draw, weights, env, evaluate, algo, loop, budget, evaluation.episodes, device(cfg))
+    many, on = evaluation.episodes, device(cfg)
+    return Parts(robot, center, task, identified, draw, told, weights, env, evaluate, algo, loop, budget, many, on)
 
 
 def check(cfg):
@@ -166,13 +175,17 @@ def train(cfg, overrides):
             listeners=Listeners(lambda row: run.log("metrics", row), evaluated, show),
         )
         progress.close()
-        checkpoint.clear()
         policy = load_policy(run.folder, robot, task)
         export_onnx(run.folder / "policy.onnx", policy, robot, task)
         judge = make_evaluation(robot, task, made.draw, episodes=made.episodes, nthread=cfg.threads)
         judged = {"best": best | task.measures(judge(policy))}
         judged["last"] = last | task.measures(judge(copy.deepcopy(algo.policy).cpu()))
-        run.summary(judged | {"best on the goals it was chosen on": best})
+        more = {"best on the goals it was chosen on": best}
+        if made.told and made.told.latent:
+            arms = made.center, made.identified
+            more["student"] = teach_latent(cfg, run.folder, robot, task, *arms, policy)
+        checkpoint.clear()
+        run.summary(judged | more)
         pages.training(run, robot)
         reach_table(console(), judged, f"{title(cfg)}; on goals that nothing was chosen on")
     print(f"written: {run.folder}")

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, nearest
-from r2s.stages.adapting import make_adapter
+from r2s.stages.adapting import is_told, make_adapter
 from r2s.stages.build import (
     console,
     is_learner,
@@ -96,6 +96,8 @@ def transfer(cfg, overrides):
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
     adapter = make_adapter(cfg, robot, source)
+    if is_told(cfg) and policy.told.latent:
+        policy = policy.by_latent()
     dynamics, draw = None, None
     if cfg.simulator.name != "none":
         dynamics = center

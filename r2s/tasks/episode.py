@@ -9,7 +9,7 @@ import torch
 
 from r2s.physics.contacts import touching
 from r2s.physics.robot import Robot
-from r2s.tasks.task import Episodes, State, Task
+from r2s.tasks.task import Episodes, State, Task, observed
 
 HOLD_S = 0.5  # s, at the end of an episode: reached means reached and held
 REST = 0.05  # rad/s, below which a joint rests
@@ -81,7 +81,7 @@ def rollout(
     touches, collision = touching(robot, table=None), [""] * count
 
     def ask(state: State, goals: np.ndarray) -> np.ndarray:
-        observation = torch.from_numpy(task.observe(state, goals, torque))
+        observation = torch.from_numpy(observed(task, state, goals, torque))
         return policy.action(observation).numpy().astype(np.float64)
 
     # what is compiled or loaded at its first call must not be so while an arm waits

@@ -24,6 +24,7 @@ class State:
         tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target as it has come through the low-pass.
         stopped: (m,), whether the arm has ended its motion.
         limited: (m,), in which share of the last control period the driver's law changed what was asked for.
+        told: (m, c), what a policy is told of its arm (r2s/adaptation/telling.py); None: nothing.
     """
 
     t: np.ndarray
@@ -35,6 +36,7 @@ class State:
     effort: np.ndarray
     stopped: np.ndarray
     limited: np.ndarray
+    told: np.ndarray | None = None
 
     @staticmethod
     def still(robot: Robot) -> "State":
@@ -176,6 +178,12 @@ class Task(Protocol):
     def score(self, row: Mapping[str, float]) -> float:
         """Return what makes one row of `measures` better than another."""
         ...
+
+
+def observed(task: Task, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Return what a policy is shown (m, d) float32: the task's observations, and then what is told of the arm."""
+    own = task.observe(state, goals, torque)
+    return own if state.told is None else np.concatenate([own, state.told], axis=1, dtype=np.float32)
 
 
 class Usual:
