@@ -17,7 +17,7 @@ is the command from which it no longer can. No model of the arm is needed.
 Where friction falls over a range of velocities (Stribeck), motion begins so slowly that `jump`, which is sudden,
 reads the release late: by 4 to 22 mNm on an arm of known truth. Once an arm is identified, `Slide` says how its
 joints move from release on, with jump (1 - exp(-(v / fall)^2)) in place of `jump`, and U alone is left to find: to
-0.2 mNm there. It counts where it explains the motion as well as positions are known.
+0.2 mNm there. It counts where it explains the motion as well as the free fit does.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ RIGID = 1e-8  # rad, a creep length that is none
 DRIFT = 3e-4  # rad/s: a joint at rest may still settle so fast
 SIDES = "negative", "positive"
 SURE = 0.1  # of log kappa, where it is of an identified arm
-EXPLAINED = 1.5  # times what positions scatter at rest: a known slide that leaves more is not this joint's
+WORSE = 1.01  # times what a free fit leaves: a slide that leaves more is not this joint's
 BACK = 0.0, 0.03, 0.1  # below the last command, in terms of its rise: where a search for U starts
 DAMPING = np.log(10.0), 1.5  # log lambda and its spread: a weak prior, where the motion is too short to tell
 STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # creep length, rad; time since release, in terms of the guess
@@ -104,12 +104,14 @@ class Slide:
         level: (K,) Nm, the command that balances a slow slide above `fall`: Coulomb's level, without what else pulls.
         viscous: (K,) Nm s/rad.
         fall: (K,) rad/s, over which friction falls from breakaway to `level` as exp(-(v / fall)^2).
+        misfit: (K,) rad RMS, what a fit that knows nothing of this leaves.
     """
 
     kappa: np.ndarray
     level: np.ndarray
     viscous: np.ndarray
     fall: np.ndarray
+    misfit: np.ndarray
 
 
 def breakaway(
@@ -148,8 +150,9 @@ def breakaway(
             continue
         seen = t[:end], x[:end], _delayed(t, u, delay, lag)[:end]
         if slide is not None and not np.isnan(slide.kappa[k]):
-            value[k], misfit[k] = _release_of(*seen, slide.kappa[k], slide.level[k], slide.viscous[k], slide.fall[k])
-        if np.isnan(value[k]):
+            known = slide.kappa[k], slide.level[k], slide.viscous[k], slide.fall[k]
+            value[k], misfit[k] = _release_of(*seen, *known)
+        if np.isnan(value[k]) or (slide is not None and misfit[k] > WORSE * slide.misfit[k]):
             value[k], misfit[k] = _release(*seen)
         value[k] *= sign
         blur[k] = RELEASE_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
@@ -219,28 +222,25 @@ def _release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]
 def _release_of(
     t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
 ) -> tuple[float, float]:
-    """Fit the known slide of a `Slide`; return U, Nm, NaN where that is not how the joint moves, and misfit, rad."""
+    """Fit the slide of a `Slide` to x (T,) rad under u (T,) Nm; return its U, Nm, and misfit, rad."""
     span = u[-1] - u[0]
     if span <= 0:
         return np.nan, np.nan
     near, used = _parts(x)
-    rest = x[near // 4 : near + 1]
-    noise = max(ENCODER, float(rest[: len(rest) // 2 + 1].std()))
 
     def residuals(p: np.ndarray) -> np.ndarray:
         k = kappa * np.exp(p[1])
         motion = p[2] + p[3] * t + _slide(t, u, p[0], k, RIGID, k * viscous, k * max(p[0] - level, 0.0), fall)
-        return np.concatenate([(motion - x)[used] / noise, [p[1] / SURE, p[3] / DRIFT]])
+        return np.concatenate([(motion - x)[used] / ENCODER, [p[1] / SURE, p[3] / DRIFT]])
 
     fits = []
     low, high = [u[0], -1.0, *LOW[-2:]], [u[-1], 1.0, *HIGH[-2:]]
     for back in BACK:
-        first = np.array([u[-1] - (back + 1e-3) * span, 0.0, np.median(rest), 0.0])
+        first = np.array([u[-1] - (back + 1e-3) * span, 0.0, np.median(x[near // 4 : near + 1]), 0.0])
         scale, step = [0.02 * span, 0.5 * SURE, ENCODER, DRIFT], [1e-5, 1e-4, 1e-3, 1e-3]
         fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
     best = min(fits, key=lambda fit: fit.cost)
-    left = float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
-    return (float(best.x[0]) if left < EXPLAINED else np.nan), left * noise
+    return float(best.x[0]), ENCODER * float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
 
 
 def _parts(x: np.ndarray) -> tuple[int, slice]:

@@ -21,7 +21,7 @@ class StaticFriction:
     def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
         kept = np.flatnonzero(~np.isnan(edges.value))
         q = np.stack([ramps.recording.q[s.start] for s in ramps.recording.stretches])[kept]
-        self._kept, self._ramps = kept, len(edges.value)
+        self._kept, self._misfit = kept, edges.misfit
         self.joint, self.side = edges.joint[kept], (edges.sign[kept] > 0).astype(int)
         self.command, own = edges.value[kept], np.arange(len(kept))
         still = np.zeros_like(q)
@@ -47,10 +47,10 @@ class StaticFriction:
         level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
         viscous = phi["viscous"] * (1 + sign * phi.get("viscous_asymmetry", 0.0))
         inertia = self._inertia @ LinkInertia(d.mass, d.com, d.inertia).standard().ravel() + d.armature[self.joint]
-        out = np.full((4, self._ramps), np.nan)
+        out = np.full((4, len(self._misfit)), np.nan)
         pull = sign * (self.net(d) - self.command)
         out[:, self._kept] = 1 / inertia, level - pull, viscous, phi["stribeck_velocity"]
-        return Slide(*out)
+        return Slide(*out, self._misfit)
 
     def edges(self, d: Dynamics) -> np.ndarray:
         """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; d's own without any."""
