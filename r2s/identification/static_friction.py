@@ -50,7 +50,8 @@ class StaticFriction:
         out = np.full((4, len(self._misfit)), np.nan)
         pull = sign * (self.net(d) - self.command)
         out[:, self._kept] = 1 / inertia, level - pull, viscous, phi["stribeck_velocity"]
-        return Slide(*out, self._misfit)
+        kappa, level, viscous, fall = out
+        return Slide(kappa, level, viscous, fall, self._misfit)
 
     def edges(self, d: Dynamics) -> np.ndarray:
         """Return (n, 2) Nm: the net torques at which joints let go, the mean over ramps; d's own without any."""

@@ -60,8 +60,8 @@ def altered(
 ) -> Dynamics:
     """Return m arms as `draw` has them with other friction and delay; arguments as of `Altered`."""
     base = draw(rng, m)
-    names = base.family.names[: base.phi.shape[-1]]
-    scale = np.where([n in LEVEL for n in names], rng.uniform(*friction, (m, robot.n, 1)), 1.0)
+    names, (low, high) = base.family.names[: base.phi.shape[-1]], friction
+    scale = np.where([n in LEVEL for n in names], rng.uniform(low, high, (m, robot.n, 1)), 1.0)
     return replace(base, phi=base.phi * scale, delay=base.delay + rng.uniform(0, late, m))
 
 
