@@ -193,7 +193,9 @@ def main() -> None:
         "explore with, 0.1, which asks for 1 Nm and hardly ever moves a joint out of its dead zone.",
         trials_table(),
     ]
-    (ROOT / "docs" / "algorithms.md").write_text("\n\n".join(pages) + "\n")
+    page = ROOT / "docs" / "algorithms.md"
+    grid = page.read_text().partition("\n## The paper's grid\n")[1:]  # benchmarks/grid.py wrote it
+    page.write_text("\n\n".join(pages) + "\n" + "".join(grid))
     print("written: docs/algorithms.md")
 
 

@@ -22,6 +22,7 @@ WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern;
     "families": (r"\d+",),
     "faults": ("kills", "places", "files", "mutations", "page"),
     "known_truth": (r"\d+",),
+    "grid": (r"\d+(,\d+)*", NUMBER),
     "least_squares": (NUMBER,),
     "payload": (r"(root|motions|make)=.+", r"\d+"),
     "searches": (NUMBER,),
@@ -117,6 +118,14 @@ def markdown(table: pd.DataFrame) -> str:
     return "\n".join("| " + " | ".join(line).replace("\n", " ") + " |" for line in lines)
 
 
+def put_section(page: Path, heading: str, parts: Sequence[str]) -> None:
+    """Write a section of a page anew, up to the next of its level; at its end where there is none of that name."""
+    begin = f"## {heading}\n"
+    before, _, after = page.read_text().partition(begin)
+    rest = after[after.find("\n## ") :] if "\n## " in after else ""
+    page.write_text(before.rstrip("\n") + "\n\n" + begin + "\n" + "\n\n".join(parts) + "\n" + rest)
+
+
 __all__ = [
     "MACHINE",
     "NEW",
@@ -131,4 +140,4 @@ __all__ = [
     "poses_about",
     "ramp",
 ]
-__all__ += ["markdown", "record", "replace", "searches", "side_by_side"]
+__all__ += ["markdown", "put_section", "record", "replace", "searches", "side_by_side"]

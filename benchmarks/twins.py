@@ -9,7 +9,7 @@ import sys
 import time
 
 import numpy as np
-from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, poses_about, ramp, record, searches
+from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, poses_about, put_section, ramp, record, searches
 
 from r2s.arm.twins import twin
 from r2s.identification.identify import identify
@@ -65,8 +65,6 @@ def main() -> None:
     print(told)
     if asked:
         return
-    begin = f"## Make {make}: what is predicted\n"
-    before, _, after = DOCS.read_text().partition(begin)
     seeds = f"{JUDGING[make][0]}-{JUDGING[make][-1]}"
     command = f"python benchmarks/twins.py{' make=2' * (make == 2)}"
     lines = [
@@ -84,8 +82,7 @@ def main() -> None:
         cells = [seed, r["family"], pairs[0], pairs[1], f"1/{r['ratio']:.1f}", pairs[2], f"{r['joints'].max():.2f}"]
         cells += [f"{r['delay']:.1f} + {r['lag']:.1f}", f"{r['seconds']:.0f}"]
         lines.append("| " + " | ".join(str(c) for c in cells) + " |")
-    rest = after[after.find("\n## ") :] if "\n## " in after else ""
-    DOCS.write_text(before + begin + "\n" + "\n".join(lines) + "\n" + rest)
+    put_section(DOCS, f"Make {make}: what is predicted", ["\n".join(lines)])
     print("written: docs/twins.md")
 
 

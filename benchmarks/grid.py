@@ -1,0 +1,142 @@
+"""The paper's grid search, run once: 48 trainings of one seed, and a search of a quarter as many beside it.
+
+`python benchmarks/grid.py [SEEDS] [MINUTES]`, by default 0 and 2.5, runs `+experiment=paper_grid` and then
+`+experiment=tune`, both only what is missing, so they can be stopped; then it writes "The paper's grid" in
+docs/algorithms.md. Run folders: runs/train/{grid,tuned}_*, runs/tune/tuned.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import pandas as pd
+import yaml
+from common import MACHINE, ROOT, markdown, put_section
+
+from r2s.reporting.tuning import against_table
+from r2s.stages.tune import MEASURES
+
+ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
+AXES = {"algo.lr": "lr", "algo.batch_size": "batch", "algo.gamma": "gamma"}
+MEASURE = "return_paper"  # what settings are chosen by
+SHOWN = {"success_1cm": ("< 1 cm, %", 100, 1), "success_5mm": ("< 5 mm, %", 100, 1)}
+SHOWN |= {"rest": ("at rest, %", 100, 1), "return_paper": ("return", 1, 1), "env_steps": ("1000 env steps", 1e-3, 0)}
+TRIALS = 12
+TUNED = ROOT / "runs" / "tune" / "tuned"
+GRID = "runs/train/grid_*"
+
+
+def run(words: Sequence[str]) -> None:
+    """Run a command of r2s; end where it fails."""
+    if subprocess.call([sys.executable, "run.py", *words], cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}):
+        sys.exit(f"failed: {' '.join(words)}")
+
+
+def trainings() -> pd.DataFrame:
+    """Return a row per job of the grid: its settings, what it was chosen by, and its last policy on unseen goals."""
+    rows = []
+    for folder in sorted(ROOT.glob(GRID)):
+        if not (folder / "summary.json").is_file():
+            continue
+        words = dict(word.split("=", 1) for word in yaml.safe_load((folder / "overrides.yaml").read_text()))
+        row = {"algo": words["algo"], "seed": int(words["seed"])} | {a: float(words[k]) for k, a in AXES.items()}
+        chosen = pd.read_csv(folder / "evaluations.csv")[MEASURE].iloc[-1]
+        rows.append(row | {"chosen by": chosen} | json.loads((folder / "summary.json").read_text())["last"])
+    return pd.DataFrame(rows)
+
+
+def settings(jobs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per algorithm and setting: the mean over seeds."""
+    numbers = ["chosen by", *SHOWN]
+    return jobs.groupby(["algo", *AXES.values()], as_index=False)[numbers].mean()
+
+
+def best_table(each: pd.DataFrame) -> pd.DataFrame:
+    """Return the setting of each algorithm that its own evaluations chose, on goals that they never saw."""
+    best = each.loc[each.groupby("algo")["chosen by"].idxmax()].set_index("algo").loc[list(ALGORITHMS)]
+    out = pd.DataFrame(
+        {"setting": [f"lr {r.lr:g}, batch {r.batch:.0f}, gamma {r.gamma:g}" for r in best.itertuples()]}
+    )
+    out.index = pd.Index(best.index, name="best of each")
+    for key, (title, scale, digits) in SHOWN.items():
+        out[title] = (scale * best[key]).map(lambda x, d=digits: f"{x:.{d}f}")
+    return out
+
+
+def spread_table(each: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Return best, median and worst over the settings of each algorithm, and who loses least from best to median."""
+    out, least = {}, {}
+    for key in ("success_1cm", "return_paper"):
+        title, scale, _ = SHOWN[key]
+        over = (scale * each[key]).groupby(each["algo"]).agg(["max", "median", "min"]).loc[list(ALGORITHMS)]
+        least[title] = str((over["max"] - over["median"]).idxmin())
+        for column, word in {"max": "best", "median": "median", "min": "worst"}.items():
+            out[f"{word} {title}"] = over[column].map("{:.1f}".format)
+    good = (each["success_1cm"] >= 0.9).groupby(each["algo"]).agg(["sum", "count"])
+    out["settings with 90 % < 1 cm"] = good.apply(lambda r: f"{r['sum']} of {r['count']}", axis=1)
+    return pd.DataFrame(out).rename_axis("over the settings"), least
+
+
+def axes_table(each: pd.DataFrame) -> pd.DataFrame:
+    """Return the median return of each algorithm at each value of each axis."""
+    columns = {}
+    for axis in AXES.values():
+        for value, some in each.groupby(axis):
+            columns[f"{axis} {value:g}"] = some.groupby("algo")["return_paper"].median().map("{:.0f}".format)
+    return pd.DataFrame(columns).loc[list(ALGORITHMS)].rename_axis("median return")
+
+
+def written(seeds: str, minutes: float) -> list[str]:
+    """Return the section."""
+    jobs = trainings()
+    each = settings(jobs)
+    spread, least = spread_table(each)
+    order = {
+        SHOWN[key][0]: list(each.groupby("algo")[key].max().sort_values(ascending=False).index)
+        for key in ("success_1cm", "return_paper")
+    }
+    leads = "leads" if all(names[0] == "tqc" for names in order.values()) else "does not lead in both"
+    holds = "confirmed" if set(least.values()) == {"tqc"} else "not confirmed"
+    ranks = "; ".join(f"by {title.removesuffix(', %')}: {' > '.join(names)}" for title, names in order.items())
+    loses = "; ".join(f"by {title.removesuffix(', %')}: {name}" for title, name in least.items())
+    text = [
+        f"`python benchmarks/grid.py` on {MACHINE}: conf/experiment/paper_grid.yaml with budget.minutes={minutes:g} "
+        f"and seed {seeds}, {len(jobs)} jobs of one thread. Of each algorithm the setting is shown that the return of "
+        "its last evaluation chose; the numbers are of its last policy on goals, starts and arms that nothing was "
+        "chosen on.",
+        markdown(best_table(each)),
+        f"Best setting of each, {ranks}: TQC {leads}. Least lost from the best to the median setting, {loses}: that "
+        f"TQC is the least sensitive is {holds}. With one seed a difference of some points is chance.",
+        markdown(spread),
+        markdown(axes_table(each)),
+    ]
+    trials = pd.read_csv(TUNED / "trials.csv")
+    against = against_table(trials, MEASURE, str(ROOT / GRID), MEASURES[MEASURE] == "maximize")
+    assert against is not None
+    counts = trials["state"].value_counts()
+    shown = against.map(lambda x: f"{x:.4g}").set_index("minutes").rename_axis("minutes of training")
+    return [
+        *text,
+        f"`+experiment=tune` with {len(trials)} trials of as many minutes ({counts.get('complete', 0)} came to their "
+        f"end, {counts.get('pruned', 0)} were stopped): the best return so far at equal compute. The grid's is the mean "
+        "over random orders of its jobs. Returns are of the last evaluations, by which either chooses.",
+        markdown(shown),
+    ]
+
+
+def main() -> None:
+    """Run the grid and the search, and write the section."""
+    seeds = sys.argv[1] if len(sys.argv) > 1 else "0"
+    minutes = float(sys.argv[2]) if len(sys.argv) > 2 else 2.5
+    run(["-m", "+experiment=paper_grid", f"budget.minutes={minutes:g}", f'grid.seed="{seeds}"'])
+    if not (TUNED / "trials.csv").is_file():
+        begun = [f"resume={TUNED}"] if TUNED.is_dir() else ["name=tuned"]
+        run(["+experiment=tune", f"budget.minutes={minutes:g}", f"tune.trials={TRIALS}", "tune.startup=4", *begun])
+    put_section(ROOT / "docs" / "algorithms.md", "The paper's grid", written(seeds, minutes))
+    print("written: docs/algorithms.md")
+
+
+if __name__ == "__main__":
+    main()
