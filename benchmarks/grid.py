@@ -76,7 +76,7 @@ def spread_table(each: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
             out[f"{word} {title}"] = over[column].map("{:.1f}".format)
     good = (each["success_1cm"] >= 0.9).groupby(each["algo"]).agg(["sum", "count"])
     out["settings with 90 % < 1 cm"] = good.apply(lambda r: f"{r['sum']} of {r['count']}", axis=1)
-    return pd.DataFrame(out).rename_axis("over the settings"), least
+    return pd.DataFrame(out).loc[list(ALGORITHMS)].rename_axis("over the settings"), least
 
 
 def axes_table(each: pd.DataFrame) -> pd.DataFrame:
@@ -103,9 +103,9 @@ def written(seeds: str, minutes: float) -> list[str]:
     loses = "; ".join(f"by {title.removesuffix(', %')}: {name}" for title, name in least.items())
     text = [
         f"`python benchmarks/grid.py` on {MACHINE}: conf/experiment/paper_grid.yaml with budget.minutes={minutes:g} "
-        f"and seed {seeds}, {len(jobs)} jobs of one thread. Of each algorithm the setting is shown that the return of "
-        "its last evaluation chose; the numbers are of its last policy on goals, starts and arms that nothing was "
-        "chosen on.",
+        f"and seed {seeds}, {len(jobs)} jobs of one thread. Of each algorithm the setting is shown that the return "
+        "of its last evaluation chose; the numbers are of its last policy on goals, starts and arms that nothing "
+        "was chosen on.",
         markdown(best_table(each)),
         f"Best setting of each, {ranks}: TQC {leads}. Least lost from the best to the median setting, {loses}: that "
         f"TQC is the least sensitive is {holds}. With one seed a difference of some points is chance.",
@@ -120,8 +120,8 @@ def written(seeds: str, minutes: float) -> list[str]:
     return [
         *text,
         f"`+experiment=tune` with {len(trials)} trials of as many minutes ({counts.get('complete', 0)} came to their "
-        f"end, {counts.get('pruned', 0)} were stopped): the best return so far at equal compute. The grid's is the mean "
-        "over random orders of its jobs. Returns are of the last evaluations, by which either chooses.",
+        f"end, {counts.get('pruned', 0)} were stopped): the best return so far at equal compute. The grid's is the "
+        "mean over random orders of its jobs. Returns are of the last evaluations, by which either chooses.",
         markdown(shown),
     ]
 
