@@ -81,7 +81,7 @@ def train(cfg, overrides):
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
     identified, told = draw, told_of(cfg, robot)
     if told:
-        draw, settings = told_draw(cfg, robot, center, draw), settings | {"told": told}
+        draw = told_draw(cfg, robot, center, draw)
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
@@ -89,7 +89,8 @@ def train(cfg, overrides):
     evaluate = make_evaluation(robot, task, draw, **words, seed=SELECTED)
     torque = torch.from_numpy(task.share * task.torque(robot))
     scale = observation_scale(robot, task, told)
-    algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque).to(device(cfg))
+    given = (scale, torque, told) if told else (scale, torque)
+    algo = called(target(cfg.algo, "algo"), "algo", settings, *given).to(device(cfg))
     best: dict = {}
     last: dict = {}
 
