@@ -274,5 +274,5 @@ def _said(over: Slot) -> bool:
 
 def _publish(driven: DrivenArm, cycle: int, state: Slot) -> None:
     s, effort, stopped, limited = driven.read()
-    told = [] if driven.told is None else driven.told
+    told = np.zeros(0) if driven.told is None else driven.told
     state.write(np.concatenate([[s.t, cycle, stopped, limited], s.q, s.dq, s.tau_J, s.tau_J_d, effort, told]))

@@ -96,7 +96,7 @@ def transfer(cfg, overrides):
     fade = cfg.arm.get("soft_start_s", 0.0)
     check_number("arm.soft_start_s", fade, "[0, inf)")
     adapter = make_adapter(cfg, robot, source)
-    if is_told(cfg) and policy.told.latent:
+    if is_told(cfg) and policy.told and policy.told.latent:
         policy = policy.by_latent()
     dynamics, draw = None, None
     if cfg.simulator.name != "none":
