@@ -59,9 +59,9 @@ def altered(
     robot: Robot, draw: Draw, friction: Sequence[float], late: float, rng: np.random.Generator, m: int
 ) -> Dynamics:
     """Return m arms as `draw` has them with other friction and delay; arguments as of `Altered`."""
-    base = draw(rng, m)
-    names, (low, high) = base.family.names[: base.phi.shape[-1]], friction
-    scale = np.where([n in LEVEL for n in names], rng.uniform(low, high, (m, robot.n, 1)), 1.0)
+    base, (least, most) = draw(rng, m), friction
+    names = base.family.names[: base.phi.shape[-1]]
+    scale = np.where([n in LEVEL for n in names], rng.uniform(least, most, (m, robot.n, 1)), 1.0)
     return replace(base, phi=base.phi * scale, delay=base.delay + rng.uniform(0, late, m))
 
 

@@ -21,7 +21,7 @@ class TQC(EntropyLearner):
     """Learner of a stochastic policy, with quantile critics whose highest atoms are left out.
 
     Args:
-        scale, torque, hidden, gamma, tau, lr, action_l2, told: see r2s.learning.networks.Learner.
+        scale, torque, told, hidden, gamma, tau, lr, action_l2: see r2s.learning.networks.Learner.
         n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
         alpha_init, target_entropy: see r2s.learning.networks.EntropyLearner.
 
@@ -33,6 +33,7 @@ class TQC(EntropyLearner):
         self,
         scale: tuple[Tensor, Tensor],
         torque: Tensor,
+        told: Told | None = None,
         *,
         hidden: Sequence[int] = (128, 128),
         n_critics: int = 2,
@@ -44,7 +45,6 @@ class TQC(EntropyLearner):
         alpha_init: float = 0.01,
         target_entropy: float | None = None,
         action_l2: float = 0.0,
-        told: Told | None = None,
     ):
         check_number("n_quantiles", n_quantiles, "[1, inf)", whole=True)
         check_number("drop_per_critic", drop_per_critic, f"[0, {n_quantiles})", whole=True)

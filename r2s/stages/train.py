@@ -93,14 +93,15 @@ def make_parts(cfg):
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
     identified, told = draw, told_of(cfg, robot)
     if told:
-        draw, settings = told_draw(cfg, robot, center, draw), settings | {"told": told}
+        draw = told_draw(cfg, robot, center, draw)
     weights = called(Curriculum, "reward", plain(cfg.reward))
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
     evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads, seed=SELECTED)
     torque = torch.from_numpy(task.share * task.torque(robot))
     scale = observation_scale(robot, task, told)
-    algo = called(target(cfg.algo, "algo"), "algo", settings, scale, torque)
+    given = (scale, torque, told) if told else (scale, torque)
+    algo = called(target(cfg.algo, "algo"), "algo", settings, *given)
     many, on = evaluation.episodes, device(cfg)
     return Parts(robot, center, task, identified, draw, told, weights, env, evaluate, algo, loop, budget, many, on)
 
