@@ -36,7 +36,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
 
     Raises:
         UserError: an option that the config does not have, with the nearest that it has; or one that no job reads;
-            a grid without -m.
+            a grid without -m; no such folder.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
@@ -44,6 +44,9 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    if config_dir and not Path(config_dir).is_dir():
+        beside = [p.name for p in Path(config_dir).absolute().parent.glob("*/")]
+        raise UserError(f"--config-dir: no folder '{config_dir}'{nearest(Path(config_dir).name, beside)}")
     own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     words = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]  # those are Hydra's own
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):

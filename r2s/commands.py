@@ -103,7 +103,7 @@ def export(typed: Namespace) -> None:
     from r2s.stages.build import CONF, is_learner, make_dynamics, make_robot, make_task, plain
     from r2s.stages.transfer import trained_config
 
-    source, trained = trained_config(Namespace(policy=typed.run))
+    source, trained = trained_config(Namespace(policy=typed.run), "export")
     if not is_learner(trained):
         raise UserError(f"export: {source} is of algo={trained.algo.name}, which is no network that could travel")
     robot = make_robot(trained)

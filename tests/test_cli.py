@@ -400,6 +400,8 @@ MISTAKES = {
     "stage=identify identify.window_s=-1": r"identify.window_s: -1 is not allowed",
     "stage=identify identify.folds=few": r"identify.folds: 'few' is not a number",
     "stage=identify identify.bounds.phi1=[2,1]": r"identify.bounds.phi1: \[2, 1\] is not \[low, high\]",
+    "stage=identify data.seconds=1": r"data.seconds: 1 is not allowed; a number in \[2, 120\] is",
+    "--config-dir cnf algo=cooling": r"--config-dir: no folder 'cnf'; did you mean 'conf'",
     "stage=identify data.seconds=long": r"data.seconds: 'long' is not a number",
     "stage=identify data=simulated data.truth=papr": r"data.truth: no 'papr'.*did you mean 'paper'",
     "stage=identify search.0.ftol=small": r"search.0.ftol: 'small' is not a number",

@@ -492,7 +492,7 @@ def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
             commands.run_command(["export", str(run), *more])
 
     refused("bundle is there already", exported.run)
-    refused("is no finished run folder of stage=train", tmp_path / "nothing")
+    refused("^export: .* is no finished run folder of stage=train", tmp_path / "nothing")
     run = shutil.copytree(exported.run, tmp_path / "run", ignore=shutil.ignore_patterns("bundle"))
     (run / "policy.onnx").write_bytes(b"no")
     refused("policy.onnx is damaged|policy.onnx", run, f"to={tmp_path / 'to'}")

@@ -38,6 +38,7 @@ BLEND_S = 0.4  # between two paces
 HOLD_S = 0.4  # at rest between two rungs
 ENDS_S = 0.2  # at rest at both ends
 LONGEST_S = 120.0
+LEAST_S = 5 * BLEND_S
 # the series
 TOP_HZ = 1.0  # of its own time
 FALL = 1.5  # of the amplitude with the harmonic: position range from the low ones, acceleration from the high
@@ -102,9 +103,8 @@ def fourier(
         UserError: an argument out of range, or no draw is safe.
 
     """
-    shortest = 5 * BLEND_S
-    if not shortest <= duration <= LONGEST_S:
-        raise UserError(f"excitation.duration={duration:g} s is not allowed; {shortest:g} to {LONGEST_S:g} s are")
+    if not LEAST_S <= duration <= LONGEST_S:
+        raise UserError(f"excitation.duration={duration:g} s is not allowed; {LEAST_S:g} to {LONGEST_S:g} s are")
     if effort < 0:
         raise UserError(f"excitation.effort={effort} must not be negative")
     center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)

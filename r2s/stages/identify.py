@@ -57,7 +57,9 @@ class Excitation:
     ramp_poses: int
 
     def __post_init__(self):
-        check_number("data.seconds", self.seconds, "(0, inf)")
+        from r2s.excitation.fourier import LEAST_S, LONGEST_S
+
+        check_number("data.seconds", self.seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
         check_number("data.excitation_seed", self.excitation_seed, "[0, inf)", whole=True)
         check_number("data.ramp_poses", self.ramp_poses, "[0, inf)", whole=True)
         if self.torque not in ("commanded", "measured"):

@@ -41,8 +41,8 @@ def reads(cfg):
     return {"policy", "simulator", "arm", "adapt", "evaluation.episodes"}
 
 
-def trained_config(cfg):
-    """Return the run folder of `policy=` and the config that it was made with.
+def trained_config(cfg, what="policy"):
+    """Return the run folder of `policy=` and the config that it was made with; `what` names it in an error.
 
     What it was calibrated with lies in that folder too, so that it needs no other.
 
@@ -53,10 +53,10 @@ def trained_config(cfg):
     if source is None or not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
         names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
         near = nearest(source.name, names) if source else ""
-        raise UserError(f"policy: '{cfg.policy}' is no finished run folder of stage=train{near}")
+        raise UserError(f"{what}: '{cfg.policy}' is no finished run folder of stage=train{near}")
     trained = loaded(source / "config.yaml")
     if trained.stage != "train":
-        raise UserError(f"policy: {source} is a run of stage={trained.stage}; allowed: train")
+        raise UserError(f"{what}: {source} is a run of stage={trained.stage}; allowed: train")
     if trained.calibration:
         trained.calibration = str(source)
     return source, trained
