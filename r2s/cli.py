@@ -22,6 +22,7 @@ WORDS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 NONE_NEEDED = ("tracker", "experiment")  # groups of which a run may have no option
 GROWS = ("tune.space",)  # what + adds to: an axis that conf/stage/tune.yaml has not
+SEARCHED = "hydra.searchpath"
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
@@ -47,7 +48,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
     if config_dir and not Path(config_dir).is_dir():
         beside = [p.name for p in Path(config_dir).absolute().parent.glob("*/")]
         raise UserError(f"--config-dir: no folder '{config_dir}'{nearest(Path(config_dir).name, beside)}")
-    own = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
+    own = [f"{SEARCHED}=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     words = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]  # those are Hydra's own
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
@@ -65,6 +66,8 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
             if isinstance(root, bool) or not isinstance(root, str | int | float):
                 raise UserError(f"root: {root} is not allowed; a folder is")
+        for cfg, job in zip(configs, jobs, strict=True):
+            check_switches(cfg, names, [w for w in job if w.lstrip("+").split("=", 1)[0] in (*groups, SEARCHED)])
         for name in names:
             reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
             if reasons and all(reasons):
@@ -95,6 +98,22 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
         first = jobs[0]
         jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
     return names, jobs
+
+
+def check_switches(cfg: Any, names: Sequence[str], chosen: Sequence[str]) -> None:
+    """Raise UserError where what is true or false without the words `names`, with `chosen` alone, is neither now."""
+    from hydra import compose
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    before = compose("config", list(chosen))
+    for name in names:
+        try:
+            was, now = OmegaConf.select(before, name), OmegaConf.select(cfg, name)
+        except OmegaConfBaseException:  # `${nowhere}`: said when it is read
+            continue
+        if isinstance(was, bool) and not isinstance(now, bool):
+            raise UserError(f"{name}: {now!r} is not allowed; true and false are")
 
 
 def check_option(group: str, value: Any, options: Sequence[str]) -> None:
@@ -214,8 +233,6 @@ def check_words(cfg):
             cfg[key] = str(value)
     if cfg.root is None:
         raise UserError("root: null is not allowed; a folder is")
-    if not isinstance(cfg.only_missing, bool):
-        raise UserError(f"only_missing: {cfg.only_missing!r} is not allowed; true and false are")
 
 
 def run_job(cfg):
