@@ -402,6 +402,8 @@ MISTAKES = {
     "stage=identify identify.bounds.phi1=[2,1]": r"identify.bounds.phi1: \[2, 1\] is not \[low, high\]",
     "stage=identify data.seconds=1": r"data.seconds: 1 is not allowed; a number in \[2, 120\] is",
     "--config-dir cnf algo=cooling": r"--config-dir: no folder 'cnf'; did you mean 'conf'",
+    "stage=identify arm=panda_emulated arm.realtime=ture": r"arm.realtime: 'ture' is not allowed; true and false are",
+    "compile=1": r"compile: 1 is not allowed; true and false are",
     "stage=identify data.seconds=long": r"data.seconds: 'long' is not a number",
     "stage=identify data=simulated data.truth=papr": r"data.truth: no 'papr'.*did you mean 'paper'",
     "stage=identify search.0.ftol=small": r"search.0.ftol: 'small' is not a number",
