@@ -49,7 +49,7 @@ def words_of(stage: str, root: Path, name: str) -> list[str]:
     if stage == "compare":
         return ["stage=compare", f"runs={root}/train/reference*", *head]
     if stage == "sweep":
-        return ["-m", *QUICK, f"root={root}", f"name={name}_${{seed}}", "only_missing=true", "seed=0,1"]
+        return ["-m", *QUICK, f"root={root}", f"name={name}s_${{seed}}", "only_missing=true", "seed=0,1"]
     space = "tune.space={algo: [td3], algo.lr: [2e-4, 1e-3], algo.batch_size: [16], algo.gamma: [0.95]}"
     own = ["tune.trials=2", "tune.workers=1", "tune.startup=1", space]
     typed = [w.replace("+experiment=toy", "+experiment=[tune,toy]") for w in QUICK if "batch_size" not in w]
@@ -117,7 +117,7 @@ def kills(root: Path, err: Path) -> None:
         needed = stage in ("train", "identify") and sys.argv[1:] != ["kills"]  # by the other parts
         if done[stage] >= count and not needed:
             continue
-        folders = [root / "train" / f"{name}_{k}" for k in (0, 1)] if stage == "sweep" else [root / stage / name]
+        folders = [root / "train" / f"{name}s_{k}" for k in (0, 1)] if stage == "sweep" else [root / stage / name]
         began = time.monotonic()
         status, text = say(words_of(stage, root, name), err)
         assert status == 0, text
@@ -172,7 +172,7 @@ def killed(stage, root, name, after, everyone, reference, err) -> dict:
         twice = [f for f in root.glob(f"train/{name}*") if f.name.count("_") > 2]
         return row | {"same": bool(same and not twice), "half": half_written(root)}
     if stage == "sweep":
-        folders = [root / "train" / f"{name}_{k}" for k in (0, 1)]
+        folders = [root / "train" / f"{name}s_{k}" for k in (0, 1)]
         twice = len(list((root / "train").glob(f"{name}*"))) - 2
         return row | {"same": [results(f) for f in folders] == reference and not twice, "half": half_written(root)}
     again = folder if resumes else max((root / stage).glob(f"{name}*"), key=os.path.getmtime)
@@ -292,7 +292,7 @@ def lost_worker(root: Path, err: Path, note, reference: dict) -> None:
     os.kill(worker, signal.SIGKILL)
     status, text = ended(pid), err.read_text()
     again, _ = say(words, err)
-    same = again == 0 and results(root / "train" / "worker_0") == reference
+    same = again == 0 and results(root / "train" / "workers_0") == reference
     note("a worker of a sweep is killed (joblib)", status, text, same and len(list(root.glob("train/worker*"))) == 2)
 
 
