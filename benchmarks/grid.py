@@ -5,16 +5,17 @@
 docs/algorithms.md. Run folders: runs/train/{grid,tuned}_*, runs/tune/tuned.
 """
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 
 import pandas as pd
-import yaml
 from common import MACHINE, ROOT, markdown, put_section
 
+from r2s.reporting.comparison import sensitivity_table
+from r2s.reporting.grouping import group
+from r2s.reporting.trainings import Trained, read_trainings
 from r2s.reporting.tuning import against_table
 from r2s.stages.tune import MEASURES
 
@@ -34,23 +35,18 @@ def run(words: Sequence[str]) -> None:
         sys.exit(f"failed: {' '.join(words)}")
 
 
-def trainings() -> pd.DataFrame:
-    """Return a row per job of the grid: its settings, what it was chosen by, and its last policy on unseen goals."""
+def trainings() -> list[Trained]:
+    """Return the finished jobs of the grid."""
+    return read_trainings(sorted(ROOT.glob(GRID)))[0]
+
+
+def settings(jobs: list[Trained]) -> pd.DataFrame:
+    """Return a row per algorithm and setting, mean over seeds: what chose it, its last policy on unseen goals."""
     rows = []
-    for folder in sorted(ROOT.glob(GRID)):
-        if not (folder / "summary.json").is_file():
-            continue
-        words = dict(word.split("=", 1) for word in yaml.safe_load((folder / "overrides.yaml").read_text()))
-        row = {"algo": words["algo"], "seed": int(words["seed"])} | {a: float(words[k]) for k, a in AXES.items()}
-        chosen = pd.read_csv(folder / "evaluations.csv")[MEASURE].iloc[-1]
-        rows.append(row | {"chosen by": chosen} | json.loads((folder / "summary.json").read_text())["last"])
-    return pd.DataFrame(rows)
-
-
-def settings(jobs: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per algorithm and setting: the mean over seeds."""
-    numbers = ["chosen by", *SHOWN]
-    return jobs.groupby(["algo", *AXES.values()], as_index=False)[numbers].mean()
+    for r in jobs:
+        axes = {axis: r.settings[key] for key, axis in AXES.items()}
+        rows.append({"algo": r.algo, **axes, "chosen by": r.curve[MEASURE].iloc[-1], **r.last})
+    return pd.DataFrame(rows).groupby(["algo", *AXES.values()], as_index=False)[["chosen by", *SHOWN]].mean()
 
 
 def best_table(each: pd.DataFrame) -> pd.DataFrame:
@@ -65,15 +61,15 @@ def best_table(each: pd.DataFrame) -> pd.DataFrame:
     return out
 
 
-def spread_table(each: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
+def spread_table(jobs: list[Trained], each: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
     """Return best, median and worst over the settings of each algorithm, and who loses least from best to median."""
-    out, least = {}, {}
+    out, least, grouped = {}, {}, group(jobs).members
     for key in ("success_1cm", "return_paper"):
         title, scale, _ = SHOWN[key]
-        over = (scale * each[key]).groupby(each["algo"]).agg(["max", "median", "min"]).loc[list(ALGORITHMS)]
-        least[title] = str((over["max"] - over["median"]).idxmin())
-        for column, word in {"max": "best", "median": "median", "min": "worst"}.items():
-            out[f"{word} {title}"] = over[column].map("{:.1f}".format)
+        table = sensitivity_table(grouped, key).set_index("algo").loc[list(ALGORITHMS)]
+        least[title] = str(table["spread"].idxmin())
+        for column in ("best", "median", "worst"):
+            out[f"{column} {title}"] = (scale * table[column]).map("{:.1f}".format)
     good = (each["success_1cm"] >= 0.9).groupby(each["algo"]).agg(["sum", "count"])
     out["settings with 90 % < 1 cm"] = good.apply(lambda r: f"{r['sum']} of {r['count']}", axis=1)
     return pd.DataFrame(out).loc[list(ALGORITHMS)].rename_axis("over the settings"), least
@@ -92,7 +88,7 @@ def written(seeds: str, minutes: float) -> list[str]:
     """Return the section."""
     jobs = trainings()
     each = settings(jobs)
-    spread, least = spread_table(each)
+    spread, least = spread_table(jobs, each)
     order = {
         SHOWN[key][0]: list(each.groupby("algo")[key].max().sort_values(ascending=False).index)
         for key in ("success_1cm", "return_paper")

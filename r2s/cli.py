@@ -66,8 +66,12 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
             if isinstance(root, bool) or not isinstance(root, str | int | float):
                 raise UserError(f"root: {root} is not allowed; a folder is")
+        before: dict[tuple[str, ...], Any] = {}
         for cfg, job in zip(configs, jobs, strict=True):
-            check_switches(cfg, names, [w for w in job if w.lstrip("+").split("=", 1)[0] in (*groups, SEARCHED)])
+            chosen = tuple(w for w in job if w.lstrip("+").split("=", 1)[0] in (*groups, SEARCHED))
+            if chosen not in before:
+                before[chosen] = compose("config", list(chosen))
+            check_switches(cfg, names, before[chosen])
         for name in names:
             reasons = [unread(name, cfg) for cfg in configs if cfg.stage in STAGES]
             if reasons and all(reasons):
@@ -100,13 +104,11 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
     return names, jobs
 
 
-def check_switches(cfg: Any, names: Sequence[str], chosen: Sequence[str]) -> None:
-    """Raise UserError where what is true or false without the words `names`, with `chosen` alone, is neither now."""
-    from hydra import compose
+def check_switches(cfg: Any, names: Sequence[str], before: Any) -> None:
+    """Raise UserError where an option of `names` that is true or false in the config `before` is neither in `cfg`."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    before = compose("config", list(chosen))
     for name in names:
         try:
             was, now = OmegaConf.select(before, name), OmegaConf.select(cfg, name)

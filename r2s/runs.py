@@ -162,10 +162,15 @@ class Run:
         (self.folder / "figures").mkdir(exist_ok=True)
         return self.folder / "figures" / f"{name}.png"
 
-    def log(self, table: str, row: Mapping[str, Any]) -> None:
-        """Append a row to <table>.csv; the first row sets the columns."""
-        self._append(table, row)
+    def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Append a row to <table>.csv; the first row sets the columns. Return it with the digits that it keeps there.
+
+        A run that chooses by those chooses as one that was interrupted and has read them (`rewind`).
+        """
+        kept = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row.items()}
+        self._append(table, kept)
         self.told(table, row)
+        return kept
 
     def told(self, table: str, row: Mapping[str, Any]) -> None:
         """Tell the watcher a row of a table that is written otherwise."""

@@ -56,7 +56,8 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)
-    spent, values = (np.array([r.last[k] for r in grid]) for k in ("wall_clock_s", measure))
+    # of the evaluations, as a trial's: a summary's last policy was judged on other goals
+    spent, values = (np.array([r.curve[k].iloc[-1] for r in grid]) for k in ("wall_clock_s", measure))
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(grid)) for _ in range(ORDERS)]
     each = np.stack([best_so_far(spent[o].tolist(), values[o].tolist(), at, sign) for o in orders])

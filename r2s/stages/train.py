@@ -156,8 +156,7 @@ def train(cfg, overrides):
                 is_best(row)
 
         def evaluated(row):
-            run.log("evaluations", row)
-            if is_best(row):
+            if is_best(run.log("evaluations", row)):
                 save_policy(run.folder, copy.deepcopy(algo.policy).cpu())
 
         def show(share, row):
