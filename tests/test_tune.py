@@ -15,7 +15,7 @@ from conftest import ROOT
 
 from r2s.errors import UserError
 from r2s.reporting.tuning import against_table, best_so_far
-from r2s.stages.tune import Tune, corners, span, suggested
+from r2s.stages.tune import Training, Tune, corners, span, suggested
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
 TOY = ["+experiment=[tune,toy]", "budget.env_steps=4000", "evaluation.env_steps=800", "algo.learning_starts=320"]
@@ -49,6 +49,17 @@ def test_an_axis_is_what_was_typed():
 def test_a_space_that_is_none_is_one_line(change, said):
     with pytest.raises(UserError, match=said):
         Tune(**TUNE | change)
+
+
+def test_a_training_that_was_left_running_does_not_speak_for_another(tmp_path):
+    """A killed tune's training tells its progress on; how another one ended is what that one said."""
+    optuna = pytest.importorskip("optuna")
+    trial = optuna.create_study().ask()
+    talks = "import sys, time; time.sleep({}); print({!r}, file=sys.stderr)"
+    left = Training(trial, tmp_path / "tune_0", [sys.executable, "-c", talks.format(1.0, "train 50 %")])
+    again = Training(trial, tmp_path / "tune_0", [sys.executable, "-c", talks.format(0.0, "it is taken")])
+    assert (again.process.wait(), left.process.wait()) == (0, 0)
+    assert (again.ended(), left.ended()) == ("it is taken", "train 50 %")
 
 
 def test_corners_hold_every_value_and_both_ends():

@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import subprocess
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -145,7 +146,8 @@ class Training:
             except UserError:
                 time.sleep(1.0)
         self.begun += 1
-        self.log = open(self.folder.parent / f".{self.folder.name}.log", "w+")  # noqa: SIM115 (closed in `ended`)
+        # a file without a name: into one that has it, a training that a killed tune left running would write too
+        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed in `ended`)
         self.process = subprocess.Popen(self.words, stdout=subprocess.DEVNULL, stderr=self.log)
 
     def rows(self) -> list[dict[str, float]]:
@@ -167,7 +169,6 @@ class Training:
         self.log.seek(0)
         lines = [line.strip() for line in self.log if line.strip()]
         self.log.close()
-        Path(self.log.name).unlink(missing_ok=True)
         return lines[-1] if lines else "no output"
 
     def stop(self) -> None:
