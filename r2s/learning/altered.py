@@ -19,7 +19,7 @@ KNOWN_S = 1.0  # after as much at most an estimate has come
 
 @dataclass(frozen=True)
 class Altered:
-    """Arms as `draw` has them, changed: what a policy learns on that is told of it; a `Draw` that `Tells`.
+    """Arms as `draw` has them, changed: what a policy learns on that is told of it; a `Draw` that tells.
 
     friction of each joint ~ drawn x U(friction), delay ~ drawn + U(0, late), payload as of `carried`.
     told from U(0, KNOWN_S) s on: truth + N(0, ERROR); zeros before, as an estimate takes its time.

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from r2s.learning.batch import ArmBatch, check_finite
-from r2s.learning.randomization import Pushes, Tells
+from r2s.learning.randomization import Pushes, TellingDraw
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task, observed
@@ -32,7 +32,7 @@ class TaskEnv(EnvBase):
     Args:
         robot, task: the arm and what is asked of it.
         draw: m -> Dynamics of m arms (or of one, for all), called at every reset with the env's generator. One that
-            `Pushes` is asked for torques at every step as well; one that `Tells`, for what a policy is told.
+            `Pushes` is asked for torques at every step as well; a `TellingDraw`, for what a policy is told.
         nsim: arms. nthread: 0 is all.
         seed: of goals, starts and draws.
         stagger: let the first episodes of eight groups of arms end at different times, not those of all at once.
@@ -109,7 +109,7 @@ class TaskEnv(EnvBase):
 
     def _tell(self, drawn: Dynamics, ids: np.ndarray | None = None) -> None:
         """Tell policies of the arms `ids` what is to be told of their dynamics, if anything is."""
-        if isinstance(self.draw, Tells):
+        if isinstance(self.draw, TellingDraw):
             self.arms.tell(*self.draw.said(self.rng, drawn), ids)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from r2s.learning.batch import ArmBatch
-from r2s.learning.randomization import Tells
+from r2s.learning.randomization import TellingDraw
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.tasks.episode import Acts, Episodes, rollout
@@ -50,7 +50,7 @@ def make_evaluation(
     """
     drawn = fixed_draws(draw, episodes, seed)
     arms = ArmBatch(robot, task, drawn, episodes, nthread)
-    if isinstance(draw, Tells):
+    if isinstance(draw, TellingDraw):
         arms.tell(*draw.said(np.random.default_rng([seed, 4]), drawn))
     starts, goals = fixed_episodes(robot, task, episodes, seed)
 

@@ -103,7 +103,7 @@ class Pushes(Protocol):
 
 
 @runtime_checkable
-class Tells(Protocol):
+class TellingDraw(Protocol):
     """Draws of which policies are told something."""
 
     def said(self, rng: np.random.Generator, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
