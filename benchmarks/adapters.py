@@ -18,6 +18,7 @@ has warmed to 0.8 of what it was when the arm was identified; commands that come
 the payload, the same seconds of the same episodes in all conditions.
 """
 
+import json
 import sys
 import time
 from collections import deque
@@ -200,8 +201,16 @@ def paired(frame: pd.DataFrame, of: str, root: bool) -> pd.DataFrame:
     return pd.DataFrame(cells).T
 
 
-def told(frame: pd.DataFrame, task: str) -> str:
-    """Return the table of one task as markdown."""
+def minutes(adapter: str, root: Path, kind: str, names: list[str]) -> float:
+    """Return what the training of an adapter, or of the policy that is told by it, took in the mean over twins."""
+    own = adapter.removesuffix("_untold")
+    folders = [told_folder(root, own, kind, n) if own in TOLD else root / "train" / f"net_m{n}" for n in names]
+    took = [json.loads((f / "meta.json").read_text())["wall_clock_s"] for f in folders if (f / "meta.json").is_file()]
+    return float(np.mean(took)) / 60 if own in (*TOLD, "history") and took else 0.0
+
+
+def told(frame: pd.DataFrame, task: str, root: Path) -> str:
+    """Return the table of one task as markdown, and below it what each adapter costs."""
     success = ("within_5mm", "within 5 mm, % of time") if task == "track" else ("reached", "within 1 cm, %")
     wanted = [("rmse", "RMSE, mm", True)] * (task == "track") + [(*success, False), ("gap", "path gap, mm", True)]
     parts = []
@@ -213,7 +222,9 @@ def told(frame: pd.DataFrame, task: str) -> str:
     table = table[[c for a in names for c in table.columns if c.endswith(f": {a}")]]
     cost = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'us'].mean():.0f}" for a in names)
     stops = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'stopped'].sum():.0f}" for a in names)
-    return f"{markdown(table.T.rename_axis(task))}\n\nµs a cycle: {cost}. Stops: {stops}."
+    trained = ", ".join(f"{a} {minutes(a, root, task, list(frame['twin'].unique())):.0f}" for a in names)
+    below = f"µs a cycle: {cost}. Trained, minutes: {trained}. Stops: {stops}."
+    return f"{markdown(table.T.rename_axis(task))}\n\n{below}"
 
 
 def main() -> None:
@@ -273,7 +284,7 @@ def main() -> None:
                 seconds = time.process_time() - began
                 print(f"{name} {condition}, {adapter}: {rmse:.2f} mm ({seconds:.0f} s of a core)", flush=True)
     frame = pd.read_csv(path)
-    print(told(frame[(frame["under"] == under) & frame["twin"].isin(names)], kind))
+    print(told(frame[(frame["under"] == under) & frame["twin"].isin(names)], kind, root))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,38 @@ from common import MACHINE, ROOT, STEADY, markdown, side_by_side
 
 PARTS = {  # minutes, seeds, settings
     "four": (4, range(95, 100), ()),
-    "twelve": (12, range(90, 95), (*STEADY, "reward=long")),
+    "twelve": (12, range(90, 95), (*STEADY, "algo.gamma=0.97", "reward=long")),
+}
+NOTES = {  # what the table does not say
+    "four": """\
+The machine computed other things beside these five: they got through 0.42 to 0.64 million env steps in their 4
+minutes; on a quiet machine it is 0.8. With that many, the development seeds 1 to 4 had 99.5 to 100 % < 1 cm, 99 to
+100 % at rest and a return of -94.7 to -99.4.
+
+The weights of `conf/reward/curriculum.yaml` were chosen on these seeds. With 2.0 to 1.5 instead of 3.0 to 2.5 for
+the bonus, four seeds after 0.36 million env steps had 62 to 86 % < 1 cm; with the present bonus, and a stillness of
+0 to 1.05, 99.5 to 100 %, but 19 to 96 % at rest. With `algo.gamma=0.97` seed 1 had 100 % < 1 cm and a return of
+-96, and was limited in 5.4 % of the cycles instead of 2 to 3. Before, five unseen seeds (85 to 89) had 76 to 100 %
+< 1 cm after 4 quiet minutes.""",
+    "twelve": """\
+What a return of -80 would take, by the development seed 1 and the goals that a training is watched on (those of the
+table are worth 3 to 4 more): the distance costs 37, eq. (2)'s smoothness 48, of which 19 fall into the first 0.2 s,
+in which every policy has to begin. The rest is the speed, and that is what the law holds: a policy that pays little
+for the law rides on 0.66 of the speed limits, which is its cap. Tried for 12 minutes each, gamma 0.97
+where the table says no other:
+
+| settings | return | limited, % of cycles | < 1 cm, % |
+| --- | --- | --- | --- |
+| gamma 0.95, bonus 3 to 1 | -102 | 0.7 | 98 |
+| bonus 3 to 1 | -89 | 3.2 | 100 |
+| gamma 0.98, bonus 3 to 1 | -89 | 5.8 | 100 |
+| bonus 3 to 2.5, limited 0.7 | -85 | 8.8 | 100 |
+| bonus 3 to 2.5, limited 2 | -101 | 0.0 | 100 |
+| bonus 3 to 3, limited 4 | -98 | 0.0 | 99.5 |
+| torque of an action half as large again, limited 0.7 | -87 | 7.6 | 100 |
+| the same, limited 0.7 to 1.2 | -90 | 2.8 | 100 |
+
+The present 0.7 to 1 lies between two of these rows and was judged without another look.""",
 }
 SHOWN = (  # measure, how it is written, what is asked in 4 and in 12 minutes
     ("success_1cm", "< 1 cm, %", 100, {"four": 98.0}),
@@ -44,7 +75,12 @@ def part(name: str) -> list[str]:
         rows[label] = {"median": float(np.median(list(values.values()))), **values}
     typed = " ".join(("algo=tqc dr=paper", f"budget.minutes={minutes}", *settings))
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("")
-    return [f"## {minutes} minutes", f"`python run.py {typed}`", markdown(table.map(lambda x: f"{x:.1f}"))]
+    return [
+        f"## {minutes} minutes",
+        f"`python run.py {typed}`",
+        markdown(table.map(lambda x: f"{x:.1f}")),
+        NOTES[name],
+    ]
 
 
 def main(wanted: str | None) -> None:
