@@ -1,5 +1,6 @@
 """`r2s export`: a folder that holds all that another program needs to run a policy, and that says so of itself."""
 
+import ast
 import json
 import os
 import shutil
@@ -26,7 +27,8 @@ from r2s.runs import read_meta
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
-LAW = "from r2s.export.law import"
+PARTS = "r2s.export."  # modules that the one file is made of, beside runtime.py
+EXAMPLES = 4  # plans that a bundle has
 SAME = 1e-4  # of the torque that an action of 1 asks for: policy.onnx against policy.pt
 
 
@@ -63,7 +65,11 @@ def write_bundle(
                 shutil.copyfile(source / name, part / name)
         write_description(part / "model", robot, dynamics)
         (part / "r2s_runtime.py").write_text(one_file())
-        (part / "contract.hpp").write_text(header(contract, sha256(part / "policy.onnx")))
+        if contract["goal"]["kind"] == "plan":
+            plans = task.goals(robot, np.random.default_rng(0), EXAMPLES)
+            np.savez_compressed(part / contract["goal"]["examples"], plans=plans)
+        else:
+            (part / "contract.hpp").write_text(header(contract, sha256(part / "policy.onnx")))
         report_markdown(part / "MODEL_CARD.md", card(source, config, meta, contract, part, places))
         contract["files"] = {
             p.relative_to(part).as_posix(): sha256(p) for p in sorted(part.rglob("*")) if p.is_file()
@@ -96,7 +102,7 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
         (said,) = ReferenceEvaluator(model).run(None, {"observation": seen})
         with torch.no_grad():
             wanted = policy(torch.from_numpy(seen)).numpy()
-        off = np.abs(said - wanted).max(0) / np.array(contract["torque"]["asked_for_Nm"])
+        off = np.abs(said - wanted).max(0) / np.array(contract["torque"]["action_Nm"])
     except BundleError:
         raise
     except Exception as error:  # reading what is damaged may fail in any way
@@ -107,9 +113,13 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
 
 
 def one_file() -> str:
-    """Return r2s_runtime.py: r2s/export/runtime.py with what r2s/export/law.py defines in the place of its import."""
+    """Return r2s_runtime.py: r2s/export/runtime.py, with what its parts define where it imports them."""
     here = Path(export.__file__).parent
     lines = (here / "runtime.py").read_text().splitlines(keepends=True)
-    law = (here / "law.py").read_text().split("import numpy as np\n", 1)[1].strip()
-    (at,) = (k for k, line in enumerate(lines) if line.startswith(LAW))
-    return "".join([*lines[:at], f"{law}\n\n", *lines[at + 1 :]])
+    for node in reversed(ast.parse("".join(lines)).body):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PARTS):
+            text = (here / f"{(node.module or '').removeprefix(PARTS)}.py").read_text()
+            imports = [k for k in ast.parse(text).body if isinstance(k, ast.Import | ast.ImportFrom)]
+            own = "".join(text.splitlines(keepends=True)[imports[-1].end_lineno :]).strip()
+            lines[node.lineno - 1 : node.end_lineno] = [f"{own}\n\n"]
+    return "".join(lines)

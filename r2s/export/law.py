@@ -19,6 +19,15 @@ LAW_NUMBER = (
 )
 
 
+class BundleError(ValueError):
+    """Why a bundle does not run here, in one line."""
+
+
+def is_number(value: Any) -> bool:
+    """Return whether what a contract says is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < np.inf
+
+
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
     """Return (n,) of what a contract lists, where null stands for `none`: JSON knows no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
@@ -96,13 +105,21 @@ class Model:
         mass = flat(heavy) @ flat(moves).T + flat(turns @ tensor) @ flat(turns).T
         return mass + self._rotors, bias
 
+    def weight(self, gravity: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm that holds the arm still against gravity (3,) m/s^2 in the base frame."""
+        centre = self.origin + (self.frame @ self._com[:, :, None])[..., 0]
+        force = -self._mass[:, None] * gravity
+        moment = cross(centre, force)
+        force, moment = np.cumsum(force[::-1], 0)[::-1], np.cumsum(moment[::-1], 0)[::-1]
+        return (self.axis * (moment - cross(self.origin, force))).sum(1)
+
 
 class Driver:
     """The driver's law, once per cycle: what is sent is within the arm's rules, whatever a policy says.
 
     Attributes:
         effort: (n,) Nm, the target as it has come through the low-pass. stopping: why the arm is being brought to
-            rest, or None.
+            rest, or None. limited: in how many cycles of the motion the law changed what was asked for.
 
     Args:
         law: of a contract. model: of the same. soft_start_s: s, over which the torque of a motion fades in.
@@ -121,6 +138,7 @@ class Driver:
         self.effort, self._target, self._filtered, self._sent = np.zeros((4, n))
         self.stopping: str | None = None
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
+        self.limited = 0
 
     @property
     def done(self) -> bool:
@@ -163,7 +181,8 @@ class Driver:
         if seen:
             if not placed:
                 self._model.place(q)
-            out = self._guard(q, dq)
+            out, changed = self._guard(q, dq)
+            self.limited += changed
         self._sent = last + np.clip(self._clipped(out) - last, -j["step"], j["step"])
         return self._sent.copy()
 
@@ -182,29 +201,33 @@ class Driver:
             return f"joint {fast.argmax() + 1} is at {dq[fast.argmax()]:.3f} rad/s, too close to its limit"
         return None
 
-    def _guard(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm nearest to the effort under which no joint accelerates beyond its bounds."""
+    def _guard(self, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the torque (n,) Nm nearest to the effort under which no joint accelerates beyond its bounds.
+
+        And whether it is another one than the effort.
+        """
         j, c = self._j, self._number
         near = max(
             float(((np.abs(dq) / j["dq_max"] - c["allowed"]) / (c["nothing"] - c["allowed"])).max()),
             float((np.maximum(q - j["q_high"], j["q_low"] - q) / j["q_fade"]).max()),
         )
-        out = (1.0 - min(max(near, 0.0), 1.0)) * self.effort
+        left = 1.0 - min(max(near, 0.0), 1.0)
+        out = left * self.effort
         mass, bias = self._model.equations(dq)
         mobility = np.linalg.inv(mass + np.diag(j["added"]))
         ddq = mobility @ (out - bias)
         high = c["rate"] * (self._allowed(j["q_high"] - q) - dq)
         low = -c["rate"] * (self._allowed(q - j["q_low"]) + dq)
         if ((low <= ddq) & (ddq <= high)).all():
-            return out
+            return out, left < 1.0
         light = (j["friction"] > 0.0) & (j["added"] > 0.0)
         held = np.where(light, j["friction"], 1.0)
         eaten = np.where(light, c["sure"] * held * np.abs(np.tanh(dq / c["dry"] + out / held)), 0.0)
         wider = np.abs(mobility) @ eaten
         low, high = low - wider, high + wider
         if ((low <= ddq) & (ddq <= high)).all():
-            return out
-        return out + self._push(mobility, ddq, low, high)
+            return out, left < 1.0
+        return out + self._push(mobility, ddq, low, high), True
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:
         """Return (n,) rad/s, how fast joints may go that have `way` (n,) rad left."""

@@ -7,6 +7,7 @@
     while not runtime.done:              # every millisecond
         tau = runtime(q, dq, tau_J_d, goal)
 
+A goal is a point, or a plan: the same one in every cycle of a motion. `runtime.plan` makes one of joint angles.
 What the bundle wants stands in its contract.json. What does not fit it is a BundleError of one line.
 """
 
@@ -20,16 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from r2s.export.law import LAW_JOINT, LAW_NUMBER, Driver, Model, per_joint
+from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number, per_joint
+from r2s.export.plan import OF_PLAN, Follower, check_goal, plan_of, width
 
-FORMAT = 1
+FORMAT = 2
 CONVENTION = "without gravity"
 # what an entry of an observation may be made of; `pull` is J^T error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
-
-
-class BundleError(ValueError):
-    """Why a bundle does not run here, in one line."""
 
 
 @dataclass(frozen=True)
@@ -92,12 +90,12 @@ def _check(contract: dict[str, Any]) -> None:
     n, rates, torque, seen = len(contract["joints"]), contract["rates"], contract["torque"], contract["observation"]
     law, model = contract["law"], contract["model"]
     lists = {f"limits.{k}": v for k, v in contract["limits"].items()} | {"model.links": model["links"]}
-    lists |= {f"torque.{k}": torque[k] for k in ("max_Nm", "max_rate_Nm_per_s", "asked_for_Nm")}
+    lists |= {f"torque.{k}": torque[k] for k in ("max_Nm", "max_rate_Nm_per_s", "asked_for_Nm", "action_Nm")}
     lists |= {f"law.joint.{k}": law["joint"][k] for k in LAW_JOINT} | {"model.rotors": model["rotors"]}
     for name, values in lists.items():
         if len(values) != n:
             raise BundleError(f"contract.json: {name} is of {len(values)} joints, the arm has {n}")
-    if missing := [k for k in LAW_NUMBER if not isinstance(law["number"].get(k), int | float)]:
+    if missing := [k for k in LAW_NUMBER if not is_number(law["number"].get(k))]:
         raise BundleError(f"contract.json: law.number.{missing[0]} is missing")
     step = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
     same = {"tau_max": torque["max_Nm"], "asked": torque["asked_for_Nm"], "step": step}
@@ -110,13 +108,13 @@ def _check(contract: dict[str, Any]) -> None:
     cycle, policy = rates["cycle_hz"], rates["policy_hz"]
     if cycle != round(1 / law["number"]["cycle_s"]) or policy <= 0 or cycle % policy:
         raise BundleError(f"contract.json: a policy of {policy} Hz in a cycle of {cycle} Hz; the law's is of 1000 Hz")
-    for what in ("history", "preview"):
-        if seen[what]:
-            raise BundleError(f"contract.json: observations of {what} {seen[what]}; this runtime has none to give")
-    at, size = 0, {"ee": 3, "goal": 3, "error": 3}
+    if seen["history"]:
+        raise BundleError(f"contract.json: observations of history {seen['history']}; this runtime has none to give")
+    check_goal(contract)
+    at, known = 0, (*MADE_OF, *OF_PLAN) if contract["goal"]["kind"] == "plan" else MADE_OF
     for entry in seen["entries"]:
-        wide = size.get(entry["of"], n)
-        if entry["of"] not in MADE_OF or entry["slice"] != [at, at + wide]:
+        wide = width(entry["of"], n, seen["preview"])
+        if entry["of"] not in known or entry["slice"] != [at, at + wide]:
             raise BundleError(
                 f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; {at} is next"
             )
@@ -183,16 +181,22 @@ class Runtime:
         except Exception as error:  # of many kinds
             raise BundleError(f"policy.onnx cannot be loaded: {' '.join(str(error).split())}") from None
         agree(contract, policy.get_modelmeta().custom_metadata_map)
+        (taken,) = policy.get_inputs()
+        if taken.shape[-1] != contract["observation"]["size"]:
+            size = contract["observation"]["size"]
+            raise BundleError(f"contract.json: observations of {size} numbers, policy.onnx takes {taken.shape[-1]}")
         self._policy, self._model = policy, Model(contract["model"])
         self.driver = Driver(contract["law"], self._model, soft_start_s)
         self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
         self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
+        self._shape = tuple(contract["goal"]["shape"])
+        self._follower = Follower(contract) if contract["goal"]["kind"] == "plan" else None
         self.reset()
 
     def reset(self) -> None:
-        """Begin a motion, from rest and zero torque."""
+        """Begin a motion, from rest and zero torque; of a plan at the angles of its first row."""
         self.driver.reset()
-        self._cycle = 0
+        self._cycle = self._limited = 0
 
     @property
     def done(self) -> bool:
@@ -204,36 +208,69 @@ class Runtime:
 
         Args:
             q, dq: (n,) rad, rad/s, as the arm measures them. tau_J_d: (n,) Nm, what it applied last.
-            goal: (3,) m in the base frame, finite.
+            goal: (3,) m in the base frame, or a plan (rows, columns) as of `goal` of the contract; finite. A plan's
+                time is the number of cycles since `reset`.
+
+        Raises:
+            BundleError: one of them is of another size, or the plan is not finite.
         """
+        asked = goal
         q, dq, tau_J_d, goal = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d, goal))
-        if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or goal.shape != (3,):
+        if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or goal.shape != self._shape:
             shapes = ", ".join(str(x.shape) for x in (q, dq, tau_J_d, goal))
+            size = " x ".join(map(str, self._shape))
             raise BundleError(
-                f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and 3 are allowed"
+                f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and {size} are allowed"
             )
+        if self._follower is not None:
+            self._follower.finite(asked, goal)
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the driver's to stop
             self._model.place(q)
             target = None
             if self._cycle % self._every == 0:
-                seen = self.observe(q, dq, goal)
-                target = self.act(seen) if np.isfinite(seen).all() else None
+                made = self._look(q, dq, goal)
+                seen = self.observe(made)
+                target = self.act(seen) + made.get("base", 0.0) if np.isfinite(seen).all() else None
             self._cycle += 1
             return self.driver(q, dq, tau_J_d, target, placed=True)
 
-    def observe(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Return the observation (d,) float32 of the arm that the model has been placed at."""
+    def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what observations of this control step are made of; the model has been placed at q."""
         ee, jacobian = self._model.hand()
-        error = goal - ee
-        made = {"q": q, "dq": dq, "ee": ee, "goal": goal, "error": error, "effort": self.driver.effort}
-        made["pull"] = jacobian.T @ error
+        made = {"q": q, "dq": dq, "ee": ee, "goal": goal, "effort": self.driver.effort}
+        if self._follower is not None:
+            changed = (self.driver.limited - self._limited) / self._every
+            self._limited = self.driver.limited
+            made |= self._follower(goal, self._cycle // self._every, q, dq, ee, changed)
+        made["error"] = made["goal"] - ee
+        return made | {"pull": jacobian.T @ made["error"]}
+
+    def observe(self, made: dict[str, np.ndarray]) -> np.ndarray:
+        """Return the observation (d,) float32 of what `_look` saw."""
         scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
         parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
         return np.concatenate(parts).astype(np.float32)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that the policy wants at an observation (d,)."""
+        """Return the torque (n,) Nm that the policy wants at an observation (d,); a base is not in it."""
         return self._policy.run(["torque"], {"observation": observation[None]})[0][0].astype(float)
+
+    def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return the plan that goes through joint angles q, dq, ddq (rows, n) rad, rad/s, rad/s^2; between motions.
+
+        Rows are a control step apart. It begins and ends at rest: the first row and `steps` others are the path, and
+        as many as the preview come after.
+
+        Raises:
+            BundleError: goals are points, or the motion is of another size.
+        """
+        if self._follower is None:
+            raise BundleError("the policy of this bundle takes points, not plans")
+        q, dq, ddq = (np.asarray(x, dtype=float) for x in (q, dq, ddq))
+        allowed = self._shape[0], self._model.n
+        if not q.shape == dq.shape == ddq.shape == allowed:
+            raise BundleError(f"q, dq and ddq are of shapes {q.shape}, {dq.shape}, {ddq.shape}; {allowed} is allowed")
+        return plan_of(self._model, q, dq, ddq)
 
 
 def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
@@ -248,7 +285,7 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
     said |= {"q_min_rad": words(limits["q_min_rad"], "-inf"), "q_max_rad": words(limits["q_max_rad"])}
     said |= {"dq_max_rad_per_s": words(limits["dq_max_rad_per_s"]), "torque_max_Nm": words(torque["max_Nm"])}
     said["torque_rate_max_Nm_per_s"] = words(torque["max_rate_Nm_per_s"])
-    said |= {"torque_scale_Nm": words(torque["asked_for_Nm"])}
+    said |= {"torque_scale_Nm": words(torque["action_Nm"])}
     for name, value in said.items():
         if metadata.get(name) != value:
             raise BundleError(f"contract.json says {name} '{value}', policy.onnx '{metadata.get(name)}'")
@@ -256,6 +293,8 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
         raise BundleError(
             f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'"
         )
+    if "base" in metadata["torque"] and contract["base"] is None:
+        raise BundleError("contract.json has no base, to which the torque of policy.onnx is to be added")
 
 
 def main() -> int:
@@ -268,6 +307,8 @@ def main() -> int:
     rates, torque, limits = contract["rates"], contract["torque"], contract["limits"]
     print(f"whole: {contract['robot']}, joints {' '.join(contract['joints'])}")
     print(f"policy {rates['policy_hz']} Hz, torque {torque['convention']} at {rates['cycle_hz']} Hz")
+    goal = contract["goal"]
+    print(f"goal: a {goal['kind']} of {' x '.join(map(str, goal['shape']))} numbers, {goal['unit']}")
     for name, values in {"max_Nm": torque["max_Nm"], **limits}.items():
         print(f"{name}: {values}")
     return 0

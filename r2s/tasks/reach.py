@@ -125,18 +125,7 @@ class ReachTask(Usual):
 
     def layout(self, robot: Robot) -> list[Entry]:
         """Return what `observe` puts where, in its order."""
-        return [
-            Entry("q", "rad", "q"),
-            Entry("dq", "rad/s", "dq"),
-            Entry("ee", "m", "ee"),
-            Entry("goal", "m", "goal"),
-            Entry("error", "m", "error"),
-            Entry("effort / torque", "1", "effort", divided_by=tuple(self.torque(robot).tolist())),
-            Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
-            Entry("J'error", "m^2/rad", "pull"),
-            Entry(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
-            Entry(f"tanh(dq / {FINE_DQ:g} rad/s)", "1", "dq", divided_by=FINE_DQ, tanh=True),
-        ]
+        return layout(self.torque(robot))
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, the distances at the start, at least CLOSE_M."""
@@ -151,6 +140,22 @@ class ReachTask(Usual):
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
         return measures(episodes)
+
+
+def layout(torque: np.ndarray) -> list[Entry]:
+    """Return what `observe` puts where, in its order; torque (n,) Nm: what an effort is divided by."""
+    return [
+        Entry("q", "rad", "q"),
+        Entry("dq", "rad/s", "dq"),
+        Entry("ee", "m", "ee"),
+        Entry("goal", "m", "goal"),
+        Entry("error", "m", "error"),
+        Entry("effort / torque", "1", "effort", divided_by=tuple(torque.tolist())),
+        Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
+        Entry("J'error", "m^2/rad", "pull"),
+        Entry(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
+        Entry(f"tanh(dq / {FINE_DQ:g} rad/s)", "1", "dq", divided_by=FINE_DQ, tanh=True),
+    ]
 
 
 def _postures(robot: Robot, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, float]]:

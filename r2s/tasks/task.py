@@ -80,7 +80,9 @@ class Entry:
 
     Attributes:
         name: of it. unit: SI, "1" where it has none.
-        of: what it is made of: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error).
+        of: what it is made of: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). Of a plan `goal` is
+            where the hand is to be now, and there are ahead (the next places - ee), velocity (the path's), limited,
+            q_off and dq_off (the plan's less the arm's), and base (the torque that an action is added to).
         divided_by: one number, or one for each element; None: nothing. tanh: whether tanh is taken then.
     """
 

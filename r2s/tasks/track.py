@@ -13,9 +13,9 @@ from r2s.excitation.safety import Space
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.model_torque import ModelTorque
-from r2s.tasks.reach import OBSERVED, ReachTask, observe
+from r2s.tasks.reach import OBSERVED, ReachTask, layout, observe
 from r2s.tasks.rewards import PAPER
-from r2s.tasks.task import Episodes, State, Usual
+from r2s.tasks.task import Entry, Episodes, State, Usual
 from r2s.tasks.timed_path import KINDS, Paths, V, X, curve
 
 BASES = ("model", "none")
@@ -121,6 +121,10 @@ class TrackTask(Usual):
         """(5,), of what is reported: error and smoothness."""
         return PAPER
 
+    def region(self, robot: Robot) -> tuple[float, float]:
+        """Return (low, high) m, how far from the shoulder paths lie."""
+        return self._region.region(robot)
+
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm, the most that a target asks for."""
         fraction = ReachTask(torque_fraction=self.torque_fraction).torque(robot)
@@ -203,6 +207,20 @@ class TrackTask(Usual):
         if self.base == "model":
             own.append(self.computed(state, goals) / torque)
         return np.concatenate([first, *own], axis=1, dtype=np.float32)
+
+    def layout(self, robot: Robot) -> list[Entry]:
+        """Return what `observe` puts where, in its order."""
+        torque = self.torque(robot)
+        own = [
+            Entry(f"the next {self.preview} places - ee", "m", "ahead"),
+            Entry("velocity of the path", "m/s", "velocity"),
+            Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
+            Entry("limited", "1", "limited"),
+            Entry("plan q - q", "rad", "q_off"),
+            Entry("plan dq - dq", "rad/s", "dq_off"),
+        ]
+        based = [Entry("base / torque", "1", "base", divided_by=tuple(torque.tolist()))]
+        return [*layout(torque), *own, *(based if self.base == "model" else [])]
 
     def target(self, action: np.ndarray, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return (m, n) Nm: action x share x torque, beside the base."""
