@@ -30,11 +30,9 @@ from r2s.export.contract import make_contract
 from r2s.export.law import Driver, Model
 from r2s.learning.networks import Policy
 from r2s.learning.policy import export_onnx, make_policy, save_policy
-from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot, load_robot
 from r2s.tasks.reach import ReachTask
-from r2s.tasks.track import TrackTask
 
 EPISODE = 50  # cycles, of hostile motion
 LIBFRANKA = ROOT / "examples" / "libfranka"
@@ -51,23 +49,21 @@ class Exported:
     run: Path
     folder: Path
     robot: Robot
-    task: ReachTask
+    task: Any
     policy: Policy
     friction: np.ndarray
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory) -> Exported:
-    """The bundle of a policy that is as it was drawn: nothing of what is tested here is a matter of training."""
+def drawn(run: Path, *overrides: str) -> Exported:
+    """Return what becomes the bundle of a policy as it was drawn: nothing tested here is a matter of training."""
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
     from r2s.stages.build import CONF, make_dynamics, make_robot, make_task
 
-    run = tmp_path_factory.mktemp("runs") / "train" / "drawn"
     run.mkdir(parents=True)
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        config = compose("config", ["algo.hidden=[16,16]"])
+        config = compose("config", ["algo.hidden=[16,16]", *overrides])
     OmegaConf.save(config, run / "config.yaml")
     robot = make_robot(config)
     center = make_dynamics(config, robot)
@@ -79,19 +75,30 @@ def exported(tmp_path_factory) -> Exported:
     best = {"env_steps": 960, "updates": 30, "success_1cm": 0.5, "return_paper": -100.0}
     (run / "summary.json").write_text(json.dumps({"best": best, "last": best}))
     (run / "meta.json").write_text(json.dumps({"status": "done", "inputs": {}, "seed": 3}))
+    return Exported(run, run / "bundle", robot, task, policy, center.level)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> Exported:
+    """The bundle of a policy that reaches."""
+    made = drawn(run := tmp_path_factory.mktemp("runs") / "train" / "drawn")
     transfer = run.parent.parent / "transfer" / "there"
     transfer.mkdir(parents=True)
     row = {"success_1cm": 0.9, "success_5cm": 1.0, "stops": 2, "episodes": 20, "asked": 20}
     (transfer / "summary.json").write_text(json.dumps({"twin": row, "predicted": row}))
     (transfer / "meta.json").write_text(json.dumps({"status": "done", "parents": [str(run)]}))
     commands.run_command(["export", str(run)])
-    return Exported(run, run / "bundle", robot, task, policy, center.level)
+    return made
 
 
 @pytest.fixture(scope="module")
 def runtime(exported) -> ModuleType:
-    """The one file of the bundle, as a program without r2s has it."""
-    spec = importlib.util.spec_from_file_location("r2s_runtime", exported.folder / "r2s_runtime.py")
+    return loaded(exported.folder)
+
+
+def loaded(folder: Path) -> ModuleType:
+    """Return the one file of a bundle, as a program without r2s has it."""
+    spec = importlib.util.spec_from_file_location("r2s_runtime", folder / "r2s_runtime.py")
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules["r2s_runtime"] = importlib.util.module_from_spec(spec)
@@ -107,8 +114,10 @@ def arm_of(exported: Exported, **other: Any) -> dict[str, Any]:
     return own | other
 
 
-def hostile(robot: Robot, task: ReachTask, cycles: int) -> dict[str, np.ndarray]:
+def hostile(robot: Robot, task: Any, cycles: int) -> dict[str, np.ndarray]:
     """Return states and targets (cycles, n) that no driver should meet, which are said, and where motions begin.
+
+    And goals, and which of them is asked for in a cycle.
 
     Joints jump beyond their limits and their speeds, a few values are not finite, targets come, go and are anything,
     and what the arm applied last is not always what was sent (that is NaN here).
@@ -128,8 +137,9 @@ def hostile(robot: Robot, task: ReachTask, cycles: int) -> dict[str, np.ndarray]
     applied = np.where(rng.random((cycles, 1)) < 0.05, 50 * rng.normal(size=(cycles, n)), np.nan)
     told = (np.arange(cycles) % 20 == 0) | (rng.random(cycles) < 0.1)
     begin = np.arange(cycles) % EPISODE == 0
-    goal = rng.uniform(-0.7, 0.7, (cycles // EPISODE + 1, 3))[np.arange(cycles) // EPISODE]
-    return {"q": q, "dq": dq, "applied": applied, "target": target, "told": told, "begin": begin, "goal": goal}
+    goal, which = rng.uniform(-0.7, 0.7, (cycles // EPISODE + 1, 3)), np.arange(cycles) // EPISODE
+    motion = {"q": q, "dq": dq, "applied": applied, "target": target, "told": told, "begin": begin}
+    return motion | {"goal": goal, "which": which}
 
 
 def driven(
@@ -188,43 +198,59 @@ def test_so_it_is_for_other_arms(arm, panda):
     assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
 
 
-def compare(exported: Exported, runtime: ModuleType, cycles: int) -> float:
-    """Return the largest difference of Runtime and r2s, of what an action of 1 asks for, over so many hostile cycles.
+def by_r2s(exported: Exported, motion: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a motion with what r2s makes of its states and goals, with its own policy and memory of what was sent.
 
-    Both see the same states and goals; each asks its own policy, with its own memory of what it has sent.
+    tau: (cycles, n) Nm. last: (cycles, n) Nm, what the arm applied. stops: (cycles, 2), whether the driver stops the
+    arm, and is done.
     """
     robot, task = exported.robot, exported.task
     torque, kinematics = task.torque(robot), Kinematics(robot)
-    motion = hostile(robot, task, cycles)
-    driver = episode_driver(robot, task, 0.0, exported.friction)
-    other = runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported)))
-    tau, worst, every = np.zeros(robot.n), 0.0, task.substeps
+    driver, cycles = episode_driver(robot, task, 0.0, exported.friction), len(motion["q"])
+    tau, last = np.zeros((2, cycles, robot.n))
+    stops = np.zeros((cycles, 2), dtype=bool)
     for k in range(cycles):
-        if motion["begin"][k]:
+        if begin := motion["begin"][k]:
             driver.reset()
-            other.reset()
-            tau, since = np.zeros(robot.n), k
-        q, dq, goal = (motion[name][k] for name in ("q", "dq", "goal"))
-        last = np.where(np.isnan(motion["applied"][k]), tau, motion["applied"][k])
-        state, target = ArmState(1e-3 * k, q, dq, tau, last), None
-        if (k - since) % every == 0:
-            seen = task.observe(as_state(kinematics, state, driver.effort, False, 0.0), goal[None], torque)
+            since, changed = k, 0
+        last[k] = np.where(np.isnan(motion["applied"][k]), 0.0 if begin else tau[k - 1], motion["applied"][k])
+        state = ArmState(1e-3 * (k - since), motion["q"][k], motion["dq"][k], np.zeros(robot.n), last[k])
+        target = None
+        if (k - since) % task.substeps == 0:
+            share, changed = (driver.limited - changed) / task.substeps, driver.limited
+            told = as_state(kinematics, state, driver.effort, False, share)
+            goal = motion["goal"][motion["which"][k], None]
             with torch.no_grad():
-                target = exported.policy(torch.from_numpy(seen)).numpy()[0].astype(float)
-        tau = driver(state, target)
-        worst = max(worst, float((np.abs(other(q, dq, last, goal) - tau) / torque).max()))
-        assert (driver.stopping is None, driver.done) == (other.driver.stopping is None, other.done)
+                action = exported.policy.action(torch.from_numpy(task.observe(told, goal, torque))).numpy()
+            target = task.target(action.astype(float), told, goal, torque)[0]
+        tau[k], stops[k] = driver(state, target), (driver.stopping is not None, driver.done)
+    return motion | {"tau": tau, "last": last, "stops": stops}
+
+
+def compare(exported: Exported, runtime: ModuleType, motion: dict[str, np.ndarray]) -> float:
+    """Return the largest difference of Runtime and `by_r2s`, of the most that is asked for, over a hostile motion."""
+    other, torque = (
+        runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported))),
+        exported.task.torque(exported.robot),
+    )
+    motion, worst, goals = by_r2s(exported, motion), 0.0, list(motion["goal"])
+    for k, (begin, which) in enumerate(zip(motion["begin"], motion["which"], strict=True)):
+        if begin:
+            other.reset()
+        tau = other(*(motion[name][k] for name in ("q", "dq", "last")), goals[which])
+        worst = max(worst, float((np.abs(tau - motion["tau"][k]) / torque).max()))
+        assert [other.driver.stopping is not None, other.done] == motion["stops"][k].tolist()
     return worst
 
 
 def test_the_runtime_does_what_r2s_does(exported, runtime):
     """From joint states and goals to torques, hostile ones included."""
-    assert compare(exported, runtime, 500) < POLICY
+    assert compare(exported, runtime, hostile(exported.robot, exported.task, 500)) < POLICY
 
 
 @pytest.mark.slow
 def test_the_runtime_does_what_r2s_does_for_ten_thousand_cycles(exported, runtime):
-    assert compare(exported, runtime, 10_000) < POLICY
+    assert compare(exported, runtime, hostile(exported.robot, exported.task, 10_000)) < POLICY
     motion = driven(exported.robot, exported.task, exported.friction, 10_000)
     contract = json.loads((exported.folder / "contract.json").read_text())
     assert np.abs(by_law(contract, motion) - motion["tau"]).max() < LAW_NM
@@ -259,7 +285,7 @@ def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
     command += ["-I", str(LIBFRANKA), "-I", str(exported.folder), "check.cpp", "-o", "check"]
     subprocess.run(command, cwd=tmp_path, check=True)
     flags = np.column_stack([motion["told"], motion["begin"]])
-    rows = [motion["q"], motion["dq"], motion["last"], motion["target"], motion["goal"], flags]
+    rows = [motion["q"], motion["dq"], motion["last"], motion["target"], motion["goal"][motion["which"]], flags]
     sent = np.ascontiguousarray(np.concatenate(rows, 1), dtype=float)
     done = subprocess.run([tmp_path / "check"], input=sent.tobytes(), capture_output=True, check=True)
     n = exported.robot.n
@@ -269,7 +295,9 @@ def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
     k = next(k for k in range(len(sent)) if motion["begin"][k] and np.isfinite(sent[k]).all())  # the effort is zero
     state = ArmState(0.0, motion["q"][k], motion["dq"][k], np.zeros(n), np.zeros(n))
     told = as_state(kinematics, state, np.zeros(n), False, 0.0)
-    assert np.allclose(got[k, n:], exported.task.observe(told, motion["goal"][k][None], torque)[0], atol=1e-6)
+    assert np.allclose(
+        got[k, n:], exported.task.observe(told, motion["goal"][motion["which"][k], None], torque)[0], atol=1e-6
+    )
 
 
 def has_header(name: str) -> bool:
@@ -349,15 +377,19 @@ def test_the_card_of_a_policy_that_follows_paths_says_errors_in_mm(exported, tmp
     assert said["Not tried"][0] == "Not tried: dart."
 
 
-@pytest.mark.parametrize(("base", "said"), [("model", "and its actions are added to what it "), ("none", "numbers;")])
-def test_a_policy_that_needs_a_plan_does_not_travel(panda, base, said):
-    """task=track: in one line, before anything is written."""
-    settings = conf("task/track") | {"reach": (0.3, 0.75), "torque_fraction": 0.12, "base": base}
-    settings |= {k: tuple(settings[k]) for k in ("speed", "size", "kinds")}
-    task = TrackTask(**settings).believing(panda, Dynamics.of(panda, np.zeros((panda.n, 3))))
-    with pytest.raises(UserError, match="does not travel: its goals are plans of 404 x 27 numbers") as refused:
-        make_contract(panda, task, np.zeros(panda.n))
-    assert said in str(refused.value)
+def test_what_a_runtime_does_not_know_does_not_travel(panda):
+    """Goals that are neither points nor plans, torques that are not the policy's: in one line."""
+
+    @dataclass(frozen=True)
+    class Odd(ReachTask):
+        def goals(self, robot, rng, count):
+            return np.zeros((count, 4, 2))
+
+        def target(self, action, state, goals, torque):
+            return 2 * action * torque
+
+    with pytest.raises(UserError, match="Odd does not travel: its goals are of 4 x 2 numbers and its act") as refused:
+        make_contract(panda, Odd(), np.zeros(panda.n))
     assert "\n" not in str(refused.value)
 
 
@@ -381,6 +413,18 @@ def limit(contract: dict, name: str, joint: int, value: float) -> None:
     own[in_law[name]][joint - 1] = value * (contract["law"]["number"]["cycle_s"] if in_law[name] == "step" else 1)
 
 
+def asks(contract: dict, value: float) -> None:
+    """Let an action of 1 ask the first joint for another torque, and let that be the most."""
+    limit(contract, "asked_for_Nm", 1, value)
+    contract["torque"]["action_Nm"][0] = value
+
+
+def fewer(contract: dict) -> None:
+    """Leave the last entry of the observations out."""
+    contract["observation"]["entries"].pop()
+    contract["observation"]["size"] = contract["observation"]["entries"][-1]["slice"][1]
+
+
 MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a joint too many": (lambda c: c["joints"].append("joint8"), "of 7 joints, the arm has 8"),
     "another order": (lambda c: swap(c["joints"]), "joint 1 of the arm is 'joint1', of the bundle 'joint2'"),
@@ -392,7 +436,8 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a torque rate": (lambda c: limit(c, "max_rate_Nm_per_s", 3, 2e3), "dtau_max of joint 3"),
     "a speed limit": (lambda c: limit(c, "dq_max_rad_per_s", 2, 9.0), "dq_max of joint 2"),
     "a position limit": (lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0), "q_min of joint 4 is -3.07"),
-    "what an action asks for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "torque_scale_Nm"),
+    "what is asked for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "an action of 1 is [26.0"),
+    "what an action asks for": (lambda c: asks(c, 20.0), "torque_scale_Nm"),
     "the convention": (lambda c: c["torque"].update(convention="with gravity"), "torque 'with gravity'"),
     "a missing link": (lambda c: c["model"]["links"].pop(), "model.links is of 6 joints"),
     "a missing row of the law": (lambda c: c["law"]["joint"].pop("most"), "damaged: KeyError 'most'"),
@@ -404,7 +449,11 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "an observation of something else": (lambda c: c["observation"]["entries"][0].update(of="x"), "'q' is x at"),
     "too few observations": (lambda c: c["observation"]["entries"].pop(), "47 observations in all, and 54"),
     "another size": (lambda c: c["observation"].update(size=46), "54 observations in all, and 46"),
-    "a later format": (lambda c: c.update(format=2), "is of format 2"),
+    "another format": (lambda c: c.update(format=1), "is of format 1"),
+    "a policy of fewer observations": (lambda c: fewer(c), "observations of 47 numbers, policy.onnx takes 54"),
+    "a base": (lambda c: c.update(base={}), "a base, which a goal that is a point does not have"),
+    "another kind of goal": (lambda c: c["goal"].update(kind="pose"), "goals are 'pose'"),
+    "another shape of goal": (lambda c: c["goal"].update(shape=[6]), "a point of shape [6]"),
 }
 
 
@@ -518,52 +567,49 @@ from r2s_runtime import Arm, Runtime
 data = np.load(sys.argv[1])
 arm = {k[4:]: data[k] for k in data.files if k.startswith("arm_")}
 arm |= {"joints": arm["joints"].tolist(), "cycle_hz": 1000, "torque": "without gravity"}
-runtime, worst = Runtime(sys.argv[2], Arm(**arm)), 0.0
-for k in range(len(data["tau"])):
-    if data["begin"][k]:
+runtime, worst, goals = Runtime(sys.argv[2], Arm(**arm)), 0.0, list(data["goal"])
+said = {name: data[name] for name in ("q", "dq", "last", "begin", "which", "tau", "torque")}
+for k in range(len(said["tau"])):
+    if said["begin"][k]:
         runtime.reset()
-    tau = runtime(data["q"][k], data["dq"][k], data["last"][k], data["goal"][k])
-    worst = max(worst, float((np.abs(tau - data["tau"][k]) / data["torque"]).max()))
+    tau = runtime(said["q"][k], said["dq"][k], said["last"][k], goals[said["which"][k]])
+    worst = max(worst, float((np.abs(tau - said["tau"][k]) / said["torque"]).max()))
 print(worst, sorted(m for m in sys.modules if m.split(".")[0] in ("r2s", "torch", "mujoco", "scipy", "numba")))
 """
 
 
-@pytest.mark.slow
-def test_it_runs_where_there_is_nothing_but_numpy_and_onnxruntime(exported, tmp_path):
-    """A virtual environment of its own; the torques are those that r2s wrote down, over 10,000 cycles."""
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory) -> Path:
+    """The Python of a virtual environment that has NumPy and ONNX Runtime and nothing else."""
     pins = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     wanted = [line for line in pins if line.split("==")[0] in ("numpy", "onnxruntime")]
-    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
-    python = tmp_path / "venv" / "bin" / "python"
+    folder = tmp_path_factory.mktemp("bare") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    python = folder / "bin" / "python"
     pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wanted]
     installed = subprocess.run(pip, capture_output=True, text=True)
     if installed.returncode:
         pytest.skip(f"pip cannot install {' '.join(wanted)} here: {installed.stderr.strip().splitlines()[-1]}")
-    cycles, robot, task = 10_000, exported.robot, exported.task
-    motion = hostile(robot, task, cycles)
-    driver, kinematics = episode_driver(robot, task, 0.0, exported.friction), Kinematics(robot)
-    tau, last = np.zeros((2, cycles, robot.n))
-    for k in range(cycles):
-        begin, target = motion["begin"][k], None
-        if begin:
-            driver.reset()
-            since = k
-        last[k] = np.where(np.isnan(motion["applied"][k]), 0.0 if begin else tau[k - 1], motion["applied"][k])
-        state = ArmState(1e-3 * k, motion["q"][k], motion["dq"][k], np.zeros(robot.n), last[k])
-        if (k - since) % task.substeps == 0:
-            told = as_state(kinematics, state, driver.effort, False, 0.0)
-            with torch.no_grad():
-                seen = torch.from_numpy(task.observe(told, motion["goal"][k][None], task.torque(robot)))
-                target = exported.policy(seen).numpy()[0].astype(float)
-        tau[k] = driver(state, target)
+    return python
+
+
+def runs_in(python: Path, exported: Exported, motion: dict[str, np.ndarray], to: Path) -> None:
+    """Assert that the bundle gives the torques that r2s wrote down, in an environment without r2s."""
     arm = {f"arm_{k}": np.array(v) for k, v in arm_of(exported).items() if k not in ("cycle_hz", "torque")}
-    kept = {k: motion[k] for k in ("q", "dq", "goal", "begin")}
-    np.savez(tmp_path / "data.npz", **kept, **arm, tau=tau, last=last, torque=task.torque(robot))
-    (tmp_path / "lean.py").write_text(LEAN)
-    words = [str(python), str(tmp_path / "lean.py"), str(tmp_path / "data.npz"), str(exported.folder)]
+    motion = by_r2s(exported, motion)
+    kept = {k: motion[k] for k in ("q", "dq", "goal", "which", "begin", "tau", "last")}
+    np.savez(to / "data.npz", **kept, **arm, torque=exported.task.torque(exported.robot))
+    (to / "lean.py").write_text(LEAN)
+    words = [str(python), str(to / "lean.py"), str(to / "data.npz"), str(exported.folder)]
     here = {"PYTHONPATH": str(exported.folder), "PYTHONSAFEPATH": "1"}
     done = subprocess.run(words, capture_output=True, text=True, env=here)
     assert done.returncode == 0, done.stderr
     worst, modules = done.stdout.split(maxsplit=1)
     assert float(worst) < POLICY
     assert modules.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_it_runs_where_there_is_nothing_but_numpy_and_onnxruntime(exported, bare, tmp_path):
+    """The torques are those that r2s wrote down, over 10,000 cycles."""
+    runs_in(bare, exported, hostile(exported.robot, exported.task, 10_000), tmp_path)

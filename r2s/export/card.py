@@ -77,12 +77,34 @@ def card(
         "Trained on": trained,
         "Measured": done,
         "Not tried": untried,
+        **({"Plans": plans(contract)} if contract["goal"]["kind"] == "plan" else {}),
         "Limits": [
             "Goals outside of what contract.json calls `goal.trained`, payloads, contact and other hands were not "
             "part of the training. The law holds the arm within its limits of torque, speed and position; it does "
             "not make a motion sensible."
         ],
     }
+
+
+def plans(contract: Mapping[str, Any]) -> list[Item]:
+    """Return what a plan is, and how one is made."""
+    goal, n = contract["goal"], len(contract["joints"])
+    rows, columns = goal["shape"]
+    words = [
+        f"A goal is a plan, {rows} rows of {columns} numbers, one every {1e3 / goal['row_hz']:g} ms: where the hand "
+        f"is to be and its velocity, m and m/s in the arm's base, then angles, speeds and accelerations of the {n} "
+        f"joints, rad. {goal['steps'] / goal['row_hz']:g} s are the path; {contract['observation']['preview']} rows "
+        "more are what a policy sees ahead of its end. A path begins and ends at rest, and the arm at its first row.",
+        f"{goal['examples']} has some of the training's family. `runtime.plan(q, dq, ddq)` makes one of a motion of "
+        "the joints that any planner gave; `TrackTask.plan` of r2s/tasks/track.py makes one of a curve of the hand, "
+        "as slow as the arm's limits want it.",
+    ]
+    if contract["base"] is not None:
+        words.append(
+            "The policy's torque is added to computed torque with the model that is `base` in contract.json. Neither "
+            "fits an arm that is another one, or that carries what the model does not know of."
+        )
+    return [words]
 
 
 def settings(group: Mapping[str, Any]) -> str:

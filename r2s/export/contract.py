@@ -1,7 +1,8 @@
 """contract.json: all that a program has to know to run a policy on the arm that it was trained for.
 
-Every number of the driver's law stands here, as r2s/physics/limits.py and r2s/arm/driver.py have it: a runtime has
-none of its own. JSON knows no infinity: null stands for a limit that is not there.
+Every number of the driver's law stands here, as r2s/physics/limits.py and r2s/arm/driver.py have it, and of the model
+whose torque a policy's is added to (r2s/tasks/model_torque.py): a runtime has none of its own.
+JSON knows no infinity: null stands for a limit that is not there.
 """
 
 from typing import Any, Protocol, cast
@@ -108,7 +109,7 @@ def links_of(robot: Robot, dynamics: Dynamics) -> list[dict[str, Any]]:
     """Return the rows of a model: each link's joint, mass, centre and tensor, in its frame at angle zero."""
     out = []
     for k in chain(robot, dynamics, friction=False)[0]:
-        row = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}
+        row: dict[str, Any] = {"place": k.origin[:3, 3], "frame": k.origin[:3, :3], "axis": k.axis}
         row |= {"mass": k.mass, "com": k.com, "tensor": k.inertia}
         out.append({"name": k.name} | {what: listed(values) for what, values in row.items()})
     return out

@@ -111,6 +111,9 @@ def _check(contract: dict[str, Any]) -> None:
     if seen["history"]:
         raise BundleError(f"contract.json: observations of history {seen['history']}; this runtime has none to give")
     check_goal(contract)
+    asked, action = torque["asked_for_Nm"], torque["action_Nm"]
+    if any(x > most if contract["base"] else x != most for x, most in zip(action, asked, strict=True)):
+        raise BundleError(f"contract.json: an action of 1 is {action} Nm, the most that is asked for {asked}")
     at, known = 0, (*MADE_OF, *OF_PLAN) if contract["goal"]["kind"] == "plan" else MADE_OF
     for entry in seen["entries"]:
         wide = width(entry["of"], n, seen["preview"])
@@ -293,8 +296,6 @@ def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
         raise BundleError(
             f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'"
         )
-    if "base" in metadata["torque"] and contract["base"] is None:
-        raise BundleError("contract.json has no base, to which the torque of policy.onnx is to be added")
 
 
 def main() -> int:

@@ -186,3 +186,16 @@ class Paths:
         hand, h = self._hand, 1e-5  # type: ignore[attr-defined]
         v = (hand.place(q + h * dq) - hand.place(q - h * dq)) / (2 * h)
         return np.hstack([hand.place(q), v, q, dq, ddq])
+
+
+def later(
+    plans: np.ndarray, k: np.ndarray, late: float, hz: int, n: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, dq, ddq (m, n) of plans `late` s after their rows k (m,); the acceleration is linear between rows."""
+    whole = int(late * hz)
+    rows, last = np.arange(len(plans)), plans.shape[1] - 1
+    a, b = plans[rows, np.minimum(k + whole, last)], plans[rows, np.minimum(k + whole + 1, last)]
+    h = late - whole / hz
+    q, dq, ddq = a[:, 6 : 6 + n], a[:, 6 + n : 6 + 2 * n], a[:, 6 + 2 * n :]
+    jerk = (b[:, 6 + 2 * n :] - ddq) * hz
+    return q + h * (dq + h * (ddq / 2 + h * jerk / 6)), dq + h * (ddq + h * jerk / 2), ddq + h * jerk

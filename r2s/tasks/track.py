@@ -1,6 +1,6 @@
 """Follow a timed path with the hand: which paths, what a policy observes and changes, and what a step is worth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import mujoco
@@ -16,7 +16,7 @@ from r2s.tasks.model_torque import ModelTorque
 from r2s.tasks.reach import OBSERVED, ReachTask, layout, observe
 from r2s.tasks.rewards import PAPER
 from r2s.tasks.task import Entry, Episodes, State, Usual
-from r2s.tasks.timed_path import KINDS, Paths, V, X, curve
+from r2s.tasks.timed_path import KINDS, Curve, Paths, V, X, curve, later
 
 BASES = ("model", "none")
 FAR_M, NEAR_M, FINE_M = 0.03, 0.01, 0.003  # lengths of the reward
@@ -152,9 +152,8 @@ class TrackTask(Usual):
         Raises:
             UserError: hardly any path is within the arm's reach, its limits, and clear of itself.
         """
-        paths = Paths(robot, self.torque(robot), self.episode_s, self.ramp_s)
+        paths = self._paths(robot)
         space, inside = Space(robot, table=-np.inf, z_min=self.height), _Inside(robot, self._region)
-        t = np.arange(self.steps + 1 + self.preview) / self.ctrl_hz
         found: list[np.ndarray] = []
         middles = self._region.goals(robot, rng, 4 * count)
         for tried in range(TRIES * count + TRIES):
@@ -162,7 +161,7 @@ class TrackTask(Usual):
                 middles = self._region.goals(robot, rng, len(middles))
             size, speed = rng.uniform(*self.size), rng.uniform(*self.speed)
             shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size)
-            plan = paths.plan(middles[tried % len(middles)], shape, speed, t)
+            plan = paths.plan(middles[tried % len(middles)], shape, speed, self._times)
             if plan is None or not inside(plan[:, X]):
                 continue
             q = plan[:: max(1, len(plan) // SEEN), 6 : 6 + robot.n]
@@ -180,6 +179,33 @@ class TrackTask(Usual):
             f"task.reach {low:g} to {high:g} m, task.height {self.height:g} m; smaller ones or a wider region are "
             "allowed"
         )
+
+    def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
+        """Return the plan (steps + 1 + preview, 6 + 3 n) of a curve of one's own.
+
+        Contacts, and whether it is of the training's family, are not looked at.
+
+        Args:
+            robot: the arm. start: (3,) m, where the hand begins. shape: how far from there it is, (T, 3) m, at u (T,)
+                m along the curve. pace: m/s of u; slower, where the arm's limits want it.
+
+        Raises:
+            UserError: the arm cannot follow it.
+        """
+        plan = self._paths(robot).plan(np.array(start, dtype=float), shape, pace, self._times)
+        if plan is None:
+            raise UserError(
+                f"plan: {robot.name} cannot follow this curve from {list(start)} m; a nearer one is allowed"
+            )
+        return plan
+
+    @property
+    def _times(self) -> np.ndarray:
+        """(T,) s, of the rows of a plan."""
+        return np.arange(self.steps + 1 + self.preview) / self.ctrl_hz
+
+    def _paths(self, robot: Robot) -> Paths:
+        return Paths(robot, self.torque(robot), self.episode_s, self.ramp_s)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation to normalise `observe` by: the task's own scales."""
@@ -252,7 +278,7 @@ class TrackTask(Usual):
         k = self._at(state.t)
         now = goals[rows, k]
         back = w**2 * (now[:, 6 : 6 + n] - state.q) + 2 * w * (now[:, 6 + n : 6 + 2 * n] - state.dq)
-        q, dq, ddq = _later(goals, k, late, self.ctrl_hz, n)
+        q, dq, ddq = later(goals, k, late, self.ctrl_hz, n)
         return model(q, dq, ddq + back, dq)
 
     def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
@@ -327,19 +353,6 @@ class _Inside:
         ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) <= self._task.azimuth
         low, high = self.region
         return bool(((away >= low) & (away <= high) & (points[:, 2] >= self._task.height) & ahead).all())
-
-
-def _later(
-    plans: np.ndarray, k: np.ndarray, late: float, hz: int, n: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, dq, ddq (m, n) of plans `late` s after their rows k (m,); the acceleration is linear between rows."""
-    whole = int(late * hz)
-    rows, last = np.arange(len(plans)), plans.shape[1] - 1
-    a, b = plans[rows, np.minimum(k + whole, last)], plans[rows, np.minimum(k + whole + 1, last)]
-    h = late - whole / hz
-    q, dq, ddq = a[:, 6 : 6 + n], a[:, 6 + n : 6 + 2 * n], a[:, 6 + 2 * n :]
-    jerk = (b[:, 6 + 2 * n :] - ddq) * hz
-    return q + h * (dq + h * (ddq / 2 + h * jerk / 6)), dq + h * (ddq + h * jerk / 2), ddq + h * jerk
 
 
 @njit(cache=True)

@@ -1,0 +1,265 @@
+"""A policy that follows plans travels: its bundle's runtime does what r2s does, and refuses what cannot be."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, conf
+from test_export import POLICY, arm_of, bare, compare, drawn, edited, fewer, hostile, loaded, runs_in, swap  # noqa: F401
+
+from r2s import commands
+from r2s.errors import UserError
+from r2s.export.contract import make_contract
+from r2s.export.plan import Follower, check_goal
+from r2s.learning.networks import Told
+from r2s.learning.policy import make_policy, save_policy
+from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.physics.friction import FAMILIES, SIGMOID
+from r2s.physics.robot import load_robot
+from r2s.tasks.task import State
+from r2s.tasks.track import TrackTask
+
+SETTINGS = {k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/track").items()}
+SHORT = "task=track", "task.episode_s=1.2", "task.kinds=[circle]"  # one second and a fifth: the least, with its ramps
+# two writings of inverse dynamics: sums of some tens of terms of the result's size, each to 1e-16
+BASE = 1e-12
+CALM_RAD, CALM_SHARE = 0.01, 0.05  # of joints off their plan, and of their largest speed
+
+
+def export(folder: Path, *overrides: str):
+    made = drawn(folder / "runs" / "train" / "drawn", *SHORT, *overrides)
+    commands.run_command(["export", str(made.run)])
+    return made
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    """The bundle of a policy whose torque is added to the model's."""
+    return export(tmp_path_factory.mktemp("planned"))
+
+
+@pytest.fixture(scope="module")
+def runtime(planned):
+    return loaded(planned.folder)
+
+
+def along(exported, cycles: int, calm: int) -> dict[str, np.ndarray]:
+    """Return a `hostile` motion whose first `calm` cycles are one that is near its plan; goals are plans.
+
+    Each cycle's joints are off the plan by other amounts, so that the law has something to do.
+    """
+    robot, task = exported.robot, exported.task
+    motion, rng, n = hostile(robot, task, cycles), np.random.default_rng(1), robot.n
+    plans = np.load(exported.folder / "plans.npz")["plans"]
+    motion |= {"goal": plans, "which": motion["which"] % len(plans)}
+    t = np.arange(calm) / task.substeps
+    row = np.minimum(t.astype(int), task.steps)
+    plan, share = plans[0], np.where(row < task.steps, t - row, 0.0)[:, None]
+    near = plan[row] + share * (plan[row + 1] - plan[row])
+    motion["q"][:calm] = near[:, 6 : 6 + n] + CALM_RAD * rng.normal(size=(calm, n))
+    motion["dq"][:calm] = near[:, 6 + n : 6 + 2 * n] + CALM_SHARE * robot.dq_max * rng.normal(size=(calm, n))
+    motion["begin"][1:calm], motion["which"][:calm], motion["applied"][:calm] = False, 0, np.nan
+    return motion
+
+
+def dynamics_of(robot, family: str):
+    """Return dynamics that have something of all that a model may say, with one family of friction."""
+    friction = conf("friction/paper") if robot.n == 7 else {"phi1": 1.0, "phi2": 20.0, "phi3": 0.01}
+    rng, d = np.random.default_rng(2), of_family(nominal_dynamics(robot, **friction), family)
+    optional = 0.3 * rng.random((robot.n, len(d.family.names) - d.phi.shape[-1]))
+    d = replace(d, phi=np.concatenate([d.phi, optional], -1), offset=rng.normal(size=robot.n), delay=0.004, lag=0.002)
+    d = replace(d, drag=rng.normal(size=(robot.n, 2)), load=0.1 * rng.random(robot.n), armature=np.full(robot.n, 0.1))
+    return replace(d, mass=1.1 * d.mass, com=d.com + 0.01, inertia=1.2 * d.inertia)
+
+
+@pytest.mark.parametrize("family", [f.name for f in FAMILIES])
+@pytest.mark.parametrize("arm", ["panda", "six_joints"])
+def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
+    """At any state and in any row of any plan, the end and what comes after included."""
+    robot = panda if arm == "panda" else load_robot(str(ROOT / "tests" / "models" / "six_joints.xml"))
+    more = {} if arm == "panda" else {"reach": None, "torque_fraction": 0.2}
+    task = TrackTask(**SETTINGS | more).believing(robot, dynamics_of(robot, family))
+    contract = json.loads(json.dumps(make_contract(robot, task, task.model.dynamics.level), allow_nan=False))
+    check_goal(contract)
+    follow, rng, n = Follower(contract), np.random.default_rng(3), robot.n
+    plan = rng.normal(size=contract["goal"]["shape"])
+    for step in (0, 1, 17, task.steps - 2, task.steps - 1, task.steps, task.steps + 50):
+        q, dq, ee, still = *rng.normal(size=(2, n)), np.zeros(3), State.still(robot)
+        state = replace(still, t=np.array([step / task.ctrl_hz]), q=q[None], dq=dq[None])
+        wanted = task.computed(state, plan[None])[0]
+        assert np.abs(follow(plan, step, q, dq, ee, 0.0)["base"] - wanted).max() < BASE * np.abs(wanted).max()
+
+
+def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
+    """Near a plan, beyond its end, and at hostile states."""
+    assert compare(planned, runtime, along(planned, 200, 100)) < POLICY
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("base", ["model", "none"])
+def test_so_it_does_for_ten_thousand_cycles(tmp_path, base):
+    """Of both bases; the calm motion is longer than its plan."""
+    exported = export(tmp_path, f"task.base={base}")
+    assert compare(exported, loaded(exported.folder), along(exported, 10_000, 1500)) < POLICY
+
+
+@pytest.mark.slow
+def test_it_follows_where_there_is_nothing_but_numpy_and_onnxruntime(planned, bare, tmp_path):  # noqa: F811
+    runs_in(bare, planned, along(planned, 10_000, 1500), tmp_path)
+
+
+def test_the_bundle_tells_what_a_plan_is_and_has_some(planned, runtime, capsys, monkeypatch):
+    """Plans of the training's family, in the contract, the card and the runtime's own words; no C++ constants."""
+    contract = runtime.load(planned.folder)
+    plans = np.load(planned.folder / "plans.npz")["plans"]
+    assert list(plans.shape[1:]) == contract["goal"]["shape"] == [124, 27]
+    assert len(plans) >= 2
+    assert "contract.hpp" not in contract["files"]
+    card = (planned.folder / "MODEL_CARD.md").read_text()
+    assert "## Plans" in card
+    assert "added to computed torque" in card
+    monkeypatch.setattr(sys, "argv", ["r2s_runtime.py", str(planned.folder)])
+    assert runtime.main() == 0
+    assert "goal: a plan of 124 x 27 numbers" in capsys.readouterr().out
+
+
+def test_a_plan_is_made_of_joint_angles(planned, runtime):
+    """It is r2s' own plan again, whose velocities are differences: to 1e-16 m / 1e-5 s."""
+    other, n = runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned))), planned.robot.n
+    plan = np.load(planned.folder / "plans.npz")["plans"][0]
+    joints = [plan[:, 6 + k * n : 6 + (k + 1) * n] for k in range(3)]
+    np.testing.assert_allclose(other.plan(*joints), plan, atol=1e-9)
+    with pytest.raises(runtime.BundleError, match=r"\(123, 7\), .* \(124, 7\) is allowed"):
+        other.plan(*(x[1:] for x in joints))
+
+
+def test_a_plan_is_made_of_a_curve(planned):
+    """The hand begins at rest where it was told to and keeps to the curve; a curve out of reach is refused."""
+    robot, task = planned.robot, planned.task
+
+    def line(u):
+        return np.outer(u, [0.0, 1.0, 0.0])
+
+    plan = task.plan(robot, (0.5, -0.1, 0.4), line, 0.3)
+    np.testing.assert_allclose(plan[0, :3], [0.5, -0.1, 0.4], atol=2e-4)
+    assert np.abs(plan[[0, -1], 3:6]).max() < 1e-9
+    np.testing.assert_allclose(plan[:, [0, 2]], [[0.5, 0.4]] * len(plan), atol=2e-4)
+    with pytest.raises(UserError, match="panda cannot follow this curve"):
+        task.plan(robot, (1.5, 0.0, 0.4), line, 0.3)
+
+
+WRONG: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
+    "too short": (lambda p: p[1:], r"\(123, 27\); 7 joints and 124 x 27 are allowed"),
+    "of another arm": (lambda p: p[:, :24], r"\(124, 24\); 7 joints and 124 x 27 are allowed"),
+    "a point": (lambda p: p[0, :3], r"\(3,\); 7 joints and 124 x 27 are allowed"),
+    "not finite": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 30, np.nan, p), "nan in row 1, column 3"),
+    "endless": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 0, np.inf, p), "inf in row 0, column 0"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_plan_of_another_size_or_that_is_not_finite_is_refused(planned, runtime, kind):
+    """In one line, and before any torque."""
+    change, words = WRONG[kind]
+    other = runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned)))
+    plan = change(np.load(planned.folder / "plans.npz")["plans"][0])
+    for _ in range(2):  # it is not taken for one that was looked at
+        with pytest.raises(runtime.BundleError, match=words) as refused:
+            other(np.zeros(7), np.zeros(7), np.zeros(7), plan)
+        assert "\n" not in str(refused.value)
+
+
+def without_base(contract: dict) -> None:
+    """Leave the base out, and its observation."""
+    fewer(contract)
+    contract["base"] = None
+
+
+def as_points(contract: dict) -> None:
+    contract["goal"] = {"kind": "point", "shape": [3], "unit": "m"}
+
+
+MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
+    "a longer preview": (
+        lambda c: c["observation"].update(preview=5),
+        "124, 27]; 120 steps, a preview of 5 and 7 jo",
+    ),
+    "no preview": (lambda c: c["observation"].update(preview=0), "a preview of 0 samples in 120 steps"),
+    "half a sample": (lambda c: c["observation"].update(preview=2.5), "a preview of 2.5 samples"),
+    "a history": (lambda c: c["observation"].update(history=3), "observations of history 3"),
+    "a preview of another width": (
+        lambda c: (c["observation"].update(preview=4), c["goal"].update(shape=[125, 27])),
+        "observation 'the next 3 places - ee' is ahead at [54, 63]; 54 is next",
+    ),
+    "longer plans": (lambda c: c["goal"].update(steps=400), "shape [124, 27]; 400 steps"),
+    "plans of another rate": (lambda c: c["goal"].update(row_hz=50), "plans of 50 Hz and a policy of 100 Hz"),
+    "another order of columns": (
+        lambda c: c["goal"]["columns"].update(place=[3, 6], velocity=[0, 3]),
+        "'place' of a plan is at [3, 6]; 0 is next",
+    ),
+    "a missing column": (lambda c: c["goal"]["columns"].pop("ddq"), "damaged: KeyError 'ddq'"),
+    "goals that are points": (as_points, "observations of preview 3; a goal that is a point has none"),
+    "another kind of goal": (lambda c: c["goal"].update(kind="path"), "goals are 'path'; this runtime takes 'point'"),
+    "no base": (lambda c: c.update(base=None), "observations of a base that is not there"),
+    "neither base nor its observation": (without_base, "an action of 1 is [2.61, "),
+    "a base that none observes": (fewer, "a base that no observation has"),
+    "an action of more than is asked for": (
+        lambda c: c["torque"]["action_Nm"].__setitem__(0, 99.0),
+        "an action of 1 is [99.0",
+    ),
+    "what an action adds": (lambda c: c["torque"]["action_Nm"].__setitem__(0, 9.0), "says torque_scale_Nm '9 "),
+    "an unknown friction": (
+        lambda c: c["base"]["friction"].update(family="rubber"),
+        "is 'rubber'; this runtime knows",
+    ),
+    "a missing parameter": (lambda c: c["base"]["friction"]["parameters"].pop("phi2"), "damaged: KeyError 'phi2'"),
+    "another family": (lambda c: c["base"]["friction"].update(family="coulomb"), "damaged: KeyError 'coulomb'"),
+    "a joint less": (lambda c: c["base"]["offset_Nm"].pop(), "base.offset_Nm is of 6 joints, the arm has 7"),
+    "a number that is none": (lambda c: c["base"]["load"].__setitem__(2, None), "base.load is [0.0, 0.0, None"),
+    "a link less": (lambda c: c["base"]["links"].pop(), "base.links is of 6 joints"),
+    "a link without mass": (lambda c: c["base"]["links"][3].pop("mass"), "base.links has a link without mass"),
+    "no gravity": (lambda c: c["base"].pop("gravity_m_per_s2"), "damaged: KeyError 'gravity_m_per_s2'"),
+    "no delay": (lambda c: c["base"]["number"].pop("late_s"), "base.number.late_s is None"),
+    "a delay backwards": (lambda c: c["base"]["number"].update(late_s=-0.01), "base.number.late_s is -0.01"),
+    "no bandwidth": (lambda c: c["base"]["number"].update(bandwidth_rad_per_s=0), "bandwidth_rad_per_s is 0"),
+}
+
+
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_a_contract_that_says_another_thing_is_refused(planned, runtime, tmp_path, kind):
+    """In one line, also where somebody sealed it anew."""
+    change, words = MUTATIONS[kind]
+    folder = edited(planned, tmp_path / "b", change, runtime)
+    with pytest.raises(runtime.BundleError) as refused:
+        runtime.Runtime(folder, runtime.Arm(**arm_of(planned)))
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_friction_of_ones_own_does_not_travel(panda):
+    family = replace(SIGMOID, name="mine")
+    task = TrackTask(**SETTINGS).believing(panda, replace(dynamics_of(panda, "sigmoid"), family=family))
+    with pytest.raises(
+        UserError, match="friction of family 'mine' does not travel; the runtime of a bundle knows sig"
+    ):
+        make_contract(panda, task, np.zeros(7))
+    bare_task = replace(task, base="none", model=None)
+    assert make_contract(panda, bare_task, np.zeros(7))["base"] is None
+
+
+def test_a_policy_that_is_told_of_its_arm_does_not_travel(planned, tmp_path):
+    """What tells it is an adapter, with a memory of what the arm did."""
+    run = tmp_path / "runs" / "train" / "told"
+    run.mkdir(parents=True)
+    for name in ("config.yaml", "meta.json", "summary.json", "policy.onnx"):
+        (run / name).write_bytes((planned.run / name).read_bytes())
+    torch.manual_seed(0)
+    save_policy(run, make_policy(planned.robot, planned.task, (16, 16), Told(15)))
+    with pytest.raises(UserError, match="is told of its arm by an adapter, which no bundle has"):
+        commands.run_command(["export", str(run)])
+    assert not (run / "bundle").exists()
