@@ -436,7 +436,7 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a torque rate": (lambda c: limit(c, "max_rate_Nm_per_s", 3, 2e3), "dtau_max of joint 3"),
     "a speed limit": (lambda c: limit(c, "dq_max_rad_per_s", 2, 9.0), "dq_max of joint 2"),
     "a position limit": (lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0), "q_min of joint 4 is -3.07"),
-    "what is asked for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "an action of 1 is [26.0"),
+    "what is asked for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "Nm, the most that is asked for [20.0, "),
     "what an action asks for": (lambda c: asks(c, 20.0), "torque_scale_Nm"),
     "the convention": (lambda c: c["torque"].update(convention="with gravity"), "torque 'with gravity'"),
     "a missing link": (lambda c: c["model"]["links"].pop(), "model.links is of 6 joints"),

@@ -1,6 +1,7 @@
 """A policy that follows plans travels: its bundle's runtime does what r2s does, and refuses what cannot be."""
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,8 @@ from conftest import ROOT, conf
 from test_export import POLICY, arm_of, bare, compare, drawn, edited, fewer, hostile, loaded, runs_in, swap  # noqa: F401
 
 from r2s import commands
+from r2s.arm.deploy import DrivenArm
+from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.export.contract import make_contract
 from r2s.export.plan import Follower, check_goal
@@ -21,6 +24,7 @@ from r2s.learning.policy import make_policy, save_policy
 from r2s.physics.dynamics import nominal_dynamics, of_family
 from r2s.physics.friction import FAMILIES, SIGMOID
 from r2s.physics.robot import load_robot
+from r2s.tasks.episode import rollout
 from r2s.tasks.task import State
 from r2s.tasks.track import TrackTask
 
@@ -109,6 +113,29 @@ def test_so_it_does_for_ten_thousand_cycles(tmp_path, base):
 
 
 @pytest.mark.slow
+def test_an_arm_follows_as_it_does_behind_r2s(planned, runtime):
+    """In closed loop, with sensors' noise: where r2s' own episode takes it, as far as float32 tells."""
+    robot, task = planned.robot, planned.task
+    plan = np.load(planned.folder / "plans.npz")["plans"][0]
+    start, noise = plan[0, 6 : 6 + robot.n], {"position_noise": 1e-5, "velocity_noise": 1e-3}
+    driven = DrivenArm(SimulatedArm(robot, task.model.dynamics, **noise), task, planned.friction)
+    wanted = rollout(planned.policy, driven, task, start[None], plan[None])
+    arm, other = (
+        SimulatedArm(robot, task.model.dynamics, **noise),
+        runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned))),
+    )
+    arm.move_to(start)
+    q = np.empty((task.steps * task.substeps, robot.n))
+    for k in range(len(q)):
+        state = arm.read()
+        arm.command(other(state.q, state.dq, state.tau_J_d, plan))
+        q[k] = arm.read().q
+    assert np.abs(q[task.substeps - 1 :: task.substeps] - wanted.q[0]).max() < 1e-6
+    assert not other.driver.stopping
+    assert wanted.distance.max() < 0.03  # it is a path that was followed
+
+
+@pytest.mark.slow
 def test_it_follows_where_there_is_nothing_but_numpy_and_onnxruntime(planned, bare, tmp_path):  # noqa: F811
     runs_in(bare, planned, along(planned, 10_000, 1500), tmp_path)
 
@@ -151,6 +178,17 @@ def test_a_plan_is_made_of_a_curve(planned):
     np.testing.assert_allclose(plan[:, [0, 2]], [[0.5, 0.4]] * len(plan), atol=2e-4)
     with pytest.raises(UserError, match="panda cannot follow this curve"):
         task.plan(robot, (1.5, 0.0, 0.4), line, 0.3)
+
+
+def test_the_page_makes_a_plan_of_a_curve(planned, tmp_path, monkeypatch):
+    """docs/export.md, as it is written."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "export.md").read_text(), re.S | re.M)
+    (block,) = (b for b in blocks if "task.plan(" in b)
+    monkeypatch.chdir(tmp_path)
+    exec(block.replace("runs/train/NAME", str(planned.run)), {})
+    plan = np.load("my_plan.npy")
+    assert list(plan.shape) == json.loads((planned.folder / "contract.json").read_text())["goal"]["shape"]
+    np.testing.assert_allclose(plan[0, :3], [0.5, -0.1, 0.4], atol=2e-4)
 
 
 WRONG: dict[str, tuple[Callable[[np.ndarray], object], str]] = {

@@ -27,7 +27,7 @@ from r2s.runs import read_meta
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
-PARTS = "r2s.export."  # modules that the one file is made of, beside runtime.py
+HERE, PARTS = "r2s.export.", ("law", "base", "plan")  # what the one file is made of beside runtime.py, in this order
 EXAMPLES = 4  # plans that a bundle has
 SAME = 1e-4  # of the torque that an action of 1 asks for: policy.onnx against policy.pt
 
@@ -115,11 +115,18 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
 def one_file() -> str:
     """Return r2s_runtime.py: r2s/export/runtime.py, with what its parts define where it imports them."""
     here = Path(export.__file__).parent
-    lines = (here / "runtime.py").read_text().splitlines(keepends=True)
-    for node in reversed(ast.parse("".join(lines)).body):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PARTS):
-            text = (here / f"{(node.module or '').removeprefix(PARTS)}.py").read_text()
-            imports = [k for k in ast.parse(text).body if isinstance(k, ast.Import | ast.ImportFrom)]
-            own = "".join(text.splitlines(keepends=True)[imports[-1].end_lineno :]).strip()
-            lines[node.lineno - 1 : node.end_lineno] = [f"{own}\n\n"]
+
+    def imports(text: str) -> list[ast.Import | ast.ImportFrom]:
+        return [node for node in ast.parse(text).body if isinstance(node, ast.Import | ast.ImportFrom)]
+
+    def own(name: str) -> str:
+        text = (here / f"{name}.py").read_text()
+        return "".join(text.splitlines(keepends=True)[imports(text)[-1].end_lineno :]).strip()
+
+    text = (here / "runtime.py").read_text()
+    lines = text.splitlines(keepends=True)
+    ours = [node for node in imports(text) if isinstance(node, ast.ImportFrom) and f"{node.module}".startswith(HERE)]
+    for node in ours:
+        lines[node.lineno - 1 : node.end_lineno] = [""] * (1 + (node.end_lineno or 0) - node.lineno)
+    lines[ours[0].lineno - 1] = "\n\n\n".join(map(own, PARTS)) + "\n\n\n"
     return "".join(lines)

@@ -11,8 +11,9 @@ import numpy as np
 
 from r2s.arm import driver
 from r2s.errors import UserError
+from r2s.export.base import FRICTION
 from r2s.export.law import LAW_JOINT
-from r2s.export.plan import COLUMNS, FRICTION, OF_PLAN, width
+from r2s.export.plan import COLUMNS, OF_PLAN, width
 from r2s.export.runtime import CONVENTION, FORMAT, MADE_OF
 from r2s.physics import limits as law
 from r2s.physics.actuation import low_pass_factor
