@@ -233,11 +233,11 @@ def compare(exported: Exported, runtime: ModuleType, motion: dict[str, np.ndarra
         runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported))),
         exported.task.torque(exported.robot),
     )
-    motion, worst, goals = by_r2s(exported, motion), 0.0, list(motion["goal"])
+    motion, worst, goals, plans = by_r2s(exported, motion), 0.0, list(motion["goal"]), motion["goal"].ndim == 3
     for k, (begin, which) in enumerate(zip(motion["begin"], motion["which"], strict=True)):
         if begin:
-            other.reset()
-        tau = other(*(motion[name][k] for name in ("q", "dq", "last")), goals[which])
+            other.reset(*([goals[which]] if plans else []))
+        tau = other(*(motion[name][k] for name in ("q", "dq", "last")), None if plans else goals[which])
         worst = max(worst, float((np.abs(tau - motion["tau"][k]) / torque).max()))
         assert [other.driver.stopping is not None, other.done] == motion["stops"][k].tolist()
     return worst
@@ -531,6 +531,10 @@ def test_states_of_another_size_are_refused(exported, runtime):
     other = runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported)))
     with pytest.raises(runtime.BundleError, match="7 joints and 3 are allowed"):
         other(np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(3))
+    with pytest.raises(runtime.BundleError, match=r"\(7,\), None; 7 joints and 3 are allowed"):
+        other(np.zeros(7), np.zeros(7), np.zeros(7))
+    with pytest.raises(runtime.BundleError, match="takes a point in every cycle, and no plan"):
+        other.reset(np.zeros((404, 27)))
 
 
 def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
@@ -570,9 +574,10 @@ arm |= {"joints": arm["joints"].tolist(), "cycle_hz": 1000, "torque": "without g
 runtime, worst, goals = Runtime(sys.argv[2], Arm(**arm)), 0.0, list(data["goal"])
 said = {name: data[name] for name in ("q", "dq", "last", "begin", "which", "tau", "torque")}
 for k in range(len(said["tau"])):
+    goal = goals[said["which"][k]]
     if said["begin"][k]:
-        runtime.reset()
-    tau = runtime(said["q"][k], said["dq"][k], said["last"][k], goals[said["which"][k]])
+        runtime.reset(*([goal] if goal.ndim == 2 else []))
+    tau = runtime(said["q"][k], said["dq"][k], said["last"][k], *([goal] if goal.ndim == 1 else []))
     worst = max(worst, float((np.abs(tau - said["tau"][k]) / said["torque"]).max()))
 print(worst, sorted(m for m in sys.modules if m.split(".")[0] in ("r2s", "torch", "mujoco", "scipy", "numba")))
 """

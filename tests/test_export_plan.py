@@ -92,11 +92,12 @@ def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
     check_goal(contract)
     follow, rng, n = Follower(contract), np.random.default_rng(3), robot.n
     plan = rng.normal(size=contract["goal"]["shape"])
+    follow.take(plan)
     for step in (0, 1, 17, task.steps - 2, task.steps - 1, task.steps, task.steps + 50):
         q, dq, ee, still = *rng.normal(size=(2, n)), np.zeros(3), State.still(robot)
         state = replace(still, t=np.array([step / task.ctrl_hz]), q=q[None], dq=dq[None])
         wanted = task.computed(state, plan[None])[0]
-        assert np.abs(follow(plan, step, q, dq, ee, 0.0)["base"] - wanted).max() < BASE * np.abs(wanted).max()
+        assert np.abs(follow(step, q, dq, ee, 0.0)["base"] - wanted).max() < BASE * np.abs(wanted).max()
 
 
 def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
@@ -125,10 +126,11 @@ def test_an_arm_follows_as_it_does_behind_r2s(planned, runtime):
         runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned))),
     )
     arm.move_to(start)
+    other.reset(plan)
     q = np.empty((task.steps * task.substeps, robot.n))
     for k in range(len(q)):
         state = arm.read()
-        arm.command(other(state.q, state.dq, state.tau_J_d, plan))
+        arm.command(other(state.q, state.dq, state.tau_J_d))
         q[k] = arm.read().q
     assert np.abs(q[task.substeps - 1 :: task.substeps] - wanted.q[0]).max() < 1e-6
     assert not other.driver.stopping
@@ -192,9 +194,10 @@ def test_the_page_makes_a_plan_of_a_curve(planned, tmp_path, monkeypatch):
 
 
 WRONG: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
-    "too short": (lambda p: p[1:], r"\(123, 27\); 7 joints and 124 x 27 are allowed"),
-    "of another arm": (lambda p: p[:, :24], r"\(124, 24\); 7 joints and 124 x 27 are allowed"),
-    "a point": (lambda p: p[0, :3], r"\(3,\); 7 joints and 124 x 27 are allowed"),
+    "none": (lambda p: None, "follows plans: one is told to `reset`"),
+    "too short": (lambda p: p[1:], r"\(123, 27\); \(124, 27\) is allowed"),
+    "of another arm": (lambda p: p[:, :24], r"\(124, 24\); \(124, 27\) is allowed"),
+    "a point": (lambda p: p[0, :3], r"\(3,\); \(124, 27\) is allowed"),
     "not finite": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 30, np.nan, p), "nan in row 1, column 3"),
     "endless": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 0, np.inf, p), "inf in row 0, column 0"),
 }
@@ -202,14 +205,17 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
 
 @pytest.mark.parametrize("kind", WRONG)
 def test_a_plan_of_another_size_or_that_is_not_finite_is_refused(planned, runtime, kind):
-    """In one line, and before any torque."""
+    """In one line, before a motion; without a plan there is none."""
     change, words = WRONG[kind]
     other = runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned)))
     plan = change(np.load(planned.folder / "plans.npz")["plans"][0])
-    for _ in range(2):  # it is not taken for one that was looked at
-        with pytest.raises(runtime.BundleError, match=words) as refused:
-            other(np.zeros(7), np.zeros(7), np.zeros(7), plan)
-        assert "\n" not in str(refused.value)
+    with pytest.raises(runtime.BundleError, match=words) as refused:
+        other.reset(plan)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(runtime.BundleError, match="one is told to `reset`"):
+        other(*np.zeros((3, 7)))
+    with pytest.raises(runtime.BundleError, match=r"\(7,\), \(3,\); 7 joints and no goal are allowed"):
+        other(*np.zeros((3, 7)), np.zeros(3))
 
 
 def without_base(contract: dict) -> None:

@@ -3,7 +3,6 @@
 It needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -68,36 +67,40 @@ class Base:
         self._late, self._bandwidth = number["late_s"], number["bandwidth_rad_per_s"]
         self._sign, self._slides = number["sign_rad_per_s"], number["load_sign_rad_per_s"]
 
-    def __call__(
-        self, joints: Sequence[np.ndarray], row: int, hz: float, q: np.ndarray, dq: np.ndarray
-    ) -> np.ndarray:
-        """Return the torque (n,) Nm at q, dq (n,) in row `row` of a plan whose q, dq, ddq are joints, (rows, n) each.
+    def prepare(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> None:
+        """Work out what does not depend on the arm, for the first `rows` rows of a plan's joints (T, n) at hz.
+
+        A cycle of 1 ms has no time for it.
+        """
+        self._q, self._dq, n = q, dq, q.shape[1]
+        self._mass, self._torque = np.empty((rows, n, n)), np.empty((rows, n))
+        whole, last = int(self._late * hz), len(q) - 1
+        h = self._late - whole / hz
+        for row in range(rows):  # the plan when the torque acts; its acceleration is linear between rows
+            a, b = min(row + whole, last), min(row + whole + 1, last)
+            jerk = (ddq[b] - ddq[a]) * hz
+            to = q[a] + h * (dq[a] + h * (ddq[a] / 2 + h * jerk / 6))
+            dto = dq[a] + h * (ddq[a] + h * jerk / 2)
+            self._mass[row], self._torque[row] = self.needs(to, dto, ddq[a] + h * jerk)
+
+    def __call__(self, row: int, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm at q, dq (n,) in a row of the plan.
 
         The feedback compares the plan of now with the arm of now, and is weighed with the model's inertia.
         """
         w = self._bandwidth
-        back = w**2 * (joints[0][row] - q) + 2 * w * (joints[1][row] - dq)
-        to, dto, ddto = self._later(joints, row, hz)
-        return self.torque(to, dto, ddto + back)
+        back = w**2 * (self._q[row] - q) + 2 * w * (self._dq[row] - dq)
+        return self._torque[row] + self._mass[row] @ back
 
-    def _later(self, joints: Sequence[np.ndarray], row: int, hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, dq, ddq (n,) when the torque acts; the acceleration is linear between rows."""
-        whole, last = int(self._late * hz), len(joints[0]) - 1
-        a, b = min(row + whole, last), min(row + whole + 1, last)
-        h = self._late - whole / hz
-        q, dq, ddq = (x[a] for x in joints)
-        jerk = (joints[2][b] - ddq) * hz
-        return q + h * (dq + h * (ddq / 2 + h * jerk / 6)), dq + h * (ddq + h * jerk / 2), ddq + h * jerk
-
-    def torque(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm for a motion q, dq, ddq (n,), without what the arm itself compensates."""
+    def needs(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mass matrix (n, n) kg m^2, and a motion's torque (n,) Nm without what the arm compensates."""
         self._own.place(q)
         self._nominal.place(q)
         mass, bias = self._own.equations(dq)
         held = self._nominal.weight(self._gravity)
         out = mass @ ddq + bias + self._own.weight(self._gravity) - held
         out += self.friction(dq) - self._offset - self._drag[0] * np.sin(q) - self._drag[1] * np.cos(q)
-        return out + self._load * np.abs(held) * np.tanh(dq / self._slides)
+        return mass, out + self._load * np.abs(held) * np.tanh(dq / self._slides)
 
     def friction(self, v: np.ndarray) -> np.ndarray:
         """Return (n,) Nm at v (n,) rad/s: r2s/physics/friction.py."""

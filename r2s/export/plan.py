@@ -69,37 +69,45 @@ class Follower:
         self._steps, self._hz, self._preview = goal["steps"], goal["row_hz"], contract["observation"]["preview"]
         self._at = {name: slice(*goal["columns"][name]) for name in COLUMNS}
         self._base = None if contract["base"] is None else Base(contract)
-        self._asked: object = None
+        self._shape, self._plan = tuple(goal["shape"]), np.zeros(0)
 
-    def finite(self, asked: object, plan: np.ndarray) -> None:
-        """Raise BundleError where a plan (rows, columns) has what is no number; what was asked before is not read."""
-        if asked is self._asked:
-            return
+    def take(self, plan: Any) -> None:
+        """Take the plan of the next motion; raise BundleError where there is none, of the size and finite."""
+        if plan is None:
+            raise BundleError("the policy of this bundle follows plans: one is told to `reset`")
+        plan = np.array(plan, dtype=float)
+        if plan.shape != self._shape:
+            raise BundleError(f"the plan is of shape {plan.shape}; {self._shape} is allowed")
         if not (good := np.isfinite(plan)).all():
             row, column = np.argwhere(~good)[0]
             raise BundleError(
                 f"the plan is {plan[row, column]} in row {row}, column {column}; finite ones are allowed"
             )
-        self._asked = asked
+        if self._base is not None:
+            q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))
+            self._base.prepare(q, dq, ddq, self._hz, self._steps + 1)
+        self._plan = plan
 
     def __call__(
-        self, plan: np.ndarray, step: int, q: np.ndarray, dq: np.ndarray, ee: np.ndarray, limited: float
+        self, step: int, q: np.ndarray, dq: np.ndarray, ee: np.ndarray, limited: float
     ) -> dict[str, np.ndarray]:
-        """Return what there is to see of a plan in a control step: `goal`, where the hand is to be, and OF_PLAN.
+        """Return what there is to see of the plan in a control step: `goal`, where the hand is to be, and OF_PLAN.
 
         Beyond the last step the plan's end is held.
 
         Args:
-            plan: (rows, columns). step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the hand.
+            step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the hand.
             limited: share of the last control period in which the law changed what was asked for.
         """
-        row, at = min(step, self._steps), self._at
+        if not self._plan.size:
+            raise BundleError("the policy of this bundle follows plans: one is told to `reset`")
+        row, at, plan = min(step, self._steps), self._at, self._plan
         now = plan[row]
         made = {"goal": now[at["place"]], "velocity": now[at["velocity"]], "limited": np.array([limited])}
         made["ahead"] = (plan[row + 1 : row + 1 + self._preview, at["place"]] - ee).ravel()
         made |= {"q_off": now[at["q"]] - q, "dq_off": now[at["dq"]] - dq}
         if self._base is not None:
-            made["base"] = self._base([plan[:, at[k]] for k in ("q", "dq", "ddq")], row, self._hz, q, dq)
+            made["base"] = self._base(row, q, dq)
         return made
 
 

@@ -7,7 +7,7 @@
     while not runtime.done:              # every millisecond
         tau = runtime(q, dq, tau_J_d, goal)
 
-A goal is a point, or a plan: the same one in every cycle of a motion. `runtime.plan` makes one of joint angles.
+Where a policy follows plans, its plan is told to `reset`, and no goal in a cycle; `plan` makes one of joint angles.
 What the bundle wants stands in its contract.json. What does not fit it is a BundleError of one line.
 """
 
@@ -192,12 +192,23 @@ class Runtime:
         self.driver = Driver(contract["law"], self._model, soft_start_s)
         self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
         self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
-        self._shape = tuple(contract["goal"]["shape"])
         self._follower = Follower(contract) if contract["goal"]["kind"] == "plan" else None
-        self.reset()
+        self._cycle = self._limited = 0
 
-    def reset(self) -> None:
-        """Begin a motion, from rest and zero torque; of a plan at the angles of its first row."""
+    def reset(self, plan: np.ndarray | None = None) -> None:
+        """Begin a motion, from rest and zero torque.
+
+        Args:
+            plan: (rows, columns) as of `goal` of the contract, where the policy follows plans; the arm is at the
+                angles of its first row. With a base it takes a tenth of a second to be worked out.
+
+        Raises:
+            BundleError: the plan is of another size or not finite, there is none, or the policy takes points.
+        """
+        if self._follower is not None:
+            self._follower.take(plan)
+        elif plan is not None:
+            raise BundleError("the policy of this bundle takes a point in every cycle, and no plan")
         self.driver.reset()
         self._cycle = self._limited = 0
 
@@ -206,27 +217,31 @@ class Runtime:
         """Whether the driver has brought the arm to rest; `driver.stopping` says why."""
         return self.driver.done
 
-    def __call__(self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def __call__(
+        self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the torque (n,) Nm to send in this cycle.
 
         Args:
             q, dq: (n,) rad, rad/s, as the arm measures them. tau_J_d: (n,) Nm, what it applied last.
-            goal: (3,) m in the base frame, or a plan (rows, columns) as of `goal` of the contract; finite. A plan's
-                time is the number of cycles since `reset`.
+            goal: (3,) m in the base frame, finite; None where the policy follows a plan, whose time is the number of
+                cycles since `reset`.
 
         Raises:
-            BundleError: one of them is of another size, or the plan is not finite.
+            BundleError: one of them is of another size, or there is no plan.
         """
-        asked = goal
-        q, dq, tau_J_d, goal = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d, goal))
-        if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or goal.shape != self._shape:
-            shapes = ", ".join(str(x.shape) for x in (q, dq, tau_J_d, goal))
-            size = " x ".join(map(str, self._shape))
+        q, dq, tau_J_d = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d))
+        if goal is not None:
+            goal = np.asarray(goal, dtype=float)
+        asked = None if goal is None else goal.shape
+        if not q.shape == dq.shape == tau_J_d.shape == (self._model.n,) or asked != (
+            None if self._follower else (3,)
+        ):
+            shapes = ", ".join(map(str, (q.shape, dq.shape, tau_J_d.shape, asked)))
+            size = "no goal" if self._follower else "3"
             raise BundleError(
                 f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and {size} are allowed"
             )
-        if self._follower is not None:
-            self._follower.finite(asked, goal)
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the driver's to stop
             self._model.place(q)
             target = None
@@ -237,14 +252,16 @@ class Runtime:
             self._cycle += 1
             return self.driver(q, dq, tau_J_d, target, placed=True)
 
-    def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+    def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> dict[str, np.ndarray]:
         """Return what observations of this control step are made of; the model has been placed at q."""
         ee, jacobian = self._model.hand()
-        made = {"q": q, "dq": dq, "ee": ee, "goal": goal, "effort": self.driver.effort}
+        made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort}
         if self._follower is not None:
             changed = (self.driver.limited - self._limited) / self._every
             self._limited = self.driver.limited
-            made |= self._follower(goal, self._cycle // self._every, q, dq, ee, changed)
+            made |= self._follower(self._cycle // self._every, q, dq, ee, changed)
+        elif goal is not None:
+            made["goal"] = goal
         made["error"] = made["goal"] - ee
         return made | {"pull": jacobian.T @ made["error"]}
 
@@ -270,7 +287,7 @@ class Runtime:
         if self._follower is None:
             raise BundleError("the policy of this bundle takes points, not plans")
         q, dq, ddq = (np.asarray(x, dtype=float) for x in (q, dq, ddq))
-        allowed = self._shape[0], self._model.n
+        allowed = self.contract["goal"]["shape"][0], self._model.n
         if not q.shape == dq.shape == ddq.shape == allowed:
             raise BundleError(f"q, dq and ddq are of shapes {q.shape}, {dq.shape}, {ddq.shape}; {allowed} is allowed")
         return plan_of(self._model, q, dq, ddq)
