@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 OF_THE_TASK = ("torque_fraction", "reach")  # what a robot's yaml says of tasks
 sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
+PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern; who is not here looks for itself
     **dict.fromkeys(("bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"\d_\d+"),
@@ -24,7 +25,7 @@ WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern;
     "known_truth": (r"\d+",),
     "grid": (r"\d+(,\d+)*", NUMBER),
     "least_squares": (NUMBER,),
-    "payload": (r"(root|motions|make)=.+", r"\d+"),
+    "payload": (PARTS, r"root=.+", r"make=[12]", r"(motions|minutes)=[1-9]\d*", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
     "twins": (r"make=[12]", r"\d+"),

@@ -1,10 +1,19 @@
-"""Identification at work: mass, centre, detection and coverage, on twins with their identified models.
+"""Identification at work on twins with their identified models: payloads, false alarms, friction that warms, setLoad.
 
-`python benchmarks/payload.py [make=2] [root=RUNS] [motions=N] [SEED ...]`, by default development seeds 0-5 of both
-makes; the judging seeds are 100-109 and 200-209. A twin that was not identified yet is (stage=identify, a minute or
-two). Each motion lasts 12 s, with pauses; a payload of U(0.05, 1.5) kg, its centre uniform within 7.5 cm, is put on
-at U(2, 4) s and taken off at U(7, 9) s. Its mass is asked for when the arm has moved for 2 s since it was put on,
-pauses not counted, or just before it is taken off. The table goes to docs/payload.md.
+`python benchmarks/payload.py [part=PART,...] [make=2] [root=RUNS] [motions=N] [minutes=N] [SEED ...]`, by default
+all parts and development seeds 0-5 of both makes; the judging seeds are 100-109, of make 1, and 200-209, of make 2. A
+twin that was not identified yet is, as m1_0 beneath ROOT/identify, a minute or two; judge_100 is found there too.
+
+- `events`: motions=4 of 12 s, with pauses, each with a payload of U(0.05, 1.5) kg, its centre uniform within 7.5 cm,
+  put on at U(2, 4) s and taken off at U(7, 9) s. Its mass is asked for when the arm has moved for 2 s since it was
+  put on, pauses not counted, or just before it is taken off.
+- `quiet`: minutes=5 of unloaded motion, a multiple of 5, and its alarms. minutes=60 does what is missing of an hour:
+  40 s of a core for 5 minutes of a twin, and a minute for their motions, which all twins share.
+- `warming`: friction falls to 0.75 of what it was, 1 - 0.25 (1 - exp(-t / 60 s)), over 4 minutes after 36 s.
+- `load`: motions=4 with a payload all along, of which the arm itself was told right, half, nothing, or half too much.
+
+Rows go to ROOT/bench/payload_PART.csv, each only once: what is missing is done, by several of these beside each
+other too, if they have other twins. Tables of the twins that were asked for go to docs/payload.md.
 """
 
 import sys
@@ -13,133 +22,179 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROBOT, ROOT, fourier, markdown, record, replace, side_by_side
-
-from r2s.adaptation.kalman import T
-from r2s.adaptation.listen import estimator, listen
-from r2s.arm.twins import twin
-from r2s.identification.parameter_file import load_parameters, load_posterior
-from r2s.physics.payload import FARTHEST_M, payload_of
-from r2s.recordings.readers import read
+from common import MACHINE, ROOT, markdown, side_by_side
+from payload_parts import (
+    FALL,
+    JUDGING,
+    PIECE,
+    SECONDS,
+    TAU_S,
+    WARMS,
+    events,
+    folder,
+    known,
+    load,
+    quiet,
+    warming,
+)
 
 DOCS = ROOT / "docs" / "payload.md"
-SECONDS, LEARN, SOON_S = 12.0, round(2.0 / T), 0.2
+PARTS = {"events": events, "quiet": quiet, "warming": warming, "load": load}
+KEY = ["make", "seed", "piece"]
+PIECE_MIN = round(PIECE * SECONDS / 60)
 
 
-def motion(seed: int):
-    """Return a calm motion."""
-    calm = replace(ROBOT, dq_max=0.6 * ROBOT.dq_max, ddq_max=0.6 * ROBOT.ddq_max)
-    return fourier(calm, duration=SECONDS, seed=1000 + seed)
+def within(rows: pd.DataFrame) -> dict[str, str]:
+    """Return how well masses and centres are told."""
+    heavy, allowed = rows[rows["mass"] > 0.3], np.maximum(0.02, 0.02 * rows["mass"])
+    return {
+        "mass, median error, g": f"{1e3 * rows['mass_error'].median():.0f}",
+        "within 2 % or 20 g": f"{100 * (rows['mass_error'] <= allowed).mean():.0f} %",
+        "centre above 0.3 kg, cm": f"{100 * heavy['centre_error'].median():.1f}",
+        "covered in motion": f"{100 * rows['moving'].mean():.0f} %",
+        "covered at rest": f"{100 * rows['resting'].mean():.0f} %",
+    }
 
 
-def drawn(rng: np.random.Generator) -> dict:
-    """Return a payload."""
-    way = rng.normal(size=3)
-    centre = way / np.linalg.norm(way) * FARTHEST_M * rng.uniform() ** (1 / 3)
-    on, off = rng.uniform(2, 4), rng.uniform(7, 9)
-    return {"mass": float(rng.uniform(0.05, 1.5)), "centre": centre.tolist(), "on_s": float(on), "off_s": float(off)}
+def of_events(rows: pd.DataFrame) -> dict[str, str]:
+    """Return a line of what was put on and taken off."""
+    return within(rows) | {
+        "seen in 0.2 s": f"{rows['seen'].sum()} of {2 * len(rows)}",
+        "other alarms in an hour": f"{rows['false'].mean() * 3600 / SECONDS:.0f}",
+        "µs": f"{rows['us'].median():.0f}",
+    }
 
 
-def one(make: int, seed: int, root: Path, motions: int) -> dict:
-    """Return what came out for one twin: a row per motion, and of unloaded motion."""
-    folder = root / "identify" / f"m{make}_{seed}"
-    space, x = load_parameters(folder, ROBOT)
-    posterior = space, load_posterior(folder, space)
-    unloaded = tuple(read(folder / f"{name}.npz", torque="commanded") for name in ("train", "validation"))
-    rng, rows = np.random.default_rng([make, seed]), []
-    for k in range(motions + 1):
-        ear = estimator(ROBOT, space.dynamics(x), posterior, unloaded)
-        given = drawn(rng) if k else 0.0
-        arm = twin(ROBOT, make=make, seed=seed, payload=given, noise=100 + k)
-        heard = record(arm, motion(k), laden=True)
-        began = time.process_time()
-        known = listen(ROBOT, ear, heard)
-        row = {"us": 1e6 * (time.process_time() - began) / len(heard.t), "alarms": len(ear.changes), "motion": k}
-        if not k:
-            rows.append(row)
-            continue
-        thing = payload_of(given)
-        carries = [e for e in known if thing.on_s <= e.t < thing.off_s]
-        moves = [e for e in carries if not e.rests]
-        at = moves[LEARN] if len(moves) > LEARN else carries[-1]
-        true = [float(thing.mass) * (thing.on_s <= e.t < thing.off_s) for e in known]
-        hit = [abs(e.mass - m) <= e.mass_half for e, m in zip(known, true, strict=True)]
-        settled = [not any(0 <= e.t - s < 0.5 for s in (0.0, thing.on_s, thing.off_s)) for e in known]
-        seen = [any(0 < c - s <= SOON_S for c in ear.changes) for s in (thing.on_s, thing.off_s)]
-        real = sum(any(0 < c - s <= 0.5 for s in (thing.on_s, thing.off_s)) for c in ear.changes)
-        rests = np.array([e.rests for e in known])
-        rows.append(
-            row
-            | {
-                "mass": float(thing.mass),
-                "mass_error": abs(at.mass - float(thing.mass)),
-                "centre_error": float(np.linalg.norm(at.centre - thing.centre)),
-                "seen": sum(seen),
-                "false": len(ear.changes) - real,
-                "moving": np.mean(np.array(hit)[~rests & settled]),
-                "resting": np.mean(np.array(hit)[rests & settled]) if (rests & settled).any() else np.nan,
-            }
-        )
-    return {"make": make, "seed": seed, "rows": pd.DataFrame(rows)}
+def of_quiet(rows: pd.DataFrame) -> dict[str, str]:
+    """Return a line of unloaded motion."""
+    hours = rows["minutes"].sum() / 60
+    return {
+        "minutes": f"{60 * hours:.0f}",
+        "alarms": f"{rows['alarms'].sum()}",
+        "in an hour": f"{rows['alarms'].sum() / hours:.1f}",
+    }
 
 
-def told(found: list[dict]) -> pd.DataFrame:
-    """Return a row per twin, and one of all of a make."""
+def of_warming(rows: pd.DataFrame) -> dict[str, str]:
+    """Return a line of friction that warmed up; errors in shares of its change."""
+
+    def percent(values) -> str:
+        return f"{100 * values.median():.0f} % ({100 * values.max():.0f} %)"
+
+    near = rows.loc[~rows["never"], "near_after_s"]
+    return {
+        "cold, of what is believed": f"{100 * rows['cold'].median():.0f} %",
+        "change": f"{100 * rows['change'].median():.0f} %",
+        "error of the change (worst)": percent(rows["error"]),
+        "error itself (worst)": percent(rows["absolute"]),
+        "behind, s (worst)": f"{rows['behind_s'].median():.0f} ({rows['behind_s'].max():.0f})",
+        "within 10 % from, s": f"{near.median():.0f}" if len(near) else "-",
+        "never within 10 %": f"{rows['never'].sum()} of {len(rows)}",
+        "covered (worst)": f"{100 * rows['covered'].mean():.0f} % ({100 * rows['covered'].min():.0f} %)",
+    }
+
+
+def of_load(rows: pd.DataFrame) -> dict[str, str]:
+    """Return a line of what the arm itself was told of."""
+    return within(rows) | {"alarms": f"{rows['changes'].sum()}"}
+
+
+def told(part: str, rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a part: a line per twin and one of each make; of `load` one per make and what was told."""
+    line = {"events": of_events, "quiet": of_quiet, "warming": of_warming, "load": of_load}[part]
     lines = {}
+    for make, own in rows.groupby("make"):
+        if part == "load":
+            for share, of in own.groupby("told", sort=False):
+                lines[f"make {make}, told {share}"] = line(of)
+            continue
+        for seed, of in own.groupby("seed"):
+            lines[f"make {make}, twin {seed}"] = line(of)
+        lines[f"make {make}, all"] = line(own)
+    return pd.DataFrame(lines).T.rename_axis("twin" if part != "load" else "the arm was")
 
-    def line(rows: pd.DataFrame) -> dict:
-        loaded, free = rows[rows["motion"] > 0], rows[rows["motion"] == 0]
-        heavy = loaded[loaded["mass"] > 0.3]
-        allowed = np.maximum(0.02, 0.02 * loaded["mass"])
-        hour = 3600 / SECONDS
-        return {
-            "mass, median error, g": f"{1e3 * loaded['mass_error'].median():.0f}",
-            "within 2 % or 20 g": f"{100 * (loaded['mass_error'] <= allowed).mean():.0f} %",
-            "centre above 0.3 kg, cm": f"{100 * heavy['centre_error'].median():.1f}",
-            "seen in 0.2 s": f"{int(loaded['seen'].sum())} of {2 * len(loaded)}",
-            "false in an hour, unloaded": f"{hour * free['alarms'].mean():.0f}",
-            "false in an hour, loaded": f"{hour * loaded['false'].mean():.0f}",
-            "covered in motion": f"{100 * loaded['moving'].mean():.0f} %",
-            "covered at rest": f"{100 * loaded['resting'].mean():.0f} %",
-            "µs": f"{rows['us'].median():.0f}",
-        }
 
-    for make in sorted({f["make"] for f in found}):
-        own = [f for f in found if f["make"] == make]
-        for f in own:
-            lines[f"make {make}, twin {f['seed']}"] = line(f["rows"])
-        lines[f"make {make}, all"] = line(pd.concat([f["rows"] for f in own]))
-    return pd.DataFrame(lines).T.rename_axis("twin")
+def said(part: str, rows: pd.DataFrame) -> str:
+    """Return what a table is of."""
+    count = rows.groupby(KEY[:2])["piece"].nunique()
+    each = f"{count.min()}" if count.min() == count.max() else f"{count.min()} to {count.max()}"
+    return {
+        "events": f"{each} motions of {SECONDS:g} s with a payload, each twin.",
+        "quiet": f"Unloaded motion; an estimator hears {PIECE_MIN} minutes.",
+        "warming": f"Friction falls by {100 * FALL:g} % with {TAU_S:g} s in {WARMS * SECONDS / 60:g} minutes; "
+        "median and worst of the joints, errors in shares of the change.",
+        "load": f"{each} motions of {SECONDS:g} s of {len(count)} twins, each with all four.",
+    }[part]
+
+
+def write(part: str, rows: pd.DataFrame, command: str) -> None:
+    """Print the table of a part and put it between its markers."""
+    text = f"`{command}` on {MACHINE}. {said(part, rows)}\n\n{markdown(told(part, rows))}\n"
+    print(f"\n{text}")
+    begin, end = f"<!-- table: {part} -->\n", "<!-- end of the table -->\n"
+    before, _, after = DOCS.read_text().partition(begin)
+    DOCS.write_text(before + begin + text + end + after.partition(end)[2])
+
+
+def wanted(words: dict[str, str], seeds: list[int]) -> list[tuple[int, int]]:
+    """Return make and seed of the twins that are asked for.
+
+    A judging seed is of its own make; others are of both, or of make=.
+    """
+    makes = [int(words["make"])] if "make" in words else sorted(JUDGING)
+    twins = []
+    for seed in seeds:
+        own = [m for m, first in JUDGING.items() if first <= seed < first + 100]
+        if seed > 9 and not own:
+            sys.exit(f"error: twin {seed} is not allowed; 0 to 9, 100 to 199 of make 1 and 200 to 299 of make 2 are")
+        if own and "make" in words and own != makes:
+            sys.exit(f"error: twin {seed} is of make {own[0]}; make={makes[0]} is not allowed with it")
+        twins += [(m, seed) for m in own or makes]
+    return sorted(set(twins))
 
 
 def main() -> None:
-    """Identify what is missing, listen to every twin, write the table."""
+    """Identify what is missing, do what is missing, write the tables."""
     words = dict(w.split("=", 1) for w in sys.argv[1:] if "=" in w)
-    root, motions = Path(words.get("root", ROOT / "runs")), int(words.get("motions", 4))
-    makes = [int(words["make"])] if "make" in words else [1, 2]
-    seeds = [int(w) for w in sys.argv[1:] if "=" not in w] or list(range(6))
-    jobs = [
-        ["stage=identify", "arm=twin", f"arm.make={m}", f"arm.seed={s}", f"root={root}", f"name=m{m}_{s}"]
-        for m in makes
-        for s in seeds
-        if not (root / "identify" / f"m{m}_{s}" / "posterior.npz").is_file()
-    ]
-    side_by_side(jobs)
-    found = []
-    for make in makes:
-        for seed in seeds:
-            found.append(one(make, seed, root, motions))
-            print(told(found[-1:]).iloc[0].to_string(), flush=True)
-            print(found[-1]["rows"].round(4).to_string(), flush=True)
-    text = markdown(told(found))
-    print(text)
-    begin, end = "<!-- table -->\n", "<!-- end of the table -->\n"
-    before, _, after = DOCS.read_text().partition(begin)
-    command = f"`python benchmarks/payload.py {' '.join(sys.argv[1:])}`".replace(f"root={root} ", "")
-    table = (
-        f"{command} on {MACHINE}; {motions} motions of {SECONDS:g} s with a payload and one without, each twin.\n\n"
+    parts = words.get("part", ",".join(PARTS)).split(",")
+    root, motions, minutes = (
+        Path(words.get("root", ROOT / "runs")),
+        int(words.get("motions", 4)),
+        int(words.get("minutes", PIECE_MIN)),
     )
-    DOCS.write_text(before + begin + table + text + "\n" + end + after.partition(end)[2])
+    if minutes % PIECE_MIN:
+        sys.exit(f"error: minutes={minutes} is not allowed; a multiple of {PIECE_MIN} is")
+    pieces = {"events": motions, "quiet": minutes // PIECE_MIN, "warming": 1, "load": motions}
+    twins = wanted(words, [int(w) for w in sys.argv[1:] if "=" not in w] or list(range(6)))
+    side_by_side(
+        ["stage=identify", "arm=twin", f"arm.make={m}", f"arm.seed={s}", f"root={root}", f"name=m{m}_{s}"]
+        for m, s in twins
+        if not (folder(root, m, s) / "posterior.npz").is_file()
+    )
+    command = " ".join(["python benchmarks/payload.py", *(w for w in sys.argv[1:] if not w.startswith("root="))])
+    for part in parts:
+        path = root / "bench" / f"payload_{part}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        there = set(map(tuple, pd.read_csv(path)[KEY].to_numpy())) if path.is_file() else set()
+        # the twins of a piece share its motions, which take longer to plan than to record
+        jobs = [(*t, k) for k in range(pieces[part]) for t in twins if (*t, k) not in there]
+        for i, (make, seed, k) in enumerate(jobs, 1):
+            began = time.process_time()
+            rows = pd.DataFrame(PARTS[part](known(root, make, seed), k))
+            for at, value in enumerate((make, seed, k)):
+                rows.insert(at, KEY[at], value)
+            rows.to_csv(path, mode="a", header=not path.is_file(), index=False)
+            seconds = time.process_time() - began
+            shown = rows.drop(columns=KEY).mean(numeric_only=True).round(3).to_dict()
+            print(
+                f"{part} {i} of {len(jobs)}: make {make}, twin {seed}, {k}: {shown} ({seconds:.0f} s of a core)",
+                flush=True,
+            )
+        rows = pd.read_csv(path)
+        asked = [
+            (m, s, k) in {(*t, k) for t in twins for k in range(pieces[part])} for m, s, k in rows[KEY].to_numpy()
+        ]
+        write(part, rows[asked], command)
 
 
 if __name__ == "__main__":

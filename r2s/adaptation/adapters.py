@@ -53,7 +53,7 @@ class Known:
     @cached_property
     def noise(self) -> Noise:
         """How wrong that may be."""
-        return noise(self.robot, self.arm, self.posterior, self.unloaded)
+        return noise(self.robot, self.dynamics, self.posterior, self.unloaded)
 
 
 def observer(known: Known, filter_s: float) -> Observer:

@@ -1,11 +1,12 @@
 """A recording, listened to as the arm would be while it works: cycle by cycle, nothing ahead."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
-from r2s.adaptation.believed import Believed, believed
+from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.noise import balances, learnt, noise_of, prior_of
@@ -32,17 +33,17 @@ def estimator(
         unloaded: two recordings of commanded torque without a payload, such as the identification's own: they say
             how wrong the model is. Without them it is taken to be a tenth of friction.
     """
-    arm = believed(robot, dynamics)
-    return Estimator(arm, noise(robot, arm, posterior, unloaded))
+    return Estimator(believed(robot, dynamics), noise(robot, dynamics, posterior, unloaded))
 
 
 def noise(
     robot: Robot,
-    arm: Believed,
+    dynamics: Dynamics,
     posterior: tuple[ParameterSpace, np.ndarray] | None,
     unloaded: tuple[Recording, Recording] | None,
 ) -> Noise:
     """Return how wrong what is believed of an arm may be; arguments as of `estimator`."""
+    arm = believed(robot, replace(dynamics, told=np.zeros(4)))  # as it was when it was identified
     prior = prior_of(*posterior) if posterior is not None else None
     if unloaded is None:
         return noise_of(arm, prior)
