@@ -13,6 +13,7 @@ from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimator, body
 from r2s.adaptation.kalman import BODY
 from r2s.adaptation.listen import at_rate, listen, table
+from r2s.adaptation.listen import noise as noise_like
 from r2s.adaptation.momentum import WIDE, momentum
 from r2s.adaptation.noise import balances, learnt, noise_of
 from r2s.errors import UserError
@@ -20,7 +21,7 @@ from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.newton_euler import WORK, equations, links_of
-from r2s.physics.payload import carrying, loaded, payload_of
+from r2s.physics.payload import carrying, loaded, moment, payload_of
 from r2s.physics.rigid_body import LinkInertia
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
@@ -212,6 +213,17 @@ def test_an_interval_is_wide_at_rest_and_narrow_in_motion():
     hidden = min(arm.edge[1], arm.edge[3]) / (lever * 9.81)
     assert moving.mass_half < 0.25 * hidden < 0.5 * hidden < resting.mass_half
     assert abs(resting.mass - 1.0) < resting.mass_half
+
+
+def test_what_an_arm_was_told_of_its_load_says_nothing_of_its_noise():
+    """The recordings of an identification are of an arm that was told of nothing."""
+    free = recording(noise=2e-3)
+    plain, told = (
+        noise_like(robot(), replace(truth(), told=load), None, (free, free))
+        for load in (np.zeros(4), moment(robot(), THING))
+    )
+    for one, other in zip(plain, told, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_what_is_told_is_a_body_that_exists():
