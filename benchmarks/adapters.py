@@ -176,24 +176,25 @@ def made_of(adapter: str, known, network: Path):
     return getattr(made, adapter)(known, **settings)
 
 
-def paired(frame: pd.DataFrame, of: str, root: bool) -> pd.DataFrame:
+def paired(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
     """Return mean and 95 % interval of a measure, a row per condition and a column per adapter.
 
-    Twins are drawn, and of each twin its episodes, the same for all adapters. root: of the mean of squares.
+    Twins are drawn, and of each twin its episodes, the same for all adapters. of_squares: the root
+    of the mean of squares.
     """
     rng, cells = np.random.default_rng(0), {}
     for condition, part in frame.groupby("condition", sort=False):
         wide = part.pivot_table(index=["twin", "episode"], columns="adapter", values=of, sort=False)
         wide = wide.astype(float).dropna()
-        each = [w.to_numpy() ** (2 if root else 1) for _, w in wide.groupby("twin")]
+        each = [w.to_numpy() ** (2 if of_squares else 1) for _, w in wide.groupby("twin")]
         draws = []
         for _ in range(2000):
             twins = [each[i] for i in rng.integers(len(each), size=len(each))]
             draws.append(np.concatenate([t[rng.integers(len(t), size=len(t))] for t in twins]).mean(0))
-        power = 0.5 if root else 1.0
+        power = 0.5 if of_squares else 1.0
         low, high = np.quantile(np.array(draws) ** power, [0.025, 0.975], axis=0)
         middle = np.concatenate(each).mean(0) ** power
-        scale, digits = (1, 2) if root else (100, 0)
+        scale, digits = (1, 2) if of_squares else (100, 0)
         cells[condition] = {
             a: f"{scale * m:.{digits}f} [{scale * x:.{digits}f}, {scale * y:.{digits}f}]"
             for a, m, x, y in zip(wide.columns, middle, low, high, strict=True)
@@ -214,8 +215,8 @@ def told(frame: pd.DataFrame, task: str, root: Path) -> str:
     success = ("within_5mm", "within 5 mm, % of time") if task == "track" else ("reached", "within 1 cm, %")
     wanted = [("rmse", "RMSE, mm", True)] * (task == "track") + [(*success, False), ("gap", "path gap, mm", True)]
     parts = []
-    for of, label, root in wanted:
-        table = paired(frame, of, root)
+    for of, label, of_squares in wanted:
+        table = paired(frame, of, of_squares)
         parts.append(table.rename(columns=lambda a, label=label: f"{label}: {a}"))
     table = pd.concat(parts, axis=1)
     names = frame["adapter"].unique()
