@@ -30,6 +30,7 @@ from r2s.arm import fci
 from r2s.engines.gazebo import RELEASES
 from r2s.physics.robot import load_robot
 from r2s.stages import pipeline
+from r2s.stages.transfer import restless
 
 TOY = ["+experiment=toy"]
 SHORT = [*TOY, "budget.env_steps=1600", "evaluation.env_steps=1600"]  # where nobody looks at the policy
@@ -649,6 +650,15 @@ def stopping(tmp_path):
     (tmp_path / "conf" / "arm").mkdir(parents=True)
     (tmp_path / "conf" / "arm" / "stopping.yaml").write_text("_target_: stopping.Stopping\nname: stopping\n")
     return tmp_path
+
+
+def test_a_policy_that_rests_less_than_predicted_is_told():
+    """Success does not see it; where nothing is predicted, or the task has no such measure, nothing is said."""
+    rows = {"predicted": {"rest": 1.0}, "twin": {"rest": 0.49}}
+    assert "51 % of the episodes on arm=twin" in restless(rows, "twin")
+    assert restless(rows | {"twin": {"rest": 0.98}}, "twin") is None
+    assert restless({"twin": {"rest": 0.49}}, "twin") is None
+    assert restless({"predicted": {}, "twin": {}}, "twin") is None
 
 
 def test_a_stopped_arm_ends_a_transfer_with_3(trained, stopping):

@@ -27,6 +27,7 @@ from r2s.stages.build import (
     set_threads,
 )
 
+RESTLESS = 0.05  # of the episodes: this many more than predicted that do not end at rest are told
 FROM_POLICY = "it comes from the policy's run"
 WHY = {k: FROM_POLICY for k in ("robot", "friction", "inertia", "calibration", "dr", "task", "algo", "reward")}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
@@ -191,6 +192,20 @@ def on_twin(cfg, asked, opens):
     return OnArm(np.arange(len(asked.goals)), done, stops, timing, None)
 
 
+def restless(rows, name):
+    """Return a line where a policy rests less on an arm than was predicted; else None.
+
+    Success and path gap do not see a policy that shakes: the hand hardly moves (docs/transfer.md).
+    """
+    seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
+    if seen is None or expected is None or seen >= expected - RESTLESS:
+        return None
+    return (
+        f"warning: {100 * (1 - seen):.0f} % of the episodes on arm={name} end with a joint that still moves, "
+        f"{100 * (1 - expected):.0f} % were predicted: the policy creeps or shakes there. Look at its torques first"
+    )
+
+
 def transfer(cfg, overrides):
     """Evaluate a trained policy in simulators and on an arm, on the same goals; adapters act on the arm alone."""
     from r2s.learning.batch import ArmBatch
@@ -242,6 +257,8 @@ def transfer(cfg, overrides):
             limits = task.torque(robot)
             pages.transfer(run, robot, episodes, rows, limits, there.timing, there.stops, there.halted)
         reach_table(console(), rows, f"{asked.source.name} on {len(goals)} goals")
+        if warning := restless(rows, name):
+            print(warning)
         if there.halted is not None:
             count = rows[name]["episodes"]
             raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {there.halted}; see {run.folder}")
