@@ -77,7 +77,7 @@ MENDED = """## What was found and mended
 | `--config-dir my_cnf`, which is no folder: three lines, of which none said so | typing | r2s/cli.py |
 | `data.seconds=1` was told once the run folder was there | typing | r2s/stages/identify.py |
 | `r2s export` of no run was told as a wrong `policy` | typing | r2s/commands.py |
-| of two trainings that held one folder, of which a killed tune had left one running, the other's progress was read as how the new one ended: its trial was told as failed (1 of 12 kills) | kills | r2s/stages/tune.py: what a training says goes to a file without a name |"""
+| of two trainings that held one folder, of which a killed tune had left one running, the other's progress was read as how the new one ended: its trial was told as failed. What the one bad kill of 12 showed fits that; it was not seen happening there | reading, tests/test_tune.py | r2s/stages/tune.py: what a training says goes to a file without a name |"""
 
 PINS = """## The pins
 
