@@ -18,7 +18,7 @@ NUMBER = r"\d+(\.\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern; who is not here looks for itself
     **dict.fromkeys(("bench", "gallery"), ()),
-    "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"\d_\d+"),
+    "adapters": (r"(root|task|episodes|policy|adapters|env_steps)=.+", r"\d_\d+"),
     "algorithms": ("trials",),
     "families": (r"\d+",),
     "faults": ("kills", "places", "files", "mutations", "page"),

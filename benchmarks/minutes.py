@@ -32,7 +32,7 @@ What a return of -80 would take, by the development seed 1 with the fourth row o
 a training is watched on (those of the table above are worth 3 to 4 more): the distance costs 37, of which 18 fall
 into the first 0.2 s, eq. (2)'s smoothness 48, of which 16 fall there: every policy has to begin. The rest is speed,
 and that is what the law holds: a policy that pays little for the law rides on 0.66 of the speed limits, which is
-its cap. Tried for 12 minutes each, gamma 0.97 where the table says no other:
+its cap. Tried for 12 minutes, gamma 0.97 where the table says no other; the last two were stopped after 10 and 11:
 
 | settings | return | limited, % of cycles | < 1 cm, % |
 | --- | --- | --- | --- |

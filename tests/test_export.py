@@ -468,15 +468,19 @@ def edited(exported: Exported, to: Path, change: Callable[[dict], object], runti
     return to
 
 
-@pytest.mark.parametrize("kind", MUTATIONS)
-def test_a_contract_that_says_another_thing_is_refused(exported, runtime, tmp_path, kind):
-    """In one line, also where somebody sealed it anew."""
-    change, words = MUTATIONS[kind]
-    folder = edited(exported, tmp_path / "b", change, runtime)
+def refuses(exported, runtime, to, change, words):
+    """Hold that a bundle with a changed contract, sealed anew, is refused in one line with these words."""
+    folder = edited(exported, to, change, runtime)
     with pytest.raises(runtime.BundleError) as refused:
         runtime.Runtime(folder, runtime.Arm(**arm_of(exported)))
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_a_contract_that_says_another_thing_is_refused(exported, runtime, tmp_path, kind):
+    """In one line, also where somebody sealed it anew."""
+    refuses(exported, runtime, tmp_path / "b", *MUTATIONS[kind])
 
 
 def test_a_number_of_the_law_that_was_changed_is_refused(exported, runtime, tmp_path):
