@@ -32,7 +32,8 @@ def draw(panda):
 @pytest.fixture(scope="module")
 def task():
     settings = conf("task/reach")
-    return ReachTask(**(settings | {"reach": tuple(settings["reach"])}))
+    exact = {"reach": tuple(settings["reach"]), "speed_noise": 0.0}  # noise: tests/test_speed_noise.py
+    return ReachTask(**(settings | exact))
 
 
 @pytest.fixture

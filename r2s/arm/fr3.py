@@ -14,13 +14,15 @@ from r2s.arm.franka import CAUTIOUS, Collision, Franka, connect, package, words
 from r2s.arm.interface import ArmStopped
 from r2s.physics.robot import Robot
 
+STOPS_IN = 0.02  # rad, of a joint that is brought to rest from 0.2 rad/s, which is what is allowed there
+
 
 def within_fr3(robot: Robot) -> Robot:
     """Return a robot that stays within an FR3's limits as well as its own, and slows down before them as an FR3 does.
 
-    An FR3 allows no speed in the last hundredths of a radian: they are cut off.
+    An FR3 allows no speed in the last hundredths of a radian: they are cut off, and what a stop takes before them.
     """
-    still = fci.FR3_VELOCITY_OFFSET**2 / (2 * fci.FR3_DECELERATION)
+    still = fci.FR3_VELOCITY_OFFSET**2 / (2 * fci.FR3_DECELERATION) + STOPS_IN
     return replace(
         robot,
         q_min=np.maximum(robot.q_min, fci.FR3_Q_MIN + still),

@@ -20,7 +20,7 @@ NONE = np.zeros(1, dtype=bool)  # has stopped
 class EngineArms:
     """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.episode.rollout`.
 
-    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`.
+    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`, and a stream of its sensors' noise.
 
     Args:
         make: the engine of an arm with given dynamics.
@@ -51,6 +51,7 @@ class EngineArms:
         self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics)
         self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque, dynamics.level)
         self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
+        self._sigma, self._rng = dynamics.speed_noise, np.random.default_rng(first)
         self._actuation.reset()
         self._limited = 0
         self._command = np.zeros(self.robot.n)
@@ -77,4 +78,5 @@ class EngineArms:
         ee, jacobian = self._kinematics(q)
         tau, effort, t = self._command[None], self._actuation.last, np.array([self._steps * self._period])
         limited = np.array([(self._guard.changed - self._limited) / self._substeps])
-        return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited)
+        noise = self._sigma * self._rng.standard_normal((1, self.robot.n))
+        return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited, noise=noise)

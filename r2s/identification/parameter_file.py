@@ -79,9 +79,10 @@ def save_parameters(
 
 
 MOST_NM, FARTHEST_M = 1e4, 10.0  # of friction and offsets; of a link's centre from its joint
+MOST_NOISE = 1.0  # rad/s
 FIXED = ("phi", "offset", "inertia")
 # files of before may lack them: then they are the robot's, or 0
-LATER = ("mass", "com", "armature", "load", "drag", "gain")
+LATER = ("mass", "com", "armature", "load", "drag", "gain", "speed_noise")
 
 
 def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
@@ -148,7 +149,9 @@ def _check_physical(d: Dynamics) -> None:
     edges = (d.breakaway[..., 0] > 0) | (d.breakaway[..., 1] < 0)
     no_body = (d.mass <= 0) | (np.linalg.eigvalsh(d.inertia)[..., 0] <= 0) | (np.abs(d.com).max(-1) > FARTHEST_M)
     beyond = (np.abs(d.offset) > MOST_NM) | (np.abs(d.friction(fast)) > MOST_NM) | (np.abs(d.gain) >= 1)
+    noisy = (d.speed_noise < 0) | (d.speed_noise > MOST_NOISE)
     reasons = {"friction or a rotor that gives energy": gives, "edges of breakaway on one side": edges}
+    reasons |= {f"a noise of its speed outside [0, {MOST_NOISE:g}] rad/s": noisy}
     reasons |= {"a link that no body can be": no_body, "an offset, friction or a gain beyond any arm": beyond}
     for reason, joints in reasons.items():
         if joints.any():

@@ -6,6 +6,7 @@ r2s/learning/batch.py -> observation, reward terms, truncation. Episodes never t
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,10 +54,10 @@ class TaskEnv(EnvBase):
     ):
         super().__init__(device=None, batch_size=[nsim])
         self.robot, self.task, self.draw, self.nsim = robot, task, draw, nsim
-        own, of_goals = np.random.SeedSequence(seed).spawn(2)
+        own, of_goals, of_noise = np.random.SeedSequence(seed).spawn(3)
         self.rng = np.random.default_rng(own)
-        first = draw(self.rng, nsim)
-        self.arms = ArmBatch(robot, task, first, nsim, nthread)
+        first = self._drawn(nsim)
+        self.arms = ArmBatch(robot, task, first, nsim, nthread, seed=of_noise)
         self._tell(first)
         self.weights = task.paper_weights
         self._torque = task.torque(robot)
@@ -96,7 +97,7 @@ class TaskEnv(EnvBase):
 
     def _restart(self, ids: np.ndarray) -> State:
         """Draw arms, starts and goals for `ids`; return the state of all arms."""
-        drawn = self.draw(self.rng, len(ids))
+        drawn = self._drawn(len(ids))
         self.arms.set_dynamics(drawn, ids)
         self._tell(drawn, ids)
         q = self.task.starts(self.robot, self.rng, len(ids))
@@ -106,6 +107,11 @@ class TaskEnv(EnvBase):
             self._count[ids] = ids * GROUPS // self.nsim * self.task.steps // GROUPS
             self._stagger = False
         return state
+
+    def _drawn(self, m: int) -> Dynamics:
+        """Return the dynamics of m arms, whose sensors are at least as noisy as the task wants them."""
+        drawn = self.draw(self.rng, m)
+        return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, self.task.speed_noise))
 
     def _tell(self, drawn: Dynamics, ids: np.ndarray | None = None) -> None:
         """Tell policies of the arms `ids` what is to be told of their dynamics, if anything is."""
@@ -159,7 +165,7 @@ class TaskEnv(EnvBase):
         action = tensordict["action"].numpy().astype(np.float64)
         if isinstance(self.draw, Pushes):
             self.arms.push(self.draw.forces(self.rng, self.nsim))
-        state = self.arms.step(self.task.target(action, self._now, self.goal, self._torque))
+        state = self.arms.step(self.task.target(action, self._now.seen(), self.goal, self._torque))
         self._now = state
         self._count += 1
         ddq = (state.dq - self._dq) * self.task.ctrl_hz
@@ -184,3 +190,4 @@ class TaskEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self.rng = np.random.default_rng(seed)
+        self.arms.seed(np.random.SeedSequence(seed).spawn(3)[2])

@@ -31,6 +31,8 @@ class Dynamics:
         drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's.
         gain: (..., n), relative error of the link-side torque sensor, or of the motor's torque constant: of what is
             recorded, not of the arm.
+        speed_noise: (..., n) rad/s, standard deviation of what sensors add to a speed: of what a policy is shown, not
+            of the arm.
         family: of the friction.
         hold: which torque the edges are of. "command" is the paper's eq. (6): command and offset are nullified while
             they are within the edges. "net" is stiction: a joint stays where it is while all that acts on it, the
@@ -52,6 +54,7 @@ class Dynamics:
     load: np.ndarray
     drag: np.ndarray
     gain: np.ndarray
+    speed_noise: np.ndarray
     family: Family = SIGMOID
     hold: str = "command"
     delay: np.ndarray | float = 0.0
@@ -80,6 +83,7 @@ class Dynamics:
             load=np.zeros(n),
             drag=np.zeros((n, 2)),
             gain=np.zeros(n),
+            speed_noise=np.zeros(n),
             family=family,
         )
 
@@ -101,7 +105,7 @@ class Dynamics:
 
 # of an array that one arm has
 AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "armature": 1}
-AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "told": 1}
+AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "speed_noise": 1, "told": 1}
 
 
 def nominal_dynamics(

@@ -1,7 +1,7 @@
 """stage=identify: recording -> parameters.yaml, errors on training and validation motion, figures."""
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -320,6 +320,7 @@ def identify(cfg, overrides):
     from r2s.identification.prediction import prediction_errors
     from r2s.physics.description import write_description
     from r2s.progress import Progress
+    from r2s.recordings.speed_noise import speed_noise
     from r2s.reporting import pages
     from r2s.reporting.identification_tables import identification_table
 
@@ -329,6 +330,7 @@ def identify(cfg, overrides):
     with open_run(cfg, overrides, made.inputs) as run:
         if cfg.data.kind != "recording":
             train, validation, ramps = recorded(cfg, robot, run, made.motion)
+        nominal = replace(nominal, speed_noise=speed_noise([train, validation]))
         settings = make_settings(cfg, train.torque)
         progress = Progress("identify")
 

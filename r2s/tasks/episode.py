@@ -95,7 +95,7 @@ def rollout(
         over = np.zeros(width, dtype=bool)  # it has touched something
         for k in range(task.steps):
             if not (state.stopped | over).all():
-                state = arms.step(task.target(ask(state, goals[now]), state, goals[now], torque))
+                state = arms.step(task.target(ask(state, goals[now]), state.seen(), goals[now], torque))
             if over.any():
                 state = _kept(state, over, q[now, k - 1], dq[now, k - 1], ee[now, k - 1], tau[now, k - 1])
             ddq = (state.dq - before) * task.ctrl_hz

@@ -36,6 +36,8 @@ class ReachTask(Usual):
         reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
             MIDDLE of what the arm reaches.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
+        speed_noise: rad/s, see `Task`. A policy that has to bear it does not answer every tremor with torque; gears
+            that swing, which no rigid model has, then find nothing to swing with (docs/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -46,6 +48,7 @@ class ReachTask(Usual):
     reach: tuple[float, float] | None = (0.3, 0.75)
     height: float = 0.1
     azimuth: float = 1.57
+    speed_noise: float = 0.05
 
     def __post_init__(self):
         cycles = round(1 / SIM_DT)
@@ -54,6 +57,7 @@ class ReachTask(Usual):
         check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, 600]")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.start_spread", self.start_spread, "[0, inf)")
+        check_number("task.speed_noise", self.speed_noise, "[0, 1]")
 
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm that an action of 1 asks for."""

@@ -5,7 +5,7 @@ and what that is worth.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +25,8 @@ class State:
         stopped: (m,), whether the arm has ended its motion.
         limited: (m,), in which share of the last control period the driver's law changed what was asked for.
         told: (m, c), what a policy is told of its arm (r2s/adaptation/telling.py); None: nothing.
+        noise: (m, n) rad/s, what sensors would add to dq where that is the truth; None: dq is what they say, or they
+            are exact.
     """
 
     t: np.ndarray
@@ -37,6 +39,11 @@ class State:
     stopped: np.ndarray
     limited: np.ndarray
     told: np.ndarray | None = None
+    noise: np.ndarray | None = None
+
+    def seen(self) -> "State":
+        """Return the state as sensors say it, which is all that a policy or a controller has."""
+        return self if self.noise is None else replace(self, dq=self.dq + self.noise, noise=None)
 
     @staticmethod
     def still(robot: Robot) -> "State":
@@ -102,6 +109,7 @@ class Task(Protocol):
         observed: what is in an observation, in words and units, for whoever deploys the policy.
         paper_weights: (k,), of the reward terms in `Episodes.reward`.
         share: of `torque`, what an action of 1 changes a target by. pool: how many goals a training draws from.
+        speed_noise: rad/s, how noisy the speeds are at least that a training shows, whatever the arm's sensors do.
     """
 
     @property
@@ -121,6 +129,8 @@ class Task(Protocol):
     def share(self) -> float: ...  # noqa: D102
     @property
     def pool(self) -> int: ...  # noqa: D102
+    @property
+    def speed_noise(self) -> float: ...  # noqa: D102
 
     def torque(self, robot: Robot) -> np.ndarray:
         """Return (n,) Nm, the most that a target asks for."""
@@ -184,7 +194,7 @@ class Task(Protocol):
 
 def observed(task: Task, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return what a policy is shown (m, d) float32: the task's observations, and then what is told of the arm."""
-    own = task.observe(state, goals, torque)
+    own = task.observe(state.seen(), goals, torque)
     return own if state.told is None else np.concatenate([own, state.told], axis=1, dtype=np.float32)
 
 
@@ -195,6 +205,7 @@ class Usual:
     episode_s: float
     share = 1.0
     pool = 2048
+    speed_noise = 0.0
 
     @property
     def steps(self) -> int:

@@ -1,0 +1,98 @@
+"""The noise of an arm's speeds is identified, and shown to policies in simulation as on the arm."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import conf
+
+from r2s.learning.batch import ArmBatch
+from r2s.learning.env import TaskEnv
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.robot import load_robot
+from r2s.recordings.recording import Recording
+from r2s.recordings.speed_noise import speed_noise
+from r2s.tasks.episode import rollout
+from r2s.tasks.reach import ReachTask
+
+PANDA = load_robot(**conf("robot/panda"))
+NEW = nominal_dynamics(PANDA, **conf("friction/paper"))
+SETTINGS = {k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()}
+TASK = ReachTask(**SETTINGS | {"speed_noise": 0.0})
+ENCODER = 1e-5  # rad
+
+
+def swinging(noise, step=1e-3, seconds=20.0):
+    """Return a recording of joints that swing at 0.3 to 0.9 Hz, whose speeds are as noisy as noise (n,) rad/s says."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, seconds, step)
+    n = len(noise)
+    w, size = 2 * np.pi * rng.uniform(0.3, 0.9, (3, n)), rng.uniform(0.1, 0.3, (3, n))
+    q = sum(size[k] * np.sin(w[k] * t[:, None]) for k in range(3)) + ENCODER * rng.normal(size=(len(t), n))
+    dq = sum(size[k] * w[k] * np.cos(w[k] * t[:, None]) for k in range(3)) + noise * rng.normal(size=(len(t), n))
+    return Recording(t, q, dq, np.zeros_like(q), "commanded")
+
+
+def test_what_was_added_to_the_speeds_is_found():
+    """White noise of 1 to 30 mrad/s. A tenth of 20,000 rows: the median of 40 pieces of 50 is within 7 %, at 3 sigma.
+
+    (One piece's mean square has a deviation of sqrt(2 / 50), a median 1.25 times that of a mean, a root half of it:
+    1.25 sqrt(2 / 50 / 40) / 2 = 2 %, less 0.7 % for the median of chi squared.) The angles' own noise adds up to 2 %.
+    """
+    noise = np.array([1e-3, 2e-3, 4e-3, 1e-2, 3e-2])
+    np.testing.assert_allclose(speed_noise([swinging(noise)]), noise, rtol=0.09)
+
+
+def test_two_recordings_are_one():
+    """Half of the rows in each of two say as much as all in one."""
+    whole = swinging(np.full(3, 2e-3))
+    half = len(whole.t) // 2
+    halves = slice(0, half), slice(half, None)
+    parts = [Recording(*(getattr(whole, f)[s] for f in ("t", "q", "dq", "tau")), "commanded") for s in halves]
+    np.testing.assert_allclose(speed_noise(parts), speed_noise([whole]), rtol=0.05)
+
+
+def test_a_coarse_recording_says_nothing():
+    """At 100 Hz five angles are no cubic's worth."""
+    assert not speed_noise([swinging(np.full(3, 2e-3), step=0.01)]).any()
+
+
+class Listens:
+    """A policy that does nothing and keeps what it was shown."""
+
+    def __init__(self):
+        self.shown = []
+
+    def action(self, observation):
+        """Return nothing to do."""
+        self.shown.append(observation.numpy().copy())
+        return torch.zeros(len(observation), PANDA.n)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_policy_is_shown_noise_and_judged_without(noise):
+    """Arms at rest that nothing asks to move: speeds shown are white noise of that size, episodes rest, return is 0."""
+    arms = ArmBatch(PANDA, TASK, replace(NEW, speed_noise=np.full(PANDA.n, noise)), 3, 1)
+    starts = np.tile(PANDA.q_home, (3, 1))
+    policy, again = Listens(), Listens()
+    done = rollout(policy, arms, TASK, starts, TASK.goals(PANDA, np.random.default_rng(0), 3))
+    rollout(again, arms, TASK, starts, TASK.goals(PANDA, np.random.default_rng(0), 3))
+    everything = np.array(policy.shown[1:])  # the first is asked for to compile
+    np.testing.assert_array_equal(np.array(again.shown[1:]), everything)  # noise begins anew
+    shown = everything[..., PANDA.n : 2 * PANDA.n]
+    assert not done.dq.any()
+    count = shown.size
+    assert shown.std() == pytest.approx(noise, rel=5 / np.sqrt(2 * count))
+    assert abs(shown.mean()) <= 5 * noise / np.sqrt(count)
+
+
+def test_a_training_shows_at_least_the_tasks_noise():
+    """Of an arm with less noise the task's, of one with more its own; the reward is of the true motion."""
+    for own, asked in ((0.001, 0.05), (0.1, 0.05)):
+        task = replace(TASK, speed_noise=asked)
+        env = TaskEnv(PANDA, task, lambda rng, m, own=own: replace(NEW, speed_noise=np.full(7, own)), 200, nthread=1)
+        observation = env.reset()["observation"].numpy()
+        shown = observation[:, PANDA.n : 2 * PANDA.n]
+        assert shown.std() == pytest.approx(max(own, asked), rel=5 / np.sqrt(2 * shown.size))
+        step = env.step(env.reset().set("action", torch.zeros(200, PANDA.n)))["next"]
+        assert not step["reward_terms"][:, 1].any()
