@@ -24,7 +24,7 @@ ENCODER = 1e-5  # rad
 
 
 def swinging(noise, step=1e-3, seconds=20.0):
-    """Return a recording of joints that swing at 0.3 to 0.9 Hz, whose speeds are as noisy as noise (n,) rad/s says."""
+    """Return a recording of joints that swing at 0.3 to 0.9 Hz; noise (n,) rad/s is that of their speeds."""
     rng, t = np.random.default_rng(0), np.arange(0.0, seconds, step)
     n = len(noise)
     w, size = 2 * np.pi * rng.uniform(0.3, 0.9, (3, n)), rng.uniform(0.1, 0.3, (3, n))
@@ -71,7 +71,7 @@ class Listens:
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_policy_is_shown_noise_and_judged_without(noise):
-    """Arms at rest that nothing asks to move: speeds shown are white noise of that size, episodes rest, return is 0."""
+    """Arms at rest that nothing asks to move: speeds shown are white noise, episodes rest."""
     arms = ArmBatch(PANDA, TASK, replace(NEW, speed_noise=np.full(PANDA.n, noise)), 3, 1)
     starts = np.tile(PANDA.q_home, (3, 1))
     policy, again = Listens(), Listens()

@@ -34,8 +34,8 @@ NOTHING = 0.82  # of the velocity limits, where no torque of the policy is left;
 # a joint's range. In Q_FADES of it, from there on, the torque of the policy fades.
 Q_ALLOWED, Q_FADES = 0.1, 0.6
 SLOWER = 0.55  # of the speed that an FR3 allows near its position limits
-# s, in which the allowed speeds come down to nothing when an arm is brought to rest. In 0.1 s the base's torque grew to
-# 60 Nm, and came off, a Nm a ms, too late: it threw a stretched elbow forward (docs/safety.md).
+# s, in which the allowed speeds come down to nothing when an arm is brought to rest. In 0.1 s the base's torque grew
+# to 60 Nm, and came off, a Nm a ms, too late: it threw a stretched elbow forward (docs/safety.md).
 BRAKE_S = 0.15
 
 # Columns of a matrix of limits (n, COLUMNS), one row for each joint.

@@ -18,7 +18,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
 
     The true speed is the slope of a cubic through the angles (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
     It is right where the arm hardly accelerates, and there a speed that a filter has made late is right, too. So only
-    the calmest tenth of all pieces of 50 ms counts, calm by the angles: dq itself does not choose. Of those the median.
+    the calmest tenth of all pieces of 50 ms counts, calm by the angles: dq itself does not choose. Theirs is the
+    median.
     """
     found: list[tuple[np.ndarray, np.ndarray]] = []
     joints = recordings[0].n_joints
