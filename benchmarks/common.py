@@ -27,7 +27,7 @@ WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern;
     "least_squares": (NUMBER,),
     "payload": (PARTS, r"root=.+", r"make=[12]", r"(motions|minutes)=[1-9]\d*", r"\d+"),
     "searches": (NUMBER,),
-    "transfer": ("page", "twins", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
+    "transfer": ("page", "twins", "noise", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
     "twins": (r"make=[12]", r"\d+"),
 }
 
