@@ -130,6 +130,26 @@ def test_nor_those_of_an_fr3(least):
     assert not reflexes
 
 
+def test_a_stop_does_not_throw_a_stretched_elbow():
+    """At full speed with the elbow near its end: torque comes off by the rate limit, late; no joint may be the faster.
+
+    With allowed speeds that fell to nothing in 0.1 s joint 4 went from 0.4 to 1.3 rad/s, beyond what an FR3 allows.
+    """
+    dynamics = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    sim, motors = Simulator(PANDA, dynamics, 1, 1), Motors(1, 7, 4e-3, 1e-3)
+    driver = Drivers(within_fr3(PANDA), TORQUE, 1, friction=LEVEL, cutoff_hz=TASK.cutoff_hz)
+    dq = np.array([1.38, 0.52, 1.21, 0.72, 0.06, -0.07, 0.29])
+    sim.reset(np.array([[-0.62, 1.51, -1.5, -0.55, 2.82, 2.26, -0.76]]), dq[None])
+    tau, fastest = np.array([[1.3, -3.2, -0.2, 0.4, 0.2, 0.3, 0.1]]), np.zeros(7)
+    for _ in range(1000):
+        tau = driver(sim.q.copy(), sim.dq.copy(), tau, np.full((1, 7), np.nan))
+        sim.rollout(motors(tau[:, None]), record=())
+        fastest = np.maximum(fastest, np.abs(sim.dq[0]))
+        assert FR3Reflexes(PANDA).inside(sim.q, sim.dq).all()
+    assert driver.done.all()
+    assert fastest[3] < 1.1 * dq[3]
+
+
 def state_of(q, dq, tau):
     return ArmState(t=0.0, q=q, dq=dq, tau_J=tau, tau_J_d=tau)
 
