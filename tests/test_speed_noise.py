@@ -1,11 +1,12 @@
 """The noise of an arm's speeds is identified, and shown to policies in simulation as on the arm."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from conftest import conf
+from conftest import ROOT, conf
 
 from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
@@ -55,6 +56,18 @@ def test_two_recordings_are_one():
 def test_a_coarse_recording_says_nothing():
     """At 100 Hz five angles are no cubic's worth."""
     assert not speed_noise([swinging(np.full(3, 2e-3), step=0.01)]).any()
+
+
+@pytest.mark.parametrize("name", ["coulomb", "lugre", "paper", "sigmoid", "stribeck"])
+def test_the_sensors_of_independent_arms_are_told(name):
+    """Another simulator's recordings, in free motion: white, as its truth says."""
+    folder = ROOT.parent / "shared" / "data" / "independent_arms" / name
+    if not folder.is_dir():
+        pytest.skip("the independent arms are not part of the project")
+    data = np.load(folder / "train.npz")
+    recording = Recording(*(data[k] for k in ("t", "q", "dq")), np.zeros_like(data["q"]), "commanded")
+    truth = np.array(json.loads((folder / "truth.json").read_text())["noise"]["sd"]["dq"])
+    np.testing.assert_allclose(speed_noise([recording]), truth, rtol=0.09)
 
 
 class Listens:

@@ -26,6 +26,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     for recording in recordings:
         for rows in recording.stretches:
             t, q, dq = recording.t[rows], recording.q[rows], recording.dq[rows]
+            if len(t) < FEWEST:
+                continue
             step = (t[-1] - t[0]) / (len(t) - 1)
             half, piece = round(HALF_S / step), round(PIECE_S / step)
             if 2 * half < FEWEST or len(t) < 2 * half + 1 + piece or np.ptp(np.diff(t)) > 0.5 * step:
