@@ -131,7 +131,7 @@ def test_nor_those_of_an_fr3(least):
 
 
 def test_a_stop_does_not_throw_a_stretched_elbow():
-    """At full speed with the elbow near its end: torque comes off by the rate limit, late; no joint may be the faster.
+    """At full speed with the elbow near its end: torque comes off by the rate limit, late; no joint may be faster.
 
     With allowed speeds that fell to nothing in 0.1 s joint 4 went from 0.4 to 1.3 rad/s, beyond what an FR3 allows.
     """
