@@ -387,9 +387,9 @@ Trained without noise a policy may shake on make 2: its actions change sign at e
 the hand hardly moves. What makes it shake are the gears: with gears four times as stiff the same policy shakes less,
 and without the sensors' noise it shakes as before. A motor behind an elastic gear is at 25 Hz as light as its rotor.
 A rigid model, in which friction holds a joint exactly, does not punish a policy that answers every tremor with
-torque; noise does. `task.speed_noise` (conf/task/reach.yaml) is the least that a training shows. What the arm's own
-sensors do is identified (r2s/recordings/speed_noise.py), and is in predictions. {NOISES[-2]:g} rad/s is also what
-counts as rest; twice that is too much to learn with."""
+torque; noise does. So each arm of a training for an identified arm shows speeds with a noise of its own, up to
+`task.speed_noise` (conf/task/reach.yaml), 0.05 rad/s by default, which is also what counts as rest. What the arm's
+own sensors do is identified (r2s/recordings/speed_noise.py), and is in predictions."""
 
 
 def main() -> None:

@@ -109,9 +109,12 @@ class TaskEnv(EnvBase):
         return state
 
     def _drawn(self, m: int) -> Dynamics:
-        """Return the dynamics of m arms, whose sensors are at least as noisy as the task wants them."""
+        """Return the dynamics of m arms, each with sensors at least as noisy as a draw of the task's noise."""
         drawn = self.draw(self.rng, m)
-        return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, self.task.speed_noise))
+        if not self.task.speed_noise:
+            return drawn
+        noise = self.task.speed_noise * self.rng.uniform(size=(m, 1))
+        return replace(drawn, speed_noise=np.maximum(drawn.speed_noise, noise))
 
     def _tell(self, drawn: Dynamics, ids: np.ndarray | None = None) -> None:
         """Tell policies of the arms `ids` what is to be told of their dynamics, if anything is."""

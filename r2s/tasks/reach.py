@@ -1,13 +1,14 @@
 """Reach a point and stay there: the region of goals, what a policy observes, its scale, and what a step is worth."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from r2s.compiled import njit
 from r2s.errors import UserError, check_number
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks import rewards
 from r2s.tasks.episode import measures
@@ -19,6 +20,7 @@ FINE_DQ = 0.1  # rad/s: a joint that creeps would hardly be seen, and one that t
 OBSERVED = (  # by `observe`, in words
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
+CALM = 0.05  # rad/s, which is also what counts as rest
 CLOSE_M = 1e-3  # at least this is a distance that others are divided by
 MIDDLE = 0.05, 0.95  # of random postures: between these quantiles of their distances goals lie by default
 POSTURES = 500  # that those are told from
@@ -36,8 +38,9 @@ class ReachTask(Usual):
         reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
             MIDDLE of what the arm reaches.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
-        speed_noise: rad/s, see `Task`. A policy that has to bear it does not answer every tremor with torque; gears
-            that swing, which no rigid model has, then find nothing to swing with (docs/transfer.md).
+        speed_noise: rad/s, see `Task`; None: CALM where the model knows of noise, as that of an identified arm does,
+            else 0. A policy that has to bear it does not answer every tremor with torque; gears that swing, which no
+            rigid model has, then find nothing to swing with (docs/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -48,7 +51,7 @@ class ReachTask(Usual):
     reach: tuple[float, float] | None = (0.3, 0.75)
     height: float = 0.1
     azimuth: float = 1.57
-    speed_noise: float = 0.05
+    speed_noise: float | None = None
 
     def __post_init__(self):
         cycles = round(1 / SIM_DT)
@@ -57,7 +60,14 @@ class ReachTask(Usual):
         check_number("task.episode_s", self.episode_s, f"[{1 / self.ctrl_hz}, 600]")
         check_number("task.cutoff_hz", self.cutoff_hz, "(0, inf)")
         check_number("task.start_spread", self.start_spread, "[0, inf)")
-        check_number("task.speed_noise", self.speed_noise, "[0, 1]")
+        if self.speed_noise is not None:
+            check_number("task.speed_noise", self.speed_noise, "[0, 1]")
+
+    def believing(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
+        """Return the task, with the noise that a training for an arm with these dynamics shows."""
+        if self.speed_noise is not None:
+            return self
+        return replace(self, speed_noise=CALM if np.any(dynamics.speed_noise) else 0.0)
 
     def torque(self, robot: Robot) -> np.ndarray:
         """(n,) Nm that an action of 1 asks for."""

@@ -109,7 +109,8 @@ class Task(Protocol):
         observed: what is in an observation, in words and units, for whoever deploys the policy.
         paper_weights: (k,), of the reward terms in `Episodes.reward`.
         share: of `torque`, what an action of 1 changes a target by. pool: how many goals a training draws from.
-        speed_noise: rad/s, how noisy the speeds are at least that a training shows, whatever the arm's sensors do.
+        speed_noise: rad/s; speeds that a training shows are at least as noisy as U(0, speed_noise), a draw for each
+            arm. None or 0: as the arm's own sensors are.
     """
 
     @property
@@ -130,7 +131,7 @@ class Task(Protocol):
     @property
     def pool(self) -> int: ...  # noqa: D102
     @property
-    def speed_noise(self) -> float: ...  # noqa: D102
+    def speed_noise(self) -> float | None: ...  # noqa: D102
 
     def torque(self, robot: Robot) -> np.ndarray:
         """Return (n,) Nm, the most that a target asks for."""
@@ -205,7 +206,7 @@ class Usual:
     episode_s: float
     share = 1.0
     pool = 2048
-    speed_noise = 0.0
+    speed_noise: float | None = None
 
     @property
     def steps(self) -> int:
