@@ -382,7 +382,7 @@ def driver_table() -> list[str]:
     return [markdown(pd.read_csv(DRIVER).astype(str).set_index("arm"))]
 
 
-NOISE = f"""\
+NOISE = """\
 Trained without noise a policy may shake on make 2: its actions change sign at every step, 25 times a second, while
 the hand hardly moves. What makes it shake are the gears: with gears four times as stiff the same policy shakes less,
 and without the sensors' noise it shakes as before. A motor behind an elastic gear is at 25 Hz as light as its rotor.
