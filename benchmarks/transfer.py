@@ -391,15 +391,16 @@ torque; noise does. So each arm of a training for an identified arm shows speeds
 `task.speed_noise` (conf/task/reach.yaml), 0.05 rad/s by default, which is also what counts as rest. What the arm's
 own sensors do is identified (r2s/recordings/speed_noise.py), and is in predictions.
 
-With 0.05 rad/s for all arms of a training (commit 7ed5627, sixteen of the trainings on 16 cores of another machine) all
-twenty judging twins were run. Make 1 and make 2 had gaps of 0.7 and 2.4 mm, at least 16 and 6 times smaller than
-nominal's; 99.7 and 99.6 % < 1 cm, on no twin under 98.5; 99.3 and 99.7 % at rest; predicted returns within 4 % of the
-twins'; and returns of -99 and -93, about 5 lower than with a draw for each arm. 0.1 rad/s was too much to learn with.
+With 0.05 rad/s for all arms of a training (commit 7ed5627, sixteen of the trainings on 16 cores of another machine)
+all twenty judging twins were run. Make 1 and make 2 had gaps of 0.7 and 2.4 mm, at least 16 and 6 times smaller than
+nominal's; 99.7 and 99.6 % < 1 cm, on no twin under 98.5; 99.3 and 99.7 % at rest; predicted returns within 4 % of
+the twins'; and returns of -99 and -93, about 5 lower than with a draw for each arm. 0.1 rad/s was too much to learn
+with.
 
 The paper's model is trained without, as nothing is known of noise there. Its friction hardly holds a joint that
-creeps: with 0.05 rad/s for all arms two policies of `dr=paper` trembled, at rest in 80 and 86 % of the episodes. With a
-draw for each arm (`task.speed_noise=0.05`) two rested in 98 and 99.5 % and had 97.5 and 99.5 % < 5 mm, and a return of
--113 and -121, 10 and more lower than without."""
+creeps: with 0.05 rad/s for all arms two policies of `dr=paper` trembled, at rest in 80 and 86 % of the episodes. With
+a draw for each arm (`task.speed_noise=0.05`) two rested in 98 and 99.5 % and had 97.5 and 99.5 % < 5 mm, and a return
+of -113 and -121, 10 and more lower than without."""
 
 
 def main() -> None:
