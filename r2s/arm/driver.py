@@ -196,7 +196,7 @@ def drive(
             memory.target[i] = 0.0
             if seen and memory.damped[i] == 1:
                 memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, MOST]).max())
-            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
+            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)  # compiled in: see limits.py
         at = slice(i, i + 1)
         condition(
             memory.target[at], memory.filtered[at], memory.effort[at], memory.cycle[at], 1, factor, fade,

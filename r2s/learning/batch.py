@@ -130,9 +130,10 @@ class ArmBatch:
         """Go back to what `state` returned; the same targets then lead to the same states, bit for bit."""
         for name in ("sim", "actuation"):
             getattr(self, name).set_state(state[name])
-        for name in ("_steps", "_limited", "_sigma", "_noise"):
-            getattr(self, name)[:] = state[name]
-        self._rng.bit_generator.state = state["_rng"]
+        self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
+        if "_rng" in state:  # checkpoints of before sensors had noise lack it
+            self._sigma[:], self._noise[:] = state["_sigma"], state["_noise"]
+            self._rng.bit_generator.state = state["_rng"]
         if "_told" in state:
             self.tell(state["_told"], state["_from"])
 
