@@ -33,6 +33,7 @@ QUICK = [
     "evaluation.env_steps=1600",
     "algo.learning_starts=800",
     "algo.replay_size=5000",
+    "task.speed_noise=0.05",
 ]
 
 
@@ -47,14 +48,15 @@ def dynamics_of(panda, family="sigmoid"):
 
 
 def make_env(panda, family="sigmoid", seed=0):
-    """Return an environment of 4 arms whose friction, delay and lag are drawn anew at every reset."""
+    """Return an environment of 4 arms whose friction, delay, lag and noise are drawn anew at every reset."""
 
     def drawn(rng: np.random.Generator, m: int) -> Dynamics:
         d = Around(panda, dynamics_of(panda, family), **conf("dr/paper"))(rng, m)
         timing = {"delay": rng.uniform(1e-3, 5e-3, m), "lag": rng.uniform(0, 2e-3, m)}
         return Dynamics(**{**vars(d), **timing})
 
-    task = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()}
+    task = ReachTask(**given | {"speed_noise": 0.05})
     return TaskEnv(panda, task, drawn, 4, nthread=1, seed=seed, stagger=True)
 
 
