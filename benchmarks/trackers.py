@@ -2,11 +2,14 @@
 
 `python benchmarks/trackers.py` counts processor time of this process and of those that the trackers start: while
 nothing is logged, and per row. A training logs a row every 1,000 updates, and those are what `UPDATES_PER_S` says.
-`python benchmarks/trackers.py --minutes 3 --pairs 4` trains with and without them in turn and compares the rates;
-for that the machine must be quiet.
+`python benchmarks/trackers.py --minutes 3 --pairs 4` trains with and without them at the same time, on a core each, and
+compares the rates; servers stay on the core of their training.
 """
 
 import argparse
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +17,7 @@ from threading import Semaphore
 
 import pandas as pd
 import psutil
-from common import MACHINE, ROOT, side_by_side
+from common import MACHINE, ROOT
 from hydra import compose, initialize_config_dir
 
 from r2s.reporting.trackers.behind import Trackers
@@ -22,6 +25,14 @@ from r2s.stages.build import open_run
 
 UPDATES_PER_S = 300.0  # more than docs/speed.md has for TQC on two threads: the worse case
 ALL = "tracker=[csv,tensorboard,mlflow,wandb,trackio]"
+# sets the core, and what is started later keeps to it; then runs run.py in this very process
+PINNED = """
+import os, runpy, sys
+os.sched_setaffinity(0, {int(sys.argv[1])})
+sys.argv = sys.argv[2:]
+sys.path.insert(0, os.path.dirname(sys.argv[0]))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
 ROWS, QUIET_S, PACE_S = 200, 20.0, 0.1
 
 
@@ -58,20 +69,36 @@ def counted(root: Path) -> None:
 
 
 def trained(root: Path, minutes: float, pairs: int) -> None:
-    """Print env_steps of trainings with all trackers over those without, one after the other."""
-    ratios = []
+    """Print env_steps of trainings with all trackers over those without: both at once, a core each, then swapped.
+
+    What the machine does beside them falls on both. What one core is slower than the other falls on each in turn: a
+    pair is two of these runs, and its ratio their geometric mean.
+    """
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    if len(cores) < 2:
+        sys.exit("error: trainings with and without trackers need a core each; this process may use one")
+    losses = []
     for k in range(pairs):
-        steps = {}
-        for name, words in sorted({"without": [], "with": [ALL]}.items(), reverse=bool(k % 2)):
-            how = [f"root={root}", f"name={name}_{k}", f"budget.minutes={minutes}", f"seed={k}"]
-            side_by_side([[*how, *words]])
-            curve = pd.read_csv(root / "train" / f"{name}_{k}" / "evaluations.csv")
-            steps[name] = curve["env_steps"].iloc[-1]
-        ratios.append(steps["with"] / steps["without"])
-        print(f"pair {k}: {100 * (1 - ratios[-1]):.2f} % lost", flush=True)
-    print(
-        f"{MACHINE}: median of {pairs} pairs of {minutes:g} min: {100 * (1 - pd.Series(ratios).median()):.2f} % lost"
-    )
+        ratio = 1.0
+        for turn in (0, 1):
+            at_once = {}
+            for name, core in zip(("without", "with"), cores[:: 1 - 2 * turn], strict=True):
+                typed = [f"root={root}", f"name={name}_{k}_{turn}", f"budget.minutes={minutes}", f"seed={k}"]
+                typed += ["threads=1", *([ALL] if name == "with" else [])]
+                at_once[name] = subprocess.Popen(
+                    [sys.executable, "-c", PINNED, str(core), str(ROOT / "run.py"), *typed], cwd=ROOT
+                )
+            if any([training.wait() for training in at_once.values()]):
+                sys.exit("error: a training failed")
+            steps = {
+                name: pd.read_csv(root / "train" / f"{name}_{k}_{turn}" / "evaluations.csv")["env_steps"].iloc[-1]
+                for name in at_once
+            }
+            ratio *= (steps["with"] / steps["without"]) ** 0.5
+        losses.append(100 * (1 - ratio))
+        print(f"pair {k}: {losses[-1]:.2f} % lost", flush=True)
+    mean, apart = pd.Series(losses).mean(), pd.Series(losses).sem()
+    print(f"{MACHINE}: mean of {pairs} pairs of twice {minutes:g} min: {mean:.2f} +- {apart:.2f} % lost")
 
 
 def main() -> None:
