@@ -285,7 +285,8 @@ def lost_worker(root: Path, err: Path, note, reference: dict) -> None:
 
     words = [*words_of("sweep", root, "worker"), "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
     pid = forked(command(words), err)
-    while not (begun := list((root / "train").glob("worker_*/metrics.csv"))):
+    while not (begun := list((root / "train").glob("workers_*/metrics.csv"))):
+        assert not os.waitpid(pid, os.WNOHANG)[0], "the sweep ended before a worker could be killed"
         time.sleep(0.05)
     worker = json.loads((begun[0].parent / "meta.json").read_text())["process"]["pid"]
     assert pid in [p.pid for p in psutil.Process(worker).parents()]

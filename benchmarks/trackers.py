@@ -2,8 +2,8 @@
 
 `python benchmarks/trackers.py` counts processor time of this process and of those that the trackers start: while
 nothing is logged, and per row. A training logs a row every 1,000 updates, and those are what `UPDATES_PER_S` says.
-`python benchmarks/trackers.py --minutes 3 --pairs 4` trains with and without them at the same time, on a core each, and
-compares the rates; servers stay on the core of their training.
+`python benchmarks/trackers.py --minutes 3 --pairs 4` trains with and without them at the same time, on a core each,
+and compares the rates; servers stay on the core of their training.
 """
 
 import argparse

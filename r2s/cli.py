@@ -175,9 +175,14 @@ def _said_in_one_line(word: str, error: Exception, groups: dict[str, list[str]],
 
 def typed_in(folder):
     """Return what the user typed for a run folder."""
+    from r2s.runs import read_meta
+
     words = loaded(folder / "overrides.yaml")
     if any(not isinstance(w, str) for w in words) or isinstance(words, Mapping):
         raise UserError(f"{folder / 'overrides.yaml'} is damaged: it is no list of KEY=VALUE")
+    meta = read_meta(folder)
+    if len(words) != meta.get("typed", len(words)):
+        raise UserError(f"{folder / 'overrides.yaml'} is damaged: {len(words)} words, {meta['typed']} were typed")
     return list(words)
 
 

@@ -6,9 +6,13 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tokenize import TokenError
 
 # what reading an array file raises that is cut off, altered, or another thing
-DAMAGED = (KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+DAMAGED = (
+    KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
+    SyntaxError, TokenError,  # of an array's header, which NumPy reads as Python's words
+)  # fmt: skip
 OWN = "r2s:"  # a path that begins so is one of the package's own files, wherever that is installed
 
 

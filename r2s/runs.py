@@ -86,6 +86,7 @@ class Run:
             "machine": machine(),
             "inputs": {str(p): sha256(p) for p in inputs},
             "parents": [str(p) for p in parents],
+            "typed": len(overrides),  # of overrides.yaml, which is cut off where it has fewer
         }
         if resume:
             self.folder = Path(resume)

@@ -15,7 +15,7 @@ import torch
 from conftest import ROOT
 from packaging.requirements import Requirement
 
-from r2s.cli import check_option
+from r2s.cli import check_option, typed_in
 from r2s.errors import UserError
 from r2s.learning.checkpoint import load_tensors, save_tensors
 from r2s.runs import Run, is_done, load_arrays, read_summary
@@ -130,6 +130,16 @@ def test_a_process_id_that_another_program_has_now_is_no_reason_to_wait(tmp_path
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(UserError, match=r"process 1 of .* is still at it"):
             is_done(run.folder)
+
+
+def test_an_overrides_yaml_that_lacks_a_line_is_damaged(tmp_path):
+    """Cut off between two lines it is a list still, of fewer words than were typed."""
+    with opened(tmp_path, overrides=["seed=1", "algo=td3"]) as run:
+        assert typed_in(run.folder) == ["seed=1", "algo=td3"]
+    path = run.folder / "overrides.yaml"
+    path.write_text(path.read_text().splitlines(keepends=True)[0])
+    with pytest.raises(UserError, match=r"overrides.yaml is damaged: 1 words, 2 were typed"):
+        typed_in(run.folder)
 
 
 @pytest.mark.parametrize("name", ["..", ".", ".hidden", "a/b", "a\0b", "a\nb", "x" * 300])

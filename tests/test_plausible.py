@@ -141,6 +141,18 @@ def test_a_dead_sensor_is_named(panda, recordings):
         check_numbers(panda, over)
 
 
+@pytest.mark.parametrize(("field", "value"), [("dq", 1e308), ("tau", -1e200), ("dq", 60.0)])
+def test_a_row_that_no_arm_has_is_named(panda, recordings, field, value):
+    """A damaged file's: of the larger ones, squares are no numbers any more."""
+    r = recordings["measured"]
+    spoilt = getattr(r, field).copy()
+    spoilt[1573, 4] = value
+    with pytest.raises(UserError) as caught:
+        check_recording(panda, replace(r, **{field: spoilt}))
+    assert f"{field} of joint 5 is {value:.4g} " in str(caught.value)
+    assert "at row 1573" in str(caught.value)
+
+
 @pytest.mark.parametrize("torque", ["measured", "commanded"])
 @pytest.mark.parametrize(
     "case",

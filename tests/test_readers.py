@@ -415,6 +415,20 @@ def test_a_damaged_hdf5_file_is_refused(tmp_path):
         assert message(read, path, torque="measured").startswith(f"{path} cannot be read as h5: ")
 
 
+HEADERS = [(b"(99999,), }", b"(99999,,(}"), (b"'shape'", b"  shape'"), (b"{'descr'", b"{{'descr'")]
+
+
+@pytest.mark.parametrize("change", HEADERS)
+def test_a_damaged_header_in_an_npz_is_refused(tmp_path, change):
+    """NumPy reads it as Python's words, and tells of it as Python does of a program."""
+    path = tmp_path / "log.npz"
+    np.savez(path, t=np.arange(99999.0))  # large: a small one has its checksum looked at first
+    content = path.read_bytes()
+    assert change[0] in content
+    path.write_bytes(content.replace(change[0], change[1].ljust(len(change[0]))[: len(change[0])]))
+    assert message(read, path, torque="measured").startswith(f"{path} cannot be read as npz: ")
+
+
 @pytest.mark.parametrize("key", ["topic", "joints"])
 def test_what_belongs_to_bags_is_not_silently_ignored(tmp_path, key):
     path = tmp_path / "log.csv"

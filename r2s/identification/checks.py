@@ -10,14 +10,16 @@ from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 SPIKE = 5.0  # times the fastest joint and the largest torque: what no sensor's noise reaches
+NONSENSE = 1e9  # times those: no unit is so far off, and squares of more would not be numbers
 JUMP = 0.05  # rad, that q may jump beside, as encoders do
 
 
 def check_recording(robot: Robot, recording: Recording) -> None:
     """Raise UserError if a user's recording does not fit the arm (`check_motion`) or is in other units."""
     check_motion(robot, recording)
+    _check_spikes(robot, recording, NONSENSE)
     check_numbers(robot, recording)
-    _check_spikes(robot, recording)
+    _check_spikes(robot, recording, SPIKE)
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
@@ -33,22 +35,22 @@ def check_motion(robot: Robot, recording: Recording) -> None:
         )
 
 
-def _check_spikes(robot: Robot, recording: Recording) -> None:
-    """Raise UserError where a row has what no row of this arm can have, as a damaged file does."""
+def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
+    """Raise UserError where a row has `most` times what this arm can, as a damaged file does."""
     r = recording
-    speed = SPIKE * robot.dq_max
+    speed = most * robot.dq_max
     jumps = np.zeros_like(r.q)
     for s in r.stretches:
         step = np.abs(np.diff(r.q[s], axis=0)) - JUMP
         jumps[s][1:] = step / (np.diff(r.t[s])[:, None] * speed)
     seen = {"q": (jumps, "rad after a jump"), "dq": (np.abs(r.dq) / speed, "rad/s")}
-    seen["tau"] = np.abs(r.tau) / (SPIKE * robot.tau_max), "Nm"
+    seen["tau"] = np.abs(r.tau) / (most * robot.tau_max), "Nm"
     for field, (share, unit) in seen.items():
         row, j = np.unravel_index(share.argmax(), share.shape)
         if share[row, j] > 1:
             raise UserError(
                 f"the recording: {field} of joint {j + 1} is {getattr(r, field)[row, j]:.4g} {unit} at row {row}, "
-                f"more than {SPIKE:g} times what {robot.name} can: is the file damaged?"
+                f"more than {most:g} times what {robot.name} can: is the file damaged?"
             )
 
 

@@ -3,7 +3,6 @@
 import os
 import re
 import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
+from r2s.files import DAMAGED
 from r2s.recordings.recording import MIN_ROWS, Recording, declared_torque
 from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra
 
@@ -330,7 +330,7 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
         return libfranka_table(_columns(path, suffix))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
-    except (ValueError, OSError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except DAMAGED as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path} cannot be read as {suffix[1:]}: {reason}") from None
 
