@@ -81,6 +81,7 @@ MENDED = """## What was found and mended
 | a recording with a single speed of 1e308 rad/s: `matrix contains invalid numeric entries`, a traceback | mutations | r2s/identification/checks.py: rows that no arm can have, by whatever unit, are told before units are guessed |
 | an .npz whose header lost a bracket: Python's tokenizer's traceback | mutations | r2s/files.py, r2s/recordings/readers.py |
 | an overrides.yaml cut off between two lines was taken | damaged files | r2s/runs.py, r2s/cli.py: meta.json says how many words were typed |
+| `-m hydra/launcher=jobib` said `error: None`; other options of Hydra's own were several lines | typing | r2s/cli.py: they are checked as all others are |
 | this benchmark waited for ever for a worker whose folder had another name | places | benchmarks/faults.py |"""
 
 PINS = """## The pins
@@ -92,7 +93,7 @@ of known faults here; do so before an installation that others can reach."""
 
 NOT = """## How this page came together
 
-All parts of this page are of one script and one day; four mends, the last four rows above, came in between:
+All parts of this page are of one script and one day; five mends, the last rows above, came in between:
 
 - The 40 kills ran first, before them.
 - Of the recordings 3 of 700 were tracebacks, and of the damaged files one was taken. After the mends the places, the

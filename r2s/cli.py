@@ -23,6 +23,7 @@ MOST_THREADS = 4096
 NONE_NEEDED = ("tracker", "experiment")  # groups of which a run may have no option
 GROWS = ("tune.space",)  # what + adds to: an axis that conf/stage/tune.yaml has not
 SEARCHED = "hydra.searchpath"
+EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm"}  # launchers, and the extra that each comes with
 LOST = "the system ended a worker of the sweep, as where memory is short; with only_missing=true it goes on, repeated"
 
 
@@ -49,10 +50,14 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         beside = [p.name for p in Path(config_dir).absolute().parent.glob("*/")]
         raise UserError(f"--config-dir: no folder '{config_dir}'{nearest(Path(config_dir).name, beside)}")
     own = [f"{SEARCHED}=[file://{Path(config_dir).resolve()}]"] if config_dir else []
-    words = [w for w in words if not w.lstrip("+~").startswith(("hydra.", "hydra/"))]  # those are Hydra's own
+    hydras = [w for w in words if w.lstrip("+~").startswith(("hydra.", "hydra/"))]  # Hydra's own
+    words = [w for w in words if w not in hydras]
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("") if g != "hydra"}
+        _check_hydras(
+            hydras, own, {f"hydra/{g}": loader.get_group_options(f"hydra/{g}") for g in loader.list_groups("hydra")}
+        )
         try:
             names, jobs = _jobs(words, own, groups)
             configs = [compose("config", job, return_hydra_config=True) for job in jobs]
@@ -77,6 +82,24 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             if reasons and all(reasons):
                 raise UserError(reasons[0])
     GlobalHydra.instance().clear()
+
+
+def _check_hydras(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
+    """Raise UserError where Hydra would not take one of its own options, which it tells on many lines."""
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    for k, word in enumerate(words):
+        try:
+            compose("config", [*own, *words[: k + 1]], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException) as error:
+            if word.partition("=")[2] in EXTRAS:
+                package = EXTRAS[word.partition("=")[2]]
+                raise UserError(f"{word}: not installed here; pip install 'r2s[{package}]'") from None
+            before = compose("config", [*own, *words[:k]], return_hydra_config=True)
+            known = [*(f"hydra.{key}" for key in _keys(before.hydra)), *groups]
+            raise _said_in_one_line(word, error, groups, known) from None
 
 
 class UnknownOption(Exception):  # noqa: N818 (whose message is made where the options are known)
@@ -153,7 +176,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
     for k in node:
         yield prefix + str(k)
-        if not OmegaConf.is_missing(node, k) and isinstance(node._get_node(k), DictConfig):
+        if not OmegaConf.is_missing(node, k) and isinstance(node._get_node(k), DictConfig) and node[k] is not None:
             yield from _keys(node[k], f"{prefix}{k}.")
 
 

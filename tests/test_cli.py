@@ -422,6 +422,9 @@ MISTAKES = {
     "stage=pipeline dr=identified": r"dr: the nominal training of stage=pipeline has no calibration",
     "algo._target_=nowhere.Mine": r"algo._target_: cannot load 'nowhere.Mine'.*No module named 'nowhere'",
     "+algo.speed=1": r"unknown option 'algo.speed'",
+    "-m seed=0,1 hydra/launcher=jobib": r"hydra/launcher: no option 'jobib'.*did you mean 'joblib'",
+    "-m seed=0,1 hydra/launher=joblib": r"unknown option 'hydra/launher'; did you mean 'hydra/launcher'",
+    "-m seed=0,1 hydra/launcher=joblib hydra.launcher.n_job=2": r"launcher.n_job'.*mean 'hydra.launcher.n_jobs'",
 }
 
 
