@@ -22,7 +22,6 @@ from r2s.arm.driver import ADDED, DEADLINE_S, Driver, Drivers
 from r2s.arm.interface import ArmStopped, Reflexes
 from r2s.arm.live import LiveArm
 from r2s.arm.simulated import SimulatedArm
-from r2s.cli import check_overrides
 from r2s.errors import UserError
 from r2s.learning.history import Lessons, fit
 from r2s.physics.dynamics import nominal_dynamics
@@ -31,6 +30,7 @@ from r2s.physics.robot import SIM_DT, load_robot
 from r2s.stages.adapting import make_adapter
 from r2s.tasks.model_torque import ModelTorque
 from r2s.tasks.reach import ReachTask
+from r2s.typed import check_overrides
 
 THING = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
 PANDA = load_robot(**conf("robot/panda"))

@@ -15,10 +15,11 @@ import torch
 from conftest import ROOT
 from packaging.requirements import Requirement
 
-from r2s.cli import check_option, typed_in
+from r2s.cli import typed_in
 from r2s.errors import UserError
 from r2s.learning.checkpoint import load_tensors, save_tensors
 from r2s.runs import Run, is_done, load_arrays, read_summary
+from r2s.typed import check_option
 
 SOURCES = [*sorted((ROOT / "r2s").rglob("*.py")), *sorted((ROOT / "hydra_plugins").glob("*.py")), ROOT / "run.py"]
 NEVER = {

@@ -16,9 +16,9 @@ ROOMS = [
     *("errors", "files", "progress", "provenance", "runs", "compiled"),
     *("physics", "recordings", "excitation", "identification", "adaptation"),
     *("tasks", "learning", "engines", "arm", "reporting", "export"),
-    *("stages", "commands", "cli", "notebook", "__main__"),
+    *("stages", "commands", "typed", "cli", "notebook", "__main__"),
 ]
-SEES_A_CONFIG = ("stages", "commands", "cli", "__main__")
+SEES_A_CONFIG = ("stages", "commands", "typed", "cli", "__main__")
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))
 MOST_LINES = 400
 FRONT_DOOR_LINES = 120

@@ -22,7 +22,6 @@ from r2s.adaptation.telling import truth as right
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.live import LiveArm
 from r2s.arm.simulated import SimulatedArm
-from r2s.cli import check_overrides
 from r2s.errors import UserError
 from r2s.learning.altered import ERROR_KG, ERROR_SHARE, Altered
 from r2s.learning.env import TaskEnv
@@ -35,6 +34,7 @@ from r2s.stages.train import train
 from r2s.stages.transfer import transfer
 from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
+from r2s.typed import check_overrides
 
 N = PANDA.n
 C = said_count(N)

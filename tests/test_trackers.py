@@ -13,12 +13,12 @@ from conftest import ROOT
 from hydra import compose, initialize_config_dir
 from PIL import Image
 
-from r2s.cli import check_overrides
 from r2s.errors import UserError
 from r2s.reporting.trackers import behind
 from r2s.reporting.trackers.behind import Trackers, finite
 from r2s.reporting.trackers.tracker import Tracked, needs
 from r2s.stages.build import GROUP, open_run
+from r2s.typed import check_overrides
 
 PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow", "wandb": "wandb", "trackio": "trackio"}
 INSTALLED = [name for name, package in PACKAGES.items() if find_spec(package)]

@@ -54,8 +54,7 @@ def card(
         trained.append(NO_SDF)
     rows = {"MuJoCo, as trained, goals on which nothing was chosen": best}
     measured = transfers(source, shown(best).judged[0])
-    for place, row in measured.items():
-        rows[place] = row
+    rows |= measured
     done: list[Item] = [reach_rows({k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})]
     stops = [
         f"{place}: stopped in {row['stops']} of {row['asked']} episodes"
