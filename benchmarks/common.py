@@ -12,7 +12,6 @@ import pandas as pd
 import yaml
 
 ROOT = Path(__file__).parent.parent
-OF_THE_TASK = ("torque_fraction", "reach")  # what a robot's yaml says of tasks
 sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
@@ -56,13 +55,14 @@ check_words()
 sys.excepthook = say
 
 from hydra.utils import instantiate  # noqa: E402
+from omegaconf import OmegaConf  # noqa: E402
 
 from r2s.arm.ramp import poses_about, ramp  # noqa: E402
 from r2s.arm.tracking import record  # noqa: E402
 from r2s.excitation.fourier import fourier  # noqa: E402
 from r2s.identification.settings import Settings  # noqa: E402
 from r2s.physics.dynamics import nominal_dynamics  # noqa: E402
-from r2s.physics.robot import load_robot  # noqa: E402
+from r2s.physics.robot import OF_TASKS, load_robot  # noqa: E402
 from r2s.provenance import cpu  # noqa: E402
 
 
@@ -71,8 +71,8 @@ def conf(path: str) -> dict:
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     if path.startswith("task/"):
         panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
-        document |= {k: panda[k] for k in OF_THE_TASK}
-    beside = {"_target_", *OF_THE_TASK} if path.startswith("robot/") else {"_target_"}
+        document = OmegaConf.to_container(OmegaConf.create({"robot": panda, "task": document}), resolve=True)["task"]
+    beside = {"_target_", "defaults", *(OF_TASKS if path.startswith("robot/") else ())}
     return {k: v for k, v in document.items() if k not in beside}
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
-from r2s.physics.robot import Robot, load_robot
+from r2s.physics.robot import OF_TASKS, Robot, load_robot
 
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
@@ -29,11 +30,10 @@ def conf(path: str) -> dict:
     """Read one file of conf/ as plain YAML: the arguments of what its `_target_` names, for the Panda."""
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     group = path.split("/")[0]
-    of_the_task = ("torque_fraction", "reach")  # a robot's yaml says them
     if group == "task":
         panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
-        document |= {k: panda[k] for k in of_the_task}
-    beside = {"_target_", "defaults", *of_the_task} if group == "robot" else {"_target_"}
+        document = OmegaConf.to_container(OmegaConf.create({"robot": panda, "task": document}), resolve=True)["task"]
+    beside = {"_target_", "defaults", *(OF_TASKS if group == "robot" else ())}
     return {k: v for k, v in document.items() if k not in beside} if isinstance(document, dict) else document
 
 

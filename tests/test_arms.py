@@ -234,9 +234,25 @@ def test_an_arm_of_ours_is_ready_for_every_stage(name):
         low, high = document["reach"]
         goals = ReachTask(reach=(low, high)).goals(robot, np.random.default_rng(0), 30)
         assert len(goals) == 30
-        # an action of 1 at the least lifts what friction of a twin holds
-        assert np.all(np.array(document["torque_fraction"]) * robot.tau_max > 0.6)
+        # an action of 1 at the least lifts what friction of a twin holds, where a joint moves the hand
+        moves = levers(robot) > 0.12
+        assert moves.sum() >= 3
+        assert np.all((np.array(document["torque_fraction"]) * robot.tau_max)[moves] > 0.6)
+        follows = np.array(document.get("tracking_fraction", document["torque_fraction"]))
+        assert np.all(follows * robot.tau_max > 0.6)
     check_limits(robot, fourier(robot, duration=3.0, seed=0, effort=0))
+
+
+def levers(robot):
+    """Return (n,) m/rad, how far each joint moves the hand: RMS over random postures."""
+    model, rng = robot.model(gravity=False), np.random.default_rng(0)
+    data, jacobian, total = mujoco.MjData(model), np.empty((3, robot.n)), np.zeros(robot.n)
+    for _ in range(200):
+        data.qpos[:] = rng.uniform(*robot.q_range)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacSite(model, data, jacobian, None, model.site(robot.ee_site).id)
+        total += (jacobian**2).sum(0) / 200
+    return np.sqrt(total)
 
 
 def test_what_is_shipped_is_found_from_anywhere():

@@ -26,7 +26,7 @@ from conftest import ROOT, conf
 from r2s.arm import fci, franka
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.emulator.control import Control, Fault
-from r2s.arm.emulator.process import Emulator, main
+from r2s.arm.emulator.process import Emulator, _yaml, main
 from r2s.arm.emulator.server import listen
 from r2s.arm.fr3 import FR3
 from r2s.arm.franka import CAUTIOUS, TORQUE_SHARE, Collision
@@ -452,6 +452,10 @@ def test_what_the_emulator_does_not_speak(panda):
         (["--fault", "drop", "soon"], "--fault drop soon: it is KIND CYCLE"),
         (["--fault", "late"], "--fault late: it is KIND CYCLE"),
         (["--robot", "no.yaml"], "--robot no.yaml: No such file"),
+        (
+            ["--robot", f"{ROOT}/conf/robot/fr3.yaml"],
+            f"--robot {ROOT}/conf/robot/fr3.yaml: it goes on from another file",
+        ),
     ],
 )
 def test_by_hand_a_mistake_is_one_line(arguments, line, capsys):
@@ -462,6 +466,13 @@ def test_by_hand_a_mistake_is_one_line(arguments, line, capsys):
     said = capsys.readouterr().err
     assert said.startswith(line)
     assert said.count("\n") == 1
+
+
+def test_the_robots_file_of_a_config_is_one_for_an_emulator(panda):
+    """What it says of tasks is left out."""
+    found = load_robot(**_yaml(ROOT / "conf" / "robot" / "panda.yaml"))
+    assert found.name == panda.name
+    assert np.array_equal(found.q_max, panda.q_max)
 
 
 def test_layout_of_the_wire():

@@ -18,6 +18,7 @@ from r2s.physics.urdf import is_urdf, read_urdf
 PANDA = "r2s:models/panda.xml"
 SIM_DT = 1e-3  # s, the arm's own cycle
 DQ_MAX = 2.0  # rad/s, where nobody says how fast a joint may be
+OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # what conf/robot says beside `load_robot`'s arguments
 
 
 @dataclass(frozen=True)

@@ -136,11 +136,14 @@ def unread(name: str, cfg: Any) -> str | None:
 
 def make_robot(cfg):
     """Return the arm of conf/robot; what a task takes from there is checked with it."""
-    if isinstance(cfg.robot, Mapping) and "torque_fraction" in cfg.robot:
-        share = plain(cfg.robot)["torque_fraction"]
-        for value in share if isinstance(share, list) and share else [share]:
-            check_number("robot.torque_fraction", value, "[1e-6, 1]")
-    return part(cfg.robot, "robot", beside=["torque_fraction", "reach"])
+    from r2s.physics.robot import OF_TASKS
+
+    for key in OF_TASKS:
+        if key.endswith("fraction") and isinstance(cfg.robot, Mapping) and key in cfg.robot:
+            share = plain(cfg.robot)[key]
+            for value in share if isinstance(share, list) and share else [share]:
+                check_number(f"robot.{key}", value, "[1e-6, 1]")
+    return part(cfg.robot, "robot", beside=OF_TASKS)
 
 
 def make_dynamics(cfg, robot):

@@ -26,7 +26,7 @@ from r2s.arm.emulator.control import KINDS, PATIENCE, Control, Fault
 from r2s.arm.emulator.server import Server, check_loopback, listen
 from r2s.arm.interface import Arm
 from r2s.errors import UserError, choices
-from r2s.physics.robot import load_robot
+from r2s.physics.robot import OF_TASKS, load_robot
 
 START_S = 180.0  # for the child to import, compile and build its arm
 
@@ -169,4 +169,8 @@ def _yaml(path: Path | None) -> dict:
         settings = yaml.safe_load(path.read_text())
     except OSError as error:
         raise UserError(f"--robot {path}: {error.strerror}") from None
-    return {k: v for k, v in settings.items() if k not in ("_target_", "torque_fraction")}  # not load_robot's own
+    if "defaults" in settings:
+        raise UserError(
+            f"--robot {path}: it goes on from another file ('defaults'); one that says everything is allowed"
+        )
+    return {k: v for k, v in settings.items() if k not in ("_target_", *OF_TASKS)}
