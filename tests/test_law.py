@@ -21,6 +21,7 @@ from r2s.tasks.reach import ReachTask
 PANDA = load_robot(**conf("robot/panda"))
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 TORQUE = TASK.torque(PANDA)
+FOLLOWS = np.array(conf("task/track")["torque_fraction"]) * PANDA.tau_max  # of a timed path: more of the wrist
 ARM = nominal_dynamics(PANDA, **conf("friction/paper"))
 MODEL = PANDA.model(gravity=False)
 NONE, LEVEL = np.zeros(7), ARM.level
@@ -73,7 +74,7 @@ def test_the_nearest_torque_that_keeps_to_the_bounds():
 def test_friction_is_no_motion():
     """A wrist at half its speed keeps the torque that its friction eats; who does not know of it takes some away."""
     dq, effort = 0.6 * PANDA.dq_max * np.eye(7)[4], 1.3 * np.eye(7)[4]
-    knows, blind = Guard(MODEL, FREE, TORQUE, 2 * LEVEL), Guard(MODEL, FREE, TORQUE, NONE)
+    knows, blind = Guard(MODEL, FREE, FOLLOWS, 2 * LEVEL), Guard(MODEL, FREE, FOLLOWS, NONE)
     np.testing.assert_array_equal(knows(PANDA.q_home, dq, effort, np.zeros(7)), effort)
     assert blind(PANDA.q_home, dq, effort, np.zeros(7))[4] < 0.9 * effort[4]
 
@@ -87,12 +88,31 @@ def test_what_needs_no_help_is_left_alone():
     assert guard.changed == 0
 
 
-def test_an_action_from_rest_is_allowed():
+@pytest.mark.parametrize("torque", [TORQUE, FOLLOWS], ids=["reach", "track"])
+def test_an_action_from_rest_is_allowed(torque):
     """At rest at home a full action of any one joint is not touched: the law leaves a policy what it may ask for."""
-    guard = Guard(MODEL, FREE, TORQUE, 2 * LEVEL)
+    guard = Guard(MODEL, FREE, torque, 2 * LEVEL)
     for j in range(7):
-        effort = (1 - 1e-9) * (TORQUE * np.eye(7)[j])
+        effort = (1 - 1e-9) * (torque * np.eye(7)[j])
         np.testing.assert_array_equal(guard(PANDA.q_home, np.zeros(7), effort, np.zeros(7)), effort)
+
+
+def test_a_limited_rate_keeps_to_the_bounds():
+    """On the way from one command to another no joint accelerates more than with either: rule 2 holds on it too.
+
+    Limited joint by joint, the torques of joints 1 and 3, whose axes are nearly parallel, would come apart by up to a
+    Nm a cycle: 100 rad/s^2 after ten.
+    """
+    free, guard, far = Guard(MODEL, FREE, TORQUE, NONE), Guard(MODEL, PANDA, TORQUE, NONE), 0
+    all_q, all_dq, efforts = some_states(400, 2)
+    for q, dq, one, other in zip(all_q, all_dq, efforts, np.roll(efforts, 1, 0), strict=True):
+        last, wanted = (free(q, dq, x, np.zeros(7)) for x in (one, other))
+        sent = guard(q, dq, other, last)
+        assert np.all(np.abs(sent - last) <= 1e-3 * PANDA.dtau_max + 1e-12)
+        now, before, after = (np.linalg.solve(inertia(guard), x) for x in (sent, last, wanted))
+        assert np.all((now >= np.minimum(before, after) - 1e-6) & (now <= np.maximum(before, after) + 1e-6))
+        far += np.any(np.abs(wanted - last) > 2e-3 * PANDA.dtau_max)
+    assert far > 100
 
 
 def test_it_is_continuous():

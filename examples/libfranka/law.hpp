@@ -161,7 +161,12 @@ class Driver {
     const Joints last = finite(tau_J_d) ? tau_J_d : sent_;
     Joints out{};
     if (seen) out = guard(q, dq);
-    for (int j = 0; j < n; ++j) sent_[j] = stepped(out[j], last[j], j);
+    double part = 1.0;  // of the way from `last`, the same in all joints: what lies on it keeps to the law
+    for (int j = 0; j < n && seen; ++j) {
+      out[j] = std::clamp(out[j], -c::tau_max[j], c::tau_max[j]);
+      part = std::min(part, c::step[j] / std::max(c::step[j], std::abs(out[j] - last[j])));
+    }
+    for (int j = 0; j < n; ++j) sent_[j] = last[j] + std::clamp(part * (out[j] - last[j]), -c::step[j], c::step[j]);
     return sent_;
   }
 

@@ -177,13 +177,16 @@ class Driver:
         self._filtered = self._filtered + c["low_pass"] * (wanted - self._filtered)
         self.effort = self.effort + np.clip(self._clipped(self._filtered) - self.effort, -j["step"], j["step"])
         last = tau_J_d if np.isfinite(tau_J_d).all() else self._sent
-        out = np.zeros_like(self.effort)
         if seen:
             if not placed:
                 self._model.place(q)
             out, changed = self._guard(q, dq)
             self.limited += changed
-        self._sent = last + np.clip(self._clipped(out) - last, -j["step"], j["step"])
+            way = self._clipped(out) - last
+            way *= 1.0 / max(1.0, float((np.abs(way) / j["step"]).max()))
+        else:
+            way = -last
+        self._sent = last + np.clip(way, -j["step"], j["step"])
         return self._sent.copy()
 
     def _clipped(self, tau: np.ndarray) -> np.ndarray:

@@ -42,6 +42,7 @@ class Oracle:
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site(robot.ee_site).id
         self._torque = task.torque(robot)
+        self._stuck = self._torque < dynamics.level
         self._plans: dict[int, tuple[np.ndarray, np.ndarray, float, int]] = {}
 
     @torch.no_grad()
@@ -71,7 +72,10 @@ class Oracle:
         return rigid + self.dynamics.friction(dto) - self.dynamics.offset
 
     def inverse_kinematics(self, start: np.ndarray, goal: np.ndarray, rounds: int = 60) -> np.ndarray:
-        """Return q (n,) within the limits whose end effector is at `goal` (3,) m, near `start`; damped steps."""
+        """Return q (n,) within the limits whose end effector is at `goal` (3,) m, near `start`; damped steps.
+
+        Joints whose friction is more than an action stay where they are.
+        """
         q, jacobian = start.copy(), np.empty((3, self.robot.n))
         low, high = self.robot.q_min + 0.15, self.robot.q_max - 0.15
         for _ in range(rounds):
@@ -79,6 +83,7 @@ class Oracle:
             mujoco.mj_kinematics(self._model, self._data)
             mujoco.mj_comPos(self._model, self._data)
             mujoco.mj_jacSite(self._model, self._data, jacobian, None, self._site)
+            jacobian[:, self._stuck] = 0.0
             error = goal - self._data.site_xpos[self._site]
             if np.linalg.norm(error) < 2e-4:
                 break

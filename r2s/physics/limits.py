@@ -7,7 +7,9 @@ Three rules, on a target that has come through the low-pass (r2s/physics/actuati
    -RATE (v + dq) <= a <= RATE (v - dq), a = M^-1 (tau - Coriolis torque), wider by what friction is believed to eat.
    Of all torques that keep to this the nearest is sent, in the sense of Gauss' principle of least constraint: what
    stops at the joints would add. Friction widens the bounds only: one that is not there must not push.
-3. The sum is clipped to the torque range, and its rate is limited, last, against what the arm applied last.
+3. The sum is clipped to the torque range, and its rate is limited, last: a cycle goes a part of the way from what the
+   arm applied last, the same part in all joints. The torques that keep to rule 2 are a convex set, so what lies on
+   the way keeps to it too. Joint by joint it would not: of two nearly parallel axes the torques must come together.
 
 Rule 2 is a control barrier function in each joint (Ames et al., European Control Conference 2019). It is continuous
 in states and targets, and its gains are what a late arm bears: nothing switches, nothing shakes.
@@ -53,8 +55,8 @@ MARGIN = 1.25  # rad, of the phase that a delay may cost: pi / 2 is where a loop
 def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     """Return what `guard` holds an arm to, (n, COLUMNS).
 
-    A joint is added inertia where a full action would throw it, so that an action of 1 from rest is just allowed; but
-    no more than its loop bears, which is faster than RATE by what is added.
+    A joint is added inertia where a full action of it, or of one that it is coupled to, would throw it, so that an
+    action of 1 from rest is just allowed; but no more than its loop bears, faster than RATE by what is added.
 
     Args:
         robot: gives position, velocity, torque and rate limits, and what it weighs at home.
@@ -66,9 +68,11 @@ def limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     out[:, MOST], out[:, DQ_MAX] = ALLOWED * robot.dq_max, robot.dq_max
     deceleration, offset = robot.slowing or (np.full(robot.n, np.inf), np.zeros(robot.n))
     out[:, SLOWING], out[:, OFFSET] = 2 * SLOWER**2 * deceleration, SLOWER * offset
-    felt = 1 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
+    mobility = InverseInertia(robot)(robot.q_home[None])[0]
+    felt = 1 / np.diag(mobility)
     most = (MARGIN / (RATE * LATE) - 1) * felt
-    out[:, ADDED] = np.clip(torque / (RATE * out[:, MOST]) - felt, 0.0, most)
+    throws = felt * (np.abs(mobility) * torque).max(1)  # Nm, of the joint's own, that would throw it as far
+    out[:, ADDED] = np.clip(throws / (RATE * out[:, MOST]) - felt, 0.0, most)
     out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
     return out
 
@@ -134,9 +138,13 @@ def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
         _push(ddq, low, high, work)
         for j in range(n):
             out[j] += work[2 * n + 3, j]
+    part = 1.0
     for j in range(n):
-        clipped = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX])
-        out[j] = last[j] + min(max(clipped - last[j], -limits[j, STEP]), limits[j, STEP])
+        out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]
+        if abs(out[j]) > limits[j, STEP]:
+            part = min(part, limits[j, STEP] / abs(out[j]))
+    for j in range(n):
+        out[j] = last[j] + min(max(part * out[j], -limits[j, STEP]), limits[j, STEP])
     return left < 1.0 or not within
 
 
