@@ -408,7 +408,7 @@ def main() -> None:
     """Write those sections of the page anew of which there are runs."""
     identified = (
         f"On {machines('judge')}. Each twin was identified from 20 s of motion and its ramps; trainings had "
-        f"{OF_A_TWIN:,} env steps, 3 to 4 minutes of a core here, and no DR; 200 fixed goals. Mean over twins with a "
+        f"{OF_A_TWIN:,} env steps, about 4 minutes of a core, and no DR; 200 fixed goals. Mean over twins with a "
         "95 % bootstrap interval over twins. The gaps are between the twin and the simulation that the policy was "
         "trained in, same policy and goals. The return on a twin is given with the noise of its speeds taken out. "
         "Success: held for the last 0.5 s."

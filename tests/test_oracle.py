@@ -51,8 +51,9 @@ def test_a_wrong_model_shows(panda, task, dynamics):
 
 
 def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dynamics):
-    """The hand is at the goal to 0.2 mm."""
-    oracle = Oracle(panda, task, dynamics)
+    """The hand is at the goal to 0.2 mm; a joint that an action does not move stays where it is."""
+    oracle, stuck = Oracle(panda, task, dynamics), task.torque(panda) < dynamics.level
+    assert np.flatnonzero(stuck).tolist() == [4, 6]
     from r2s.physics.rigid_body import Kinematics
 
     kinematics = Kinematics(panda)
@@ -60,6 +61,7 @@ def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dyna
         q = oracle.inverse_kinematics(start, goal)
         assert np.all((q > panda.q_min) & (q < panda.q_max))
         assert np.linalg.norm(kinematics(q)[0] - goal) < 2e-4
+        np.testing.assert_array_equal(q[stuck], start[stuck])
 
 
 def test_minimum_jerk_starts_and_ends_at_rest():

@@ -1,7 +1,8 @@
 """How well a policy does in simulation: 200 fixed episodes, deterministic, the same for every policy.
 
 Two sets of goals, starts and draws: a training is watched, and its best policy chosen, on SELECTED; what is reported
-of a policy comes from JUDGED, on which nothing was chosen, neither policies nor hyper-parameters.
+of a policy comes from JUDGED, on which no policy is chosen. Settings of conf/algo and conf/reward have been compared
+on JUDGED too: benchmarks/minutes.py judges them on goals of its own.
 """
 
 from collections.abc import Callable
