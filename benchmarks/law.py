@@ -53,9 +53,9 @@ class Watched:
     def __getattr__(self, name):
         return getattr(self._driver, name)
 
-    def __call__(self, state, target):
+    def __call__(self, state, target, added=None):
         """Return the command of a cycle."""
-        command = self._driver(state, target)
+        command = self._driver(state, target, added)
         self.asked.append(self._driver.effort.copy())
         self.sent.append(command.copy())
         return command

@@ -274,10 +274,12 @@ def twins_of(table: pd.DataFrame) -> list[str]:
         hardly = "hardly needs it" if abs(points) < 2 else "needs it"
         gained = (ours - bare).mean()
         known, guessed = ours["ee_path_rmse_mm"].mean(), bare["ee_path_rmse_mm"].mean()
-        each = {key: ", ".join(f"{100 * v:.3g}" for v in ours[key]) for key in ("success_1cm", "rest", "kept")}
+        shown = ("success_1cm", "rest", "kept", "limited")
+        each = {key: ", ".join(f"{100 * v:.3g}" for v in ours[key]) for key in shown}
         pages += [
-            f"Each identified twin: < 1 cm {each['success_1cm']} %; at rest {each['rest']} % (asked: 98); the "
-            f"predicted return over the twin's {each['kept']} % (asked of make 1: 95 to 105).",
+            f"Each identified twin: < 1 cm {each['success_1cm']} %; at rest {each['rest']} % (asked: 98); limited in "
+            f"{each['limited']} % of the cycles (asked: 5); the predicted return over the twin's {each['kept']} % "
+            "(asked of make 1: 95 to 105).",
             "Path gap of the nominal model over that of the identified one, both without DR, per twin: "
             f"{', '.join(f'{r:.1f}' for r in ratio)}; median {ratio.median():.1f}, smallest {ratio.min():.1f} "
             f"(asked: 4). In the mean {known:.1f} mm instead of {guessed:.1f} mm (asked: 5 mm of make 1).",
