@@ -30,6 +30,7 @@ from r2s.tasks.reach import ReachTask
 PANDA = load_robot(**conf("robot/panda"))
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
 TORQUE = TASK.torque(PANDA)
+FOLLOWS = np.array(conf("task/track")["torque_fraction"]) * PANDA.tau_max  # of a timed path: more of the wrist
 LEVEL = nominal_dynamics(PANDA, **conf("friction/paper")).level
 KINDS = ("nan", "inf", "huge", "flip", "silence", "full", "noise", "wrong shape of time", "held noise")
 
@@ -175,12 +176,13 @@ def test_any_floats_give_a_command_that_the_arm_takes(targets, seed):
         tau = new
 
 
-def test_a_good_policy_is_left_alone():
+@pytest.mark.parametrize(("torque", "share"), [(TORQUE, 0.3), (FOLLOWS, 0.5)], ids=["reach", "track"])
+def test_a_good_policy_is_left_alone(torque, share):
     """Away from limits the command is the low-passed, rate-limited target, bit for bit, as in training."""
-    driver, plain = Driver(PANDA, TORQUE, LEVEL, cutoff_hz=100.0), Actuation(PANDA, 1, cutoff_hz=100.0)
+    driver, plain = Driver(PANDA, torque, LEVEL, cutoff_hz=100.0), Actuation(PANDA, 1, cutoff_hz=100.0)
     tau = np.zeros(7)
     for k in range(400):
-        wanted = 0.3 * TORQUE * np.sin(0.01 * k + np.arange(7))
+        wanted = share * torque * np.sin(0.01 * k + np.arange(7))
         tau = driver(state_of(PANDA.q_home, 0.5 * np.sin(0.01 * k + np.arange(7)), tau), wanted)
         np.testing.assert_allclose(tau, plain(wanted[None], 1)[0, 0], atol=1e-12)
         np.testing.assert_array_equal(driver.effort, plain.last[0])
@@ -208,6 +210,15 @@ def test_silence_is_damped_then_stopped():
     assert not driver.done
     driver(state_of(PANDA.q_home, np.zeros(7), tau), None)
     assert driver.done
+
+
+def test_a_stop_leaves_a_light_joint_to_its_friction():
+    """Joint 7 of a timed path, which may be asked for more than its inertia bears, gets none; the others brake."""
+    driver, tau, speed = Driver(PANDA, FOLLOWS, LEVEL), np.zeros(7), np.full(7, 0.5)
+    for _ in range(400):
+        tau = driver(state_of(PANDA.q_home, speed, tau), None)
+    assert np.all(tau[:6] < 0)
+    assert abs(tau[6]) < 1e-9
 
 
 def test_torque_fades_in():
