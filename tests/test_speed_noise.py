@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import ROOT, conf
 
+from r2s.errors import UserError
 from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
 from r2s.physics.dynamics import nominal_dynamics
@@ -56,6 +57,12 @@ def test_two_recordings_are_one():
 def test_a_coarse_recording_says_nothing():
     """At 100 Hz five angles are no cubic's worth."""
     assert not speed_noise([swinging(np.full(3, 2e-3), step=0.01)]).any()
+
+
+def test_speeds_that_are_no_speeds_are_refused():
+    """What identification would write no training would take: said where the recording is read, with the joint."""
+    with pytest.raises(UserError, match=r"^dq of joint 2 is .* rad/s off the slope of its q .*at most 1 is allowed"):
+        speed_noise([swinging(np.array([1e-3, 2.0, 1e-3]))])
 
 
 @pytest.mark.parametrize("name", ["coulomb", "lugre", "paper", "sigmoid", "stribeck"])

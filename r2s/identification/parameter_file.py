@@ -23,6 +23,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
 from r2s.physics.friction import spelled
 from r2s.physics.robot import Robot
+from r2s.recordings.speed_noise import MOST_NOISE
 
 
 def save_parameters(
@@ -79,7 +80,6 @@ def save_parameters(
 
 
 MOST_NM, FARTHEST_M = 1e4, 10.0  # of friction and offsets; of a link's centre from its joint
-MOST_NOISE = 1.0  # rad/s
 FIXED = ("phi", "offset", "inertia")
 # files of before may lack them: then they are the robot's, or 0
 LATER = ("mass", "com", "armature", "load", "drag", "gain", "speed_noise")
