@@ -176,10 +176,10 @@ BEFORE = f"""\
 and dampers in six directions. Of {STARTS} fits from drawn starts the error of the best fit, and the range of all;
 RMSE as above, mean over the joints."""
 AFTER = """\
-So a base that sways is what the rigid model lacks: on optitraj2 it takes a third of the error away. But optitraj1
-alone does not tell which: fits that leave the same error there differ by a quarter on optitraj2. Two motions would
-tell, or a hit against the stand. The asked 0.75 Nm on optitraj2 from optitraj1 alone was not reached by any start,
-and r2s has no such term: what a recording cannot tell is not identified."""
+So a base that sways is what the rigid model lacks: on optitraj2 it takes up to a third of the error away. But
+optitraj1 alone does not tell which: fits that leave 0.34 to 0.35 Nm there differ by a sixth on optitraj2, and none of
+them comes to the asked 0.75 Nm. Nor did fits to optitraj1 and the dataset's `quadratic`, with both kinds of torque
+(tried by hand: 0.79 to 0.91). So r2s has no such term: what the recordings cannot tell is not identified."""
 
 if __name__ == "__main__":
     main()
