@@ -13,6 +13,7 @@ from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
 
 from r2s.arm.simulated import SimulatedArm
 from r2s.identification.family_selection import compare_families
+from r2s.identification.identify import STANDSTILL
 from r2s.physics.friction import BRISTLE, FAMILIES, SIGMOID, STRIBECK
 
 NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
@@ -48,7 +49,7 @@ def main() -> None:
             truth = draw(family, np.random.default_rng([FAMILIES.index(family), seed]))
             arm = SimulatedArm(ROBOT, truth, **NOISE, seed=seed)
             motion = record(arm, fourier(ROBOT, duration=15.0, seed=seed))
-            chosen = compare_families(ROBOT, OLD, motion, *given, {"cutoff_hz": 10.0}, lambda row: None)
+            chosen = compare_families(ROBOT, OLD, motion, *given, {"cutoff_hz": 10.0}, lambda row: None, STANDSTILL)
             picks[family.name].append(names[chosen["best"]])
             told = ", ".join(f"{n} {e:.3f}" for n, e in zip(names, chosen["error"], strict=True))
             print(f"{family.name}, seed {seed}: {picks[family.name][-1]} ({told})", flush=True)

@@ -116,3 +116,25 @@ def test_plain_regression_finds_coulomb_friction(tmp_path):
     right = friction(truth, v)
     off = plain_regression(tmp_path / "train.npz")(v) - (right - truth["offset"])
     assert (np.abs(off).max((0, 1)) < 0.01 * np.abs(right).mean((0, 1))).all()
+
+
+@pytest.mark.parametrize(("seed", "all_rows", "family"), [(27, "coulomb", "stribeck"), (26, "coulomb", "coulomb")])
+def test_friction_that_falls_where_joints_also_stop_is_told_by_slow_slides(seed, all_rows, family, tmp_path):
+    """Arm 27's friction falls below 0.1 rad/s. All rows together take it for Coulomb's, 28 % wrong."""
+    from common import OLD, ROBOT, how
+    from independent_arms import make
+
+    from r2s.identification.family_selection import compare_families
+    from r2s.identification.identify import STANDSTILL
+    from r2s.identification.problem import believed
+    from r2s.physics.friction import FAMILIES
+    from r2s.recordings.readers import read
+
+    make(tmp_path / "arm", seed)
+    recording = read(tmp_path / "arm" / "train.npz", torque="commanded", n_joints=ROBOT.n, name="train")
+    settings = how()
+    prior = believed(settings.prior, ROBOT, recording)
+    given = ROBOT, OLD, recording, settings.bounds, prior, settings.terms, settings.folds
+    for slowest, picked in ((0.0, all_rows), (STANDSTILL, family)):
+        chosen = compare_families(*given, {"cutoff_hz": settings.cutoff_hz}, lambda row: None, slowest)
+        assert FAMILIES[chosen["best"]].name == picked

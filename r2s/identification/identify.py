@@ -103,17 +103,16 @@ def identify(
         return done
 
     how = {"cutoff_hz": settings.cutoff_hz}
+    commanded = recording.torque == "commanded"
+    slowest = STANDSTILL if commanded else 0.0
     families: dict[str, float] = {}
     if family == "auto":
-        chosen = step(
-            "family",
-            lambda: compare_families(robot, nominal, recording, bounds, prior, terms, folds, how, told),
-        )
+        given = robot, nominal, recording, bounds, prior, terms, folds, how, told, slowest
+        chosen = step("family", lambda: compare_families(*given))
         families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
         family = names[int(chosen["best"])]
     nominal = of_family(nominal, family)
-    commanded = recording.torque == "commanded"
-    level = how | {"slowest": STANDSTILL if commanded else 0.0}
+    level = how | {"slowest": slowest}
     # a term of friction that the family does not have
     absent = {*optional_friction()} - {*nominal.family.optional}
     if extra := [name for name in settings.extra if name not in absent]:
