@@ -49,6 +49,7 @@ So on a slower machine give a training half a million env steps more where rest 
 The goals of all reports are a little nearer than most: on 1000 others the same policies have about 1 less. Return and
 limits are one trade (below), and env steps help both: with half as many, on a slower machine and with a final limited
 of 1, five seeds had -76.0 to -80.7 and were limited in 4.0 to 5.6 % of the cycles.
+Here the price is 1.25, and two of the five saved policies are still limited in 5.7 and 6.1 %.
 
 What holds a return back, each line a training of development seed 1 with what the line says and otherwise the
 settings of its day, on the 200 goals of all reports. Torque is what an action of 1 asks
