@@ -30,6 +30,16 @@ RIDGE = 10.0 ** np.arange(-12, 1.1, 0.5)  # strengths, relative to the mean squa
 TRAINED = {"joints 1, 3, 5, 7": (1, 3, 5, 7), "joints 2, 4, 6": (2, 4, 6)}
 
 
+def kinova(folder: Path) -> tuple[Robot, Dynamics]:
+    """Return the arm of the recordings in a folder, and where its identification starts; end where there is none."""
+    model = folder / "model.xml"
+    if not model.is_file():
+        sys.exit(f"there is no {model}: FOLDER is that of the Kinova's recordings (docs/real_arms.md)")
+    own = {k: v for k, v in conf("robot/other").items() if k not in ("defaults", "mjcf")}
+    robot = load_robot(str(model), **own)
+    return robot, nominal_dynamics(robot, **conf("friction/uniform"))
+
+
 def rmse(robot: Robot, recording: Recording, dynamics: Dynamics) -> np.ndarray:
     """Return (n,) Nm of a model's torque."""
     space = parameter_space(robot, dynamics, {"offset": [-1.0, 1.0]})
@@ -79,9 +89,7 @@ def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python benchmarks/real_arms.py FOLDER")
     folder = Path(sys.argv[1])
-    own = {k: v for k, v in conf("robot/other").items() if k not in ("defaults", "mjcf")}
-    robot = load_robot(str(folder / "model.xml"), **own)
-    nominal = nominal_dynamics(robot, **conf("friction/uniform"))
+    robot, nominal = kinova(folder)
     lines: list[str] = []
 
     def recorded(name: str, torque: str) -> Recording:

@@ -17,17 +17,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pandas as pd
-from common import ROOT, conf, how, markdown, put_section, searches
-from real_arms import CUTOFF_HZ
+from common import ROOT, how, markdown, put_section, searches
+from real_arms import CUTOFF_HZ, kinova
 from scipy.optimize import least_squares
 
 from r2s.compiled import njit
 from r2s.identification.identify import identify
 from r2s.identification.parameters import parameter_space
 from r2s.identification.torque_residual import TorqueResidual
-from r2s.physics.dynamics import Dynamics, nominal_dynamics
+from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import put_links
-from r2s.physics.robot import SIM_DT, Robot, load_robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.readers import read
 
 STARTS = 8
@@ -145,9 +145,7 @@ def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python benchmarks/stand.py FOLDER")
     folder = Path(sys.argv[1])
-    own = {k: v for k, v in conf("robot/other").items() if k not in ("defaults", "mjcf")}
-    robot = load_robot(str(folder / "model.xml"), **own)
-    nominal = nominal_dynamics(robot, **conf("friction/uniform"))
+    robot, nominal = kinova(folder)
     train = read(folder / "optitraj1.npz", torque="measured", n_joints=robot.n, name="optitraj1")
     found = identify(robot, nominal, train, searches("staged"), how("measured", family="auto")).dynamics
     one, two = (Swaying.of(robot, found, folder, name) for name in ("optitraj1", "optitraj2"))

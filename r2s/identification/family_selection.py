@@ -19,9 +19,7 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 FAMILY_HZ = 50.0  # rows per second that families are compared on
-ALIKE = (
-    1.05  # of the least error: families that are hardly told apart. Where friction falls slides tell by 1.2 and more
-)
+ALIKE = 1.05  # of the least error: hardly told apart. Where friction falls with speed, slides tell by 1.2 and more
 GUARD_S = 0.1  # s, rows this close to a block are nearly its own
 
 
@@ -70,11 +68,8 @@ def compare_families(
         spaces = [searched(robot, of_family(nominal, f.name), bounds, terms, recording) for f in families]
         return _compared(robot, spaces, recording, prior, folds, dict(how) | {"rate_hz": FAMILY_HZ}, report)
 
-    order = sorted(range(len(FAMILIES)), key=lambda k: len(FAMILIES[k].names))
-    errors, chosen = compared([FAMILIES[k] for k in order], how)
-    error, best = np.empty(len(FAMILIES)), order[chosen]
-    error[order] = errors
-    richer = [k for k in order[order.index(best) + 1 :] if error[k] <= ALIKE and not FAMILIES[k].has_memory]
+    error, best = compared(FAMILIES, how)  # which are in the order of how many parameters they have
+    richer = [k for k in range(best + 1, len(FAMILIES)) if error[k] <= ALIKE and not FAMILIES[k].has_memory]
     if slowest and richer and not FAMILIES[best].has_memory:
         close = [best, *richer]
         error[close], chosen = compared([FAMILIES[k] for k in close], dict(how) | {"slowest": slowest})
