@@ -18,8 +18,8 @@ from r2s.learning.train import Budget, Loop, replay_dump, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
-from r2s.tasks import rewards
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rewards import Curriculum
 
 QUICK = [
     "root=runs",
@@ -120,7 +120,7 @@ def train_until_it_breaks(env, algo, dump):
             env,
             algo,
             make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
-            lambda spent: rewards.PAPER,
+            Curriculum(**conf("reward/paper")),
             Loop(batch_size=16, learning_starts=80),
             Budget(None, 4000),
             dump=dump,
@@ -194,7 +194,7 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
             env,
             algo,
             evaluate,
-            lambda spent: rewards.PAPER,
+            Curriculum(**conf("reward/paper")),
             Loop(batch_size=16, learning_starts=4000),
             Budget(None, 4000),
             dump=tmp_path / "dump.pt",

@@ -396,6 +396,7 @@ MISTAKES = {
     "algo.hidden=abc": r"algo.hidden: 'abc' is not a number",
     "dr.phi_relative=1.5": r"dr.phi_relative: 1.5 is not allowed",
     "reward.anneal=[a,b]": r"reward.anneal: 'a' is not a number",
+    "reward.limited_most=0": r"reward.limited_most: 0 is not allowed; a number in \(0, 1\] is",
     "evaluation.env_steps=ten": r"evaluation.env_steps: 'ten' is not a number",
     "budget.minutes=four": r"budget.minutes: 'four' is not a number",
     "stage=identify identify.window_s=-1": r"identify.window_s: -1 is not allowed",

@@ -18,7 +18,7 @@ from r2s.learning.randomization import Around
 from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.tasks.reach import ReachTask, observe
-from r2s.tasks.rewards import PAPER, TERMS, Curriculum, terms
+from r2s.tasks.rewards import DEAREST, PAPER, TERMS, Curriculum, terms
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
 
@@ -273,6 +273,33 @@ def test_the_curriculum_goes_from_one_end_to_the_other():
     for progress, weights in ((0.0, first), (start, first), (end, last), (1.0, last), (2.0, last)):
         np.testing.assert_allclose(Curriculum(**settings)(progress), weights)
     np.testing.assert_allclose(Curriculum(**settings)(0.5 * (start + end)), np.mean([first, last], axis=0))
+
+
+@pytest.mark.parametrize("light", [0.08, 0.2, 0.02])
+def test_the_price_of_limits_settles_where_the_share_is_what_was_asked_for(light):
+    """Of policies that are limited in light / price of the cycles: no more than limited_most, the price not lower."""
+    curriculum = Curriculum(**conf("reward/curriculum"))
+    progress, factor = curriculum.anneal[0], 1.0
+    for _ in range(4000):
+        factor = curriculum.dearer(factor, progress, light / factor, 160)
+    assert factor == pytest.approx(min(max(light / curriculum.limited_most, 1.0), DEAREST), rel=1e-3)
+    weights = curriculum(progress), curriculum(progress, factor)
+    np.testing.assert_array_equal(weights[1], weights[0] * [1, 1, 1, 1, factor])
+
+
+def test_the_price_of_limits_is_left_alone_before_anything_moves():
+    """While a policy is still wild, and where any share is allowed."""
+    curriculum, paper = (Curriculum(**conf(f"reward/{name}")) for name in ("curriculum", "paper"))
+    assert curriculum.dearer(1.0, 0.99 * curriculum.anneal[0], 1.0, 10_000) == 1.0
+    assert paper.dearer(1.0, 1.0, 1.0, 10_000) == 1.0
+
+
+@pytest.mark.parametrize("worse", [{"success_1cm": 0.99}, {"rest": 0.98}, {"limited": 0.06}, {"return_paper": -91.0}])
+def test_the_policy_that_is_saved_reaches_rests_and_is_let_be(task, worse):
+    """Of two evaluations that differ in one measure the better is kept; being limited now and then costs nothing."""
+    good = {"success_1cm": 1.0, "rest": 1.0, "limited": 0.01, "return_paper": -90.0}
+    assert task.score(good | worse) < task.score(good)
+    assert task.score(good | {"limited": 0.03}) == task.score(good)
 
 
 @pytest.mark.parametrize("progress", [0.0, 0.3, 1.0])

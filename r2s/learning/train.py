@@ -26,6 +26,7 @@ from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
+from r2s.tasks.rewards import Curriculum
 from r2s.tasks.task import Episodes
 
 
@@ -142,7 +143,7 @@ def train(
     env: TaskEnv,
     algo: Learner,
     evaluate: Callable[[Policy], Episodes],
-    weights: Callable[[float], np.ndarray],
+    weights: Curriculum,
     loop: Loop,
     budget: Budget,
     *,
@@ -156,7 +157,7 @@ def train(
         env: arms to learn on.
         algo: a learner (r2s/learning/tqc.py).
         evaluate: policy -> Episodes (r2s/learning/evaluate.py).
-        weights: fraction of the budget -> (k,) weights of the reward terms (r2s/tasks/rewards.py).
+        weights: of the reward terms, over the budget; of the last of them, as what was seen asks for.
         loop: how. budget: when to stop.
         checkpoint: written after every evaluation; where it holds a state, training goes on from there.
         dump: file for what led to a number that is not finite, for `replay_dump`.
@@ -168,6 +169,7 @@ def train(
     keep_memory()
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every storage it makes
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, loop.eval_env_steps
+    dearer = 1.0  # factor on the price of what the driver's law had to change
     device = algo.torque.device
     if loop.compile:
         with products(loop.matmul):
@@ -184,7 +186,7 @@ def train(
         env.set_state(_arrays(saved["env"]))
         state = state.update(saved["state"])
         env_steps, updates, next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
-        shown, began = saved["shown"], began - saved["seconds"]
+        shown, began, dearer = saved["shown"], began - saved["seconds"], saved.get("dearer", 1.0)
         torch.set_rng_state(saved["torch"])
 
     def evaluation() -> dict:
@@ -196,7 +198,7 @@ def train(
         return {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began} | out
 
     while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
-        env.weights = weights(spent)
+        env.weights = weights(spent, dearer)
         algo.set_lr(loop.lr_share(spent))
         warm = env_steps >= loop.learning_starts
         seen = state["observation"].to(device)
@@ -210,6 +212,7 @@ def train(
             where = {"env": origin, "actions": torch.stack(actions)}
             raise _dumped(error, dump, where, f"{env_steps} env steps") from None
         replay.extend(_transition(step))
+        dearer = weights.dearer(dearer, spent, -float(step["next", "reward_terms"][:, -1].mean()), env.nsim)
         state = state_next
         env_steps += env.nsim
         if env_steps < loop.learning_starts:
@@ -236,7 +239,7 @@ def train(
             listeners.evaluated(shown)
             if checkpoint:
                 now = {"env_steps": env_steps, "updates": updates, "next_eval": next_eval, "shown": shown}
-                now |= {"seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
+                now |= {"dearer": dearer, "seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
                 now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
                 checkpoint.save(now, replay, env_steps, loop.replay_size)
         listeners.progress(spent, shown | {"env_steps": env_steps, "updates": updates})

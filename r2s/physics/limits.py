@@ -104,7 +104,7 @@ class Guard:
         return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
     """Write the command (n,) Nm of a cycle into `out`; return whether the law changed anything but the rate.
 
@@ -148,7 +148,7 @@ def guard(q, dq, effort, last, share, friction, mass, bias, limits, work, out):
     return left < 1.0 or not within
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _left(q, dq, limits):
     """Return the share of its torque that a policy keeps: rule 1."""
     near = 0.0
@@ -158,7 +158,7 @@ def _left(q, dq, limits):
     return 1.0 - min(near, 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _allowed(way, share, limits):
     """Return rad/s, how fast a joint may go that has `way` rad left; back, where there is none left."""
     speed = min(share * limits[MOST], APPROACH * way)
@@ -167,7 +167,7 @@ def _allowed(way, share, limits):
     return speed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _factor(mass, limits, work):
     """Write Cholesky's root of the inertia, its diagonal inverted, into the first n rows of `work`."""
     for i in range(len(limits)):
@@ -183,7 +183,7 @@ def _factor(mass, limits, work):
         work[i, i] = 1.0 / np.sqrt(d)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _solve(root, x):
     """Divide x (n,) by the inertia that `root` is of, in place."""
     n = len(x)
@@ -199,7 +199,7 @@ def _solve(root, x):
         x[i] = s * root[i, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _widen(low, high, dq, out, friction, limits, work):
     """Widen the bounds by what friction may do to each joint, its neighbours' included; M^-1 is left in `work`."""
     n = len(low)
@@ -219,7 +219,7 @@ def _widen(low, high, dq, out, friction, limits, work):
         high[k] += wider
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _push(ddq, low, high, work):
     """Write the torques (n,) Nm that stops at the joints would add into row 2 n + 3 of `work`, which has M^-1.
 

@@ -58,6 +58,8 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
+PATIENCE = 50_000  # env steps in which the price of `limited` grows e-fold where twice the share allowed is limited
+DEAREST = 4.0  # the most that it grows
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,11 @@ class Curriculum:
     Attributes:
         smoothness, precision, stillness, limited: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
+        limited_most: share of the cycles; None: any. From the first of `anneal` on, while the law changes what is
+            asked for in more of them, the price of `limited` grows; and falls back, never below the curriculum's. One
+            price does not hold a share: policies of the same make of training that differ in their seed alone are
+            limited in 1 to 6 % of the cycles (docs/minutes.md). This is a Lagrange multiplier's integral control
+            (Stooke, Achiam and Abbeel, ICML 2020), of the price's logarithm.
 
     Raises:
         UserError: no pair of numbers, or a number outside its range.
@@ -81,6 +88,7 @@ class Curriculum:
     stillness: Sequence[float]
     limited: Sequence[float]
     anneal: Sequence[float]
+    limited_most: float | None = None
 
     def __post_init__(self):
         for name, interval in (*WEIGHTS, ("anneal", "[0, 1]")):
@@ -89,11 +97,30 @@ class Curriculum:
                 raise UserError(f"reward.{name}: {pair} is not allowed; two numbers are, before and after")
             for number in pair:
                 check_number(f"reward.{name}", number, interval)
+        if self.limited_most is not None:
+            check_number("reward.limited_most", self.limited_most, "(0, 1]")
 
-    def __call__(self, progress: float) -> np.ndarray:
-        """Return the (5,) weights at `progress`, the fraction of the training budget that is spent."""
+    def __call__(self, progress: float, dearer: float = 1.0) -> np.ndarray:
+        """Return the (5,) weights at `progress`, the fraction of the training budget that is spent.
+
+        Args:
+            dearer: the factor on the price of `limited`, of `dearer`.
+        """
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
         pairs = (getattr(self, name) for name in TERMS[1:])
         moving = [before + at * (after - before) for before, after in pairs]
+        moving[-1] *= dearer
         return np.array([1.0, *moving])
+
+    def dearer(self, factor: float, progress: float, limited: float, env_steps: int) -> float:
+        """Return the factor on the price of `limited` after env_steps more of a training.
+
+        Args:
+            factor: before. progress: fraction of the budget that is spent.
+            limited: in which share of their cycles the law changed what was asked for.
+        """
+        if self.limited_most is None or progress < self.anneal[0]:
+            return factor
+        beyond = min(limited / self.limited_most - 1.0, 1.0)
+        return float(np.clip(factor * np.exp(beyond * env_steps / PATIENCE), 1.0, DEAREST))
