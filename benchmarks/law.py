@@ -149,9 +149,13 @@ episodes.
 {markdown(table.round(3))}
 
 What the law, and the motors' delay behind it, cost a training's environment of {ARMS} arms, in CPU time of one
-thread:
+thread, in turns (asked: 10 %):
 
 {markdown(costs(policy).round(1))}
+
+Gentle and wild are random actions of a standard deviation of 0.1 and 0.5. A trained policy is limited in 1 to 5 % of
+the cycles, a new one in many: where the law acts, it solves for the nearest torque. Until its loops were compiled for
+seven joints it cost 12.3, 19.6 and 12.5 % on an AMD EPYC, 9.9, 18.2 and 8.9 % on an Intel Xeon.
 """
     (ROOT / "docs" / "law.md").write_text(text)
     print(table.round(3).to_string())

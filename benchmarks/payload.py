@@ -58,8 +58,10 @@ def within(rows: pd.DataFrame) -> dict[str, str]:
 
 def of_events(rows: pd.DataFrame) -> dict[str, str]:
     """Return a line of what was put on and taken off."""
+    rest, seen = rows["at_rest"].sum(), rows["seen_at_rest"].sum()
     return within(rows) | {
-        "seen in 0.2 s": f"{rows['seen'].sum()} of {2 * len(rows)}",
+        "seen in 0.2 s in motion": f"{rows['seen'].sum() - seen} of {2 * len(rows) - rest}",
+        "at rest": f"{seen} of {rest}",
         "other alarms in an hour": f"{rows['false'].mean() * 3600 / SECONDS:.0f}",
         "µs": f"{rows['us'].median():.0f}",
     }

@@ -127,7 +127,9 @@ def events(of: Known, k: int) -> list[dict]:
     at = (thing.on_s, thing.off_s)
     seen = [min((c - s for c in ear.changes if 0 < c - s <= LATE_S), default=np.nan) for s in at]
     real = sum(any(0 < c - s <= LATE_S for s in at) for c in ear.changes)
+    rests = [all(e.rests for e in told if s <= e.t <= s + SOON_S) for s in at]
     late = {"on_after": seen[0], "off_after": seen[1], "seen": sum(x <= SOON_S for x in seen)}
+    late |= {"at_rest": sum(rests), "seen_at_rest": sum(x <= SOON_S for x, r in zip(seen, rests, strict=True) if r)}
     return [errors(told, thing) | late | {"false": len(ear.changes) - real, "us": us}]
 
 

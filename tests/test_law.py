@@ -11,10 +11,10 @@ from r2s.arm.deploy import DrivenArm
 from r2s.arm.simulated import SimulatedArm
 from r2s.learning.batch import ArmBatch
 from r2s.learning.evaluate import fixed_episodes
-from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.limits import ADDED, ALLOWED, LATE, Q_HIGH, RATE, Guard, limits
 from r2s.physics.robot import load_robot
-from r2s.physics.simulator import Simulator
+from r2s.physics.simulator import Simulator, single_arm
 from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
 
@@ -199,3 +199,25 @@ def test_the_simulation_as_trained_in_is_the_arm_behind_the_driver(soft_start_s,
     assert one.limited.max() > 0.3
     for name, bound in {"q": 1e-12, "dq": 1e-10, "tau": 1e-9, "limited": 2 / 1500}.items():
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur10e"])
+def test_the_law_inside_the_step_is_the_guards(name):
+    """Compiled for seven joints, and for any number: a command of the physics step is what `Guard` sends there.
+
+    Both solve with an inertia of MuJoCo's, so they agree to round-off, limited or not.
+    """
+    robot, count = load_robot(**conf(f"robot/{name}")), 64
+    dynamics = Dynamics.of(robot, np.tile([1.0, 20.0, 0.0], (robot.n, 1)))
+    torque = robot.tau_max * 0.3
+    rng = np.random.default_rng(0)
+    q = robot.q_home + 0.5 * rng.normal(size=(count, robot.n))
+    dq, effort = 0.3 * robot.dq_max * rng.normal(size=q.shape), torque * rng.uniform(-1, 1, q.shape)
+    simulator = Simulator(robot, dynamics, count, 1)
+    simulator.drive(limits(robot, torque))
+    simulator.reset(q, dq)
+    simulator.rollout(effort[:, None])
+    guard = Guard(single_arm(robot, dynamics), robot, torque, dynamics.level)
+    sent = np.array([guard(q[k], dq[k], effort[k], np.zeros(robot.n)) for k in range(count)])
+    assert 0 < simulator.limited.sum() == guard.changed < count
+    np.testing.assert_allclose(simulator.tau, sent, rtol=0, atol=1e-9)
