@@ -54,7 +54,7 @@ rested in 67 and 94.5 % (saved 97.5 and 93), and a training for the nominal mode
 the first step on makes a training slow, of some seeds more than of others. With prices that begin low, and a price of
 limits that grows only where it has to (next section), that training rested in 98.5 % and had a return of -82 instead
 of -92. What rest costs at half a million env steps is the last millimetres: of seeds 3 and 5 82.5 and 98.5 % were
-< 5 mm with a final stillness of 2.5, 99.5 and 95.5 % with 2.1, and all of five seeds' with 2.1 and 800,000 env steps.
+< 5 mm with a final stillness of 2.5, 99.5 and 95.5 % with 2.1, 99.5 to 100 % of five with 2.1 and 800,000 env steps.
 So on a slower machine give a training half a million env steps more where rest and millimetres count.""",
     "twelve": """\
 The goals of all reports are a little nearer than most: on 1000 others the same policies have about 1 less. Return and
@@ -66,7 +66,8 @@ were limited in 5.7 and 6.1 %.
 **A price does not hold a share.** Trainings that differ in their seed alone end limited in 1 to 6 % of the cycles, on
 twins too. So the price grows while more than `limited_most` of the cycles are limited, and falls again
 (r2s/tasks/rewards.py). The share is that of the training's own steps, exploration included: of the policy alone it is
-0.1 to 0.8 of that. Twelve minutes, 1.6 million env steps, development seeds:
+0.1 to 0.8 of that (written down by hand: metrics.csv has the price, `weight_4`, not the share). Twelve minutes, 1.6
+million env steps, development seeds:
 
 | `limited_most` | seed | limited in the last 100,000 steps of the training, % | limited, last policy, % | return |
 | --- | --- | --- | --- | --- |

@@ -285,7 +285,7 @@ def twins_of(table: pd.DataFrame) -> list[str]:
         gained = (ours - bare).mean()
         known, guessed = ours["ee_path_rmse_mm"].mean(), bare["ee_path_rmse_mm"].mean()
         pages += [
-            f"Path gap of the nominal model over that of the identified one, both without DR, twins "
+            "Path gap of the nominal model over that of the identified one, both without DR, twins "
             f"{', '.join(map(str, both))}: "
             f"{', '.join(f'{r:.1f}' for r in ratio)}; median {ratio.median():.1f}, smallest {ratio.min():.1f} "
             f"(asked: 4). In the mean {known:.1f} mm instead of {guessed:.1f} mm (asked: 5 mm of make 1).",

@@ -236,7 +236,7 @@ def _force_at(at: dict[str, int]) -> Callable:
 def _drive(n, user, fields):
     """Let the driver's law and the motors turn what is asked for into what the joints feel, in place.
 
-    Called with a constant n, it is compiled for that: loops unroll, which spares a quarter of the law's time.
+    Called with a constant n, it is compiled for that: loops unroll, and the law costs half (docs/law.md).
 
     Args:
         n: joints. user, fields: addresses of MuJoCo's arrays.
