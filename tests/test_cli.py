@@ -281,7 +281,8 @@ def test_every_number_and_figure_is_explained(trained, identified):
     summary, errors = (json.loads((f / "summary.json").read_text()) for f in (trained, identified))
     head = (trained / "metrics.csv").read_text().splitlines()[0].split(",")
     clock = {"env_steps", "updates", "wall_clock_s"}
-    known = named | clock | {f"nominal_{name}" for name in named} | {f"weight_{k}" for k in range(4)}
+    between = {f"{kind}_{k}" for kind in ("weight", "term") for k in range(1, 4)}
+    known = named | clock | between | {f"nominal_{name}" for name in named}
     assert {*summary["best"], *errors["validation"], *head} - known == set()
     assert {p.stem for f in (trained, identified) for p in (f / "figures").glob("*.png")} <= named
     sections = re.findall(r"^## (.+)", (identified / "report.md").read_text(), flags=re.M)

@@ -281,7 +281,7 @@ def test_the_price_of_limits_settles_where_the_share_is_what_was_asked_for(light
     curriculum = Curriculum(**conf("reward/curriculum"))
     progress, factor = curriculum.anneal[0], 1.0
     for _ in range(4000):
-        factor = curriculum.dearer(factor, progress, light / factor, 160)
+        factor = curriculum.dearer(factor, progress, np.array([-1.0, -1.0, 0.5, -0.3, -light / factor]), 160)
     assert factor == pytest.approx(min(max(light / curriculum.limited_most, 1.0), DEAREST), rel=1e-3)
     weights = curriculum(progress), curriculum(progress, factor)
     np.testing.assert_array_equal(weights[1], weights[0] * [1, 1, 1, 1, factor])
@@ -290,8 +290,9 @@ def test_the_price_of_limits_settles_where_the_share_is_what_was_asked_for(light
 def test_the_price_of_limits_is_left_alone_before_anything_moves():
     """While a policy is still wild, and where any share is allowed."""
     curriculum, paper = (Curriculum(**conf(f"reward/{name}")) for name in ("curriculum", "paper"))
-    assert curriculum.dearer(1.0, 0.99 * curriculum.anneal[0], 1.0, 10_000) == 1.0
-    assert paper.dearer(1.0, 1.0, 1.0, 10_000) == 1.0
+    always = np.array([-1.0, -1.0, 0.5, -0.3, -1.0])
+    assert curriculum.dearer(1.0, 0.99 * curriculum.anneal[0], always, 10_000) == 1.0
+    assert paper.dearer(1.0, 1.0, always, 10_000) == 1.0
 
 
 @pytest.mark.parametrize("worse", [{"success_1cm": 0.99}, {"rest": 0.98}, {"limited": 0.06}, {"return_paper": -91.0}])

@@ -170,6 +170,7 @@ def train(
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every storage it makes
     began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, loop.eval_env_steps
     dearer = 1.0  # factor on the price of what the driver's law had to change
+    since: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
     device = algo.torque.device
     if loop.compile:
         with products(loop.matmul):
@@ -187,6 +188,7 @@ def train(
         state = state.update(saved["state"])
         env_steps, updates, next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
         shown, began, dearer = saved["shown"], began - saved["seconds"], saved.get("dearer", 1.0)
+        since = list(saved["since"].numpy()) if "since" in saved else []
         torch.set_rng_state(saved["torch"])
 
     def evaluation() -> dict:
@@ -212,7 +214,9 @@ def train(
             where = {"env": origin, "actions": torch.stack(actions)}
             raise _dumped(error, dump, where, f"{env_steps} env steps") from None
         replay.extend(_transition(step))
-        dearer = weights.dearer(dearer, spent, -float(step["next", "reward_terms"][:, -1].mean()), env.nsim)
+        terms = step["next", "reward_terms"].mean(0).numpy()
+        dearer = weights.dearer(dearer, spent, terms, env.nsim)
+        since.append(terms)
         state = state_next
         env_steps += env.nsim
         if env_steps < loop.learning_starts:
@@ -232,7 +236,10 @@ def train(
         if updates % 1000 < loop.updates_per_step or updates == loop.updates_per_step:
             numbers = {k: float(v) for k, v in row.items()}
             head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}
-            listeners.log(head | numbers | {f"weight_{i}": float(w) for i, w in enumerate(env.weights)})
+            paid = {f"weight_{i}": float(w) for i, w in enumerate(env.weights)}
+            paid |= {f"term_{i}": float(x) for i, x in enumerate(np.mean(since, axis=0))}
+            listeners.log(head | numbers | paid)
+            since = []
         if env_steps >= next_eval:
             next_eval += loop.eval_env_steps
             shown = evaluation()
@@ -240,6 +247,7 @@ def train(
             if checkpoint:
                 now = {"env_steps": env_steps, "updates": updates, "next_eval": next_eval, "shown": shown}
                 now |= {"dearer": dearer, "seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
+                now |= {"since": torch.tensor(np.array(since))}
                 now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
                 checkpoint.save(now, replay, env_steps, loop.replay_size)
         listeners.progress(spent, shown | {"env_steps": env_steps, "updates": updates})

@@ -113,14 +113,15 @@ class Curriculum:
         moving[-1] *= dearer
         return np.array([1.0, *moving])
 
-    def dearer(self, factor: float, progress: float, limited: float, env_steps: int) -> float:
+    def dearer(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
         """Return the factor on the price of `limited` after env_steps more of a training.
 
         Args:
             factor: before. progress: fraction of the budget that is spent.
-            limited: in which share of their cycles the law changed what was asked for.
+            seen: (5,), the mean terms of those steps, of `terms`.
         """
         if self.limited_most is None or progress < self.anneal[0]:
             return factor
+        limited = -seen[TERMS.index("limited")]
         beyond = min(limited / self.limited_most - 1.0, 1.0)
         return float(np.clip(factor * np.exp(beyond * env_steps / PATIENCE), 1.0, DEAREST))
