@@ -22,8 +22,8 @@ OTHERS = 2_026_1123  # a seed like those of r2s/learning/evaluate.py, of goals t
 MANY = 1000  # of them: the mean return of 200 depends by 2 on which they are
 
 PARTS = {  # minutes, seeds, settings
-    "four": (4, range(160, 165), ()),
-    "twelve": (12, range(155, 160), ("reward=long",)),
+    "four": (4, range(165, 170), ()),
+    "twelve": (12, range(170, 175), ("reward=long",)),
 }
 NOTES = {  # what the table does not say
     "four": """\
