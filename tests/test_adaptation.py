@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from conftest import conf
 
-from r2s.adaptation.balance import SPAN
+from r2s.adaptation.balance import SPAN, Balance
 from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimator, body
-from r2s.adaptation.kalman import BODY
+from r2s.adaptation.kalman import BODY, Filter, update
 from r2s.adaptation.listen import at_rate, listen, table
 from r2s.adaptation.listen import noise as noise_like
 from r2s.adaptation.momentum import WIDE, momentum
@@ -197,6 +197,27 @@ def test_a_gear_that_swings_is_no_torque():
     own = links_of(robot(), robot().mass, robot().com, robot().inertia)
     equations(own, np.zeros(3), robot().q_home, np.zeros(7), mass, bias, np.empty((7, WORK)))
     assert np.abs(swung - plain).max() < 0.1 * 2 * mass[0, 0] * v / (SPAN * SIM_DT)
+
+
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 1.5), (3.0, 6.0, 12.0)])
+def test_what_surprises_for_long_is_taken_for_noise(times, low, high):
+    """Of white noise that is `times` as large as is known, the filter believes its square, give or take a third.
+
+    One joint's wavers by a fifth of it, for 25 spans or so: the mean of 7 joints and 1000 spans by a hundredth.
+    """
+    noise, rng = noise_of(believed(robot(), truth())), np.random.default_rng(0)
+    noise = noise._replace(prior=np.full_like(noise.prior, 1e-6), warming=0.0, drifting=np.zeros(7), creeping=0.0)
+    noise = noise._replace(model=np.zeros(7), turning=np.zeros(7), moving=np.zeros(7))
+    filter, b, rough = Filter.fresh(noise), Balance.empty(7), []
+    for _ in range(1200):
+        b.y[:] = times * noise.white * rng.standard_normal(7)
+        update(filter, noise, b)
+        rough.append(filter.rough.copy())
+    assert low <= np.mean(rough[200:]) <= high
+    assert np.min(rough) >= 1.0
+    still = Filter.fresh(noise)
+    update(still, noise._replace(learning=0.0), b)
+    assert (still.rough == 1.0).all()
 
 
 def test_an_interval_is_wide_at_rest_and_narrow_in_motion():

@@ -37,6 +37,7 @@ PANDA = load_robot(**conf("robot/panda"))
 TORQUE = 0.3 * PANDA.tau_max
 SPRING = np.array([60, 120, 60, 60, 10, 10, 5.0])
 FILTER_S = conf("adapt/observer")["filter_s"]
+MAKES = [partial(make, filter_s=conf(f"adapt/{make.__name__}")["filter_s"]) for make in (observer, rls)]
 
 
 @cache
@@ -82,7 +83,7 @@ def swing(adapter, *, seconds=2.0, rate=1.0, payload=None, push=0.0, noise=0.0):
     return (np.array(x) for x in zip(*rows, strict=True))
 
 
-@pytest.mark.parametrize("make", [partial(observer, filter_s=FILTER_S), rls])
+@pytest.mark.parametrize("make", MAKES)
 def test_an_adapter_on_an_arm_that_equals_its_model_changes_nothing(make):
     """To 1e-3 Nm, in calm motion: a step of 1 ms is wrong by half of what the torque changes by in it."""
     heard = Heard(make(known()))
@@ -100,9 +101,7 @@ def test_the_observer_adds_what_a_push_takes():
     assert np.abs(np.delete(lacks, 1, axis=1)).max() < 0.05
 
 
-@pytest.mark.parametrize(
-    ("make", "late"), [(partial(observer, filter_s=FILTER_S), FILTER_S + SPAN * SIM_DT), (rls, RATE_S)]
-)
+@pytest.mark.parametrize(("make", "late"), zip(MAKES, (FILTER_S + SPAN * SIM_DT, RATE_S), strict=True))
 def test_a_payload_s_torque_is_added(make, late):
     """What an arm with the payload needs more for the same motion, a second after it was put on.
 
@@ -118,6 +117,23 @@ def test_a_payload_s_torque_is_added(make, late):
     rms = lambda x: np.sqrt((x[now] ** 2).mean())  # noqa: E731
     assert rms(more[:, 1]) > 2.0
     assert rms(np.array(heard.added) - more) < late * rms(np.gradient(more, SIM_DT, axis=0)) + 0.1 * rms(more)
+
+
+def test_a_new_estimate_comes_in_slowly():
+    """What is told of a payload steps when it is seen; what is added does not: a low-pass is between them."""
+    adapter, told = MAKES[1](known()), []
+
+    class Asked(Heard):
+        def __call__(self, q, dq, tau):
+            added = super().__call__(q, dq, tau)
+            told.append(adapter._says.copy())
+            return added
+
+    heard = Asked(adapter)
+    swing(heard, payload=replace(THING, on_s=0.7), seconds=1.2, rate=3.0)
+    steps = [np.abs(np.diff(x, axis=0)).max() for x in (told, heard.added)]
+    assert steps[0] > 1.0  # Nm
+    assert steps[1] < 0.05 * steps[0]
 
 
 def test_what_holds_an_arm_at_rest_is_left_to_hold_it():
@@ -240,7 +256,7 @@ def test_an_adapter_that_raises_ends_as_a_policy_that_raises():
 
 def test_a_motion_begins_as_if_nothing_had_been_heard():
     """And what goes to another process is the same there."""
-    for make in (partial(observer, filter_s=FILTER_S), rls):
+    for make in MAKES:
         adapter, first = make(known()), []
         for again in (adapter, adapter, pickle.loads(pickle.dumps(make(known())))):
             again.begin()
@@ -270,8 +286,9 @@ def test_what_an_adapter_lacks_is_said_in_one_line(tmp_path):
         check_overrides(["stage=transfer", "adapt=obsever"], None)
     with pytest.raises(UserError, match=r"^adapt: stage=train does not read it: adapters work on an arm"):
         check_overrides(["adapt=observer"], None)
-    with pytest.raises(UserError, match=r"filter_s"):
-        observer(known(), 0.0)
+    for make in (observer, rls):
+        with pytest.raises(UserError, match=r"^filter_s: 0\.0 is not allowed"):
+            make(known(), 0.0)
 
 
 def test_the_history_s_network_is_shown_what_lacks():

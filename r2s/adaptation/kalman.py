@@ -39,6 +39,7 @@ class Noise(NamedTuple):
         warming: 1/sqrt(s), of friction's share. drifting: (n,) Nm/sqrt(s), of the offsets.
         resting: kg^2/s, what may be put into the hand while nothing is seen of it.
         creeping: 1/sqrt(s), share of the payload's prior by which it is never known for good.
+        learning: how fast white noise grows with what surprises, per span, as of `Filter.rough`; 0: it is what it is.
         prior, start: (N,) standard deviations and means before anything is seen.
     """
 
@@ -56,6 +57,7 @@ class Noise(NamedTuple):
     drifting: np.ndarray
     resting: float
     creeping: float
+    learning: float
     prior: np.ndarray
     start: np.ndarray
 
@@ -64,7 +66,9 @@ class Filter(NamedTuple):
     """x (N,), P (N, N); of each onset f (LATEST, N, 4), information (LATEST, 4, 4) and vector (LATEST, 4).
 
     counts: (4,): spans, onsets in use, spans at rest in a row, the next onset. odds: (3,): log of the mean odds of a
-    jump, that of the likeliest onset, its number. seen: (2, n): innovations and their variances.
+    jump, that of the likeliest onset, its number. seen: (2, n): innovations and their variances. rough: (n,), how
+    many times the variance that is known of it a joint's white noise has now: what surprises for long is taken for
+    noise, as of a gear that swings under a load that was never heard before. It is never less than 1.
     """
 
     x: np.ndarray
@@ -75,6 +79,7 @@ class Filter(NamedTuple):
     counts: np.ndarray
     odds: np.ndarray
     seen: np.ndarray
+    rough: np.ndarray
     work: np.ndarray
 
     @staticmethod
@@ -84,13 +89,15 @@ class Filter(NamedTuple):
         n = (N - BODY) // 4
         return Filter(
             noise.start.copy(), np.diag(prior**2), np.zeros((LATEST, N, JUMP)), np.zeros((LATEST, JUMP, JUMP)),
-            np.zeros((LATEST, JUMP)), np.zeros(4, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.zeros((2, N)),
+            np.zeros((LATEST, JUMP)), np.zeros(4, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.ones(n),
+            np.zeros((2, N)),
         )  # fmt: skip
 
 
 SLOW = 5.0  # times as long as the model's error lasts that of the momentum
 AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
 REST_S = 0.25  # of what friction hides at rest: how long it stays the same
+MOST_SURPRISE = 9.0  # of a span, as a square of standard deviations: one that is a jump says little of the noise
 RESTS = 5  # spans without sliding, from which an arm rests
 
 
@@ -152,7 +159,7 @@ def update(filter, noise, b):
         _begin_onset(filter)
     h, g = filter.work[0], np.empty(JUMP)
     for j in range(n):
-        R = noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2 + unsure[j]
+        R = filter.rough[j] * (noise.white[j] ** 2 + (noise.moving[j] * b.change[j]) ** 2 + unsure[j])
         if slides[j] == 0.0:
             R += noise.edge[j] ** 2 / 3.0 * REST_S / T
         for i in range(N):
@@ -168,6 +175,9 @@ def update(filter, noise, b):
             S += h[c] * payload[j, c]
             v -= x[c] * payload[j, c]
         filter.seen[0, j], filter.seen[1, j] = v, S
+        if slides[j] > 0.0:
+            surprise = min(v * v / S, MOST_SURPRISE) - 1.0
+            filter.rough[j] = max(1.0, filter.rough[j] * (1.0 + noise.learning * surprise))
         for k in range(count[1]):
             f, C, d = filter.f[k], filter.information[k], filter.vector[k]
             for c in range(JUMP):

@@ -21,6 +21,7 @@ WARMING = 0.02  # 1/sqrt(s): a fifth in 100 s
 DRIFTED, DRIFTING = 0.05, 0.005  # of friction's level; per sqrt(s)
 RESTING = 0.1  # kg^2/s
 CREEPING = 0.01  # 1/sqrt(s)
+LEARNING = 0.04  # of 25 spans, half a second
 LASTING = 0.3  # s
 # where no motion without a payload says how wrong the model is: shares of friction's level
 WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
@@ -72,6 +73,7 @@ def noise_of(arm: Believed, prior: Prior | None = None) -> Noise:
         drifting=DRIFTING * arm.level,
         resting=RESTING,
         creeping=CREEPING,
+        learning=LEARNING,
         prior=(sigma := np.concatenate([payload, friction, offset, MODEL * arm.level, zero + MOVING])),
         start=np.zeros_like(sigma),
     )
@@ -98,7 +100,7 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
     joints' until no odds of a payload are above the number of spans. Friction and offsets begin with what that motion
     says.
     """
-    noise, n = noise_of(arm, prior), len(arm.level)
+    noise, n = noise_of(arm, prior)._replace(learning=0.0), len(arm.level)
     inertia, late = np.zeros((n, n)), np.zeros((n, n))
     for j in range(n):
         columns, y, used = _lacking(train, j)
@@ -146,7 +148,7 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
     slow = slice(BODY, BODY + 2 * n)
     start[slow] = filter.x[slow]
     prior_now[slow] = np.hypot(np.sqrt(np.diag(filter.P)[slow]), drift)
-    return noise._replace(prior=prior_now, start=start)
+    return noise._replace(prior=prior_now, start=start, learning=LEARNING)
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
