@@ -4,11 +4,13 @@
 [env_steps=N] TWIN ...`
 TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging ones are 1_100 to 1_109 and 2_200 to
 2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
-under computed torque, or under a training's policy; adapt=history with a network of its own (two minutes of a core).
-osi and rma are policies of their own, trained for env_steps=300000 where they are missing, as osi_m1_0 and rma_m1_0
-(`told_words`); osi_untold and rma_untold are these without their adapter. Rows go to ROOT/bench/adapters.csv, each
-only once, and the table of what is there is printed: means over twins and episodes with paired 95 % bootstrap
-intervals. A long run, a quarter of an hour of a core for each policy:
+under computed torque, or under a training's policy ({} in FOLDER is the twin: runs/train/track_{}_identified_0 are
+those of tracking.py); adapt=history with a network of its own (two minutes of a core). A NAME may have settings
+behind it: rls:filter_s=null. osi and rma are policies of their own, trained for env_steps=300000 where they are
+missing, as osi_m1_0 and rma_m1_0 (`told_words`); osi_untold and rma_untold are these without their adapter. Rows go
+to ROOT/bench/adapters.csv, each only once, by several of these beside each other too, if they have other twins. The
+table of what is there is printed: means over twins and episodes with paired 95 % bootstrap intervals. A long run, a
+quarter of an hour of a core for each policy:
 
     python benchmarks/adapters.py adapters=none,observer,rls,history,osi,osi_untold,rma,rma_untold \
         env_steps=1500000 1_0 1_1 2_0
@@ -27,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import yaml
 from common import ROBOT, ROOT, conf, markdown, side_by_side
 
 from r2s.adaptation import adapters as made
@@ -120,7 +123,8 @@ def one(name: str, task, under: str, condition: str, adapter: str, known, policy
     arm, commanded = opened(make, seed, **given)
     silent = adapter == "none" or adapter.endswith("_untold")
     works = None if silent else made_of(adapter, known, networks / f"net_m{name}")
-    driven = DrivenArm(commanded, task, known.dynamics.level, adapter=works)
+    model = known.dynamics
+    driven = DrivenArm(commanded, task, model.level, rotors=model.armature, adapter=works)
     for k in range(len(goals)):
         thing = carried(np.random.default_rng([make, seed, k]), given.get("mass", 0.0))
         arm.carry(thing if thing.mass > 0 else None)
@@ -169,11 +173,12 @@ def under_which(known, bare, folder: Path | str | None, adapter: str):
 
 
 def made_of(adapter: str, known, network: Path):
-    """Return an adapter with the settings of conf/adapt."""
-    settings = {k: v for k, v in conf(f"adapt/{adapter}").items() if k not in ("name", *BESIDE)}
-    if "network" in settings and adapter not in TOLD:
+    """Return an adapter with the settings of conf/adapt, but for those behind its name."""
+    name, *own = adapter.split(":")
+    settings = {k: v for k, v in conf(f"adapt/{name}").items() if k not in ("name", *BESIDE)}
+    if "network" in settings and name not in TOLD:
         settings["network"] = network
-    return getattr(made, adapter)(known, **settings)
+    return getattr(made, name)(known, **settings | {k: yaml.safe_load(v) for k, v in (x.split("=") for x in own)})
 
 
 def paired(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
@@ -265,7 +270,8 @@ def main() -> None:
         each = {}
         for adapter in wanted:
             own = adapter.removesuffix("_untold")
-            folder = told_folder(root, own, kind, name) if own in TOLD else words.get("policy")
+            tracked = words["policy"].format(name) if "policy" in words else None
+            folder = told_folder(root, own, kind, name) if own in TOLD else tracked
             known, task, policy = under_which(shared, bare, folder, own)
             model = ArmBatch(ROBOT, task, known.dynamics, count, 1)
             each[adapter] = known, task, policy, rollout(policy(), model, task, starts, goals)
@@ -280,7 +286,7 @@ def main() -> None:
                 rows = one(
                     name, task, under, condition, adapter, known, policy(), (starts, goals, predicted), root / "train"
                 )
-                pd.concat([old, pd.DataFrame(rows)] if len(old) else [pd.DataFrame(rows)]).to_csv(path, index=False)
+                pd.DataFrame(rows).to_csv(path, mode="a", header=not path.is_file(), index=False)
                 rmse = np.sqrt(np.mean([r["rmse"] ** 2 for r in rows]))
                 seconds = time.process_time() - began
                 print(f"{name} {condition}, {adapter}: {rmse:.2f} mm ({seconds:.0f} s of a core)", flush=True)

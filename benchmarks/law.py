@@ -1,8 +1,8 @@
-"""What the driver's law does to a trained policy, seen every millisecond: python benchmarks/law.py RUN
+"""What the driver's law does to a trained policy, seen every millisecond: python benchmarks/law.py RUN [OF_TWIN ...]
 
 RUN is a run folder of stage=train. Its policy reaches for the first goals that nothing was chosen on, on arms of
-known truth with delays of 0 to 8 ms and on development twins; what is asked for and what is sent are written down in
-every cycle. docs/law.md is made of it.
+known truth with delays of 0 to 8 ms; each OF_TWIN, a training on the identification of a twin, does so on that twin.
+What is asked for and what is sent are written down in every cycle. docs/law.md is made of it.
 
 The action of the law is what is sent less what is asked for. Its spectrum is judged by its largest line above 20 Hz,
 against the largest below: a loop that shakes has its line there.
@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.simulated import SimulatedArm
-from r2s.arm.twin import Twin
+from r2s.arm.twins import twin
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.networks import Policy
@@ -37,7 +37,6 @@ from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
 
 DELAYS_MS = (0, 2, 4, 6, 8)
-TWINS = range(4)
 GOALS = 20
 ARMS, STEPS, TURNS = 32, 25, 41
 ACTIONS = {"gentle": 0.1, "wild": 0.5}  # standard deviation of random actions: the wild are those of a new policy
@@ -61,9 +60,9 @@ class Watched:
         return command
 
 
-def judged(arm, friction, policy, task, starts, goals) -> dict[str, float]:
+def judged(arm, dynamics, policy, task, starts, goals) -> dict[str, float]:
     """Return one row: how the policy does on the arm, and what the law does to it."""
-    driven = DrivenArm(arm, task, friction)
+    driven = DrivenArm(arm, task, dynamics.level, rotors=dynamics.armature)
     watched = driven._driven.driver = Watched(driven._driven.driver)
     row = task.measures(rollout(policy, driven, task, starts, goals))
     asked, sent = np.array(watched.asked), np.array(watched.sent)
@@ -119,32 +118,37 @@ def costs(policy: Policy | None = None) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("actions")
 
 
-def main(folder: str, only_cost: bool = False) -> None:
-    """Write docs/law.md, or print what the law costs."""
-    cfg = OmegaConf.create({"policy": folder})
-    source, trained = trained_config(cfg)
+def loaded(folder: str):
+    """Return the config of a training and what it trained with: robot, dynamics, task and policy."""
+    source, trained = trained_config(OmegaConf.create({"policy": folder}))
     robot = make_robot(trained)
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
-    policy = load_policy(source, robot, task)
-    if only_cost:
-        print(costs(policy).round(1).to_string())
-        return
+    return trained, robot, dynamics, task, load_policy(source, robot, task)
+
+
+def main(folder: str, of_twins: list[str]) -> None:
+    """Write docs/law.md."""
+    trained, robot, dynamics, task, policy = loaded(folder)
     starts, goals = fixed_episodes(robot, task, GOALS)
     rows = {}
     for ms in DELAYS_MS:
         arm = SimulatedArm(
             robot, replace(dynamics, delay=1e-3 * ms, lag=np.float64(2e-3)), position_noise=1e-5, velocity_noise=3e-3
         )
-        rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, dynamics.level, policy, task, starts, goals)
-    for seed in TWINS:
-        rows[f"twin {seed}"] = judged(Twin(robot, seed), dynamics.level, policy, task, starts, goals)
+        rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, dynamics, policy, task, starts, goals)
+    for own in of_twins:
+        _, robot, dynamics, task, its = loaded(own)
+        known = OmegaConf.load(Path(OmegaConf.load(Path(own) / "config.yaml").calibration) / "config.yaml").arm
+        starts, goals = fixed_episodes(robot, task, GOALS)
+        arm = twin(robot, make=known.make, seed=known.seed)
+        rows[f"twin {known.seed} of make {known.make}"] = judged(arm, dynamics, its, task, starts, goals)
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("arm")
     text = f"""# The driver's law at 1 kHz
 
 `python benchmarks/law.py RUN` on {MACHINE}: a policy of {trained.algo.name}, {GOALS} goals on each arm, sensors with
-noise. The law's action is what is sent less what is asked for; a line is the largest of its spectrum over joints and
-episodes.
+noise; on a twin a policy that was trained on its identification. The law's action is what is sent less what is asked
+for; a line is the largest of its spectrum over joints and episodes.
 
 {markdown(table.round(3))}
 
@@ -166,6 +170,10 @@ if __name__ == "__main__":
     if words == ["cost"]:
         print(costs().round(1).to_string())
         raise SystemExit
-    if not words or not Path(words[-1]).is_dir() or words[:-1] not in ([], ["cost"]):
+    folders = words[words[:1] == ["cost"] :]
+    if not folders or not all(Path(x).is_dir() for x in folders):
         raise SystemExit(__doc__)
-    main(words[-1], words[0] == "cost")
+    if folders == words:
+        main(words[0], words[1:])
+    else:
+        print(costs(loaded(folders[0])[-1]).round(1).to_string())

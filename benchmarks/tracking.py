@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from common import NEW, OLD, ROBOT, ROOT, conf, markdown
+from omegaconf import OmegaConf
 
 from r2s.arm.deploy import DrivenArm
 from r2s.arm.interface import Arm
@@ -69,10 +70,10 @@ def identified(name: str, *words: str) -> Dynamics:
     return space.dynamics(x)
 
 
-def judged(arm: Arm, task: TrackTask, friction: np.ndarray, policy: Acts) -> dict:
+def judged(arm: Arm, task: TrackTask, dynamics: Dynamics, policy: Acts) -> dict:
     """Return the measures of an arm behind its driver, and the RMSE of each path."""
     starts, goals = fixed_episodes(ROBOT, task, PATHS)
-    driven = DrivenArm(arm, task, friction)
+    driven = DrivenArm(arm, task, dynamics.level, rotors=dynamics.armature)
     done = rollout(policy, driven, task, starts, goals)
     each = 1e3 * np.sqrt((done.distance**2).mean(1))
     return task.measures(done) | {"stops": len(driven.stops), "each": " ".join(f"{x:.3f}" for x in each)}
@@ -106,7 +107,7 @@ def twins(make: int, seeds: Sequence[int]) -> None:
             if not known(name, f"computed torque, {what}"):
                 dynamics = model()
                 task = TASK.believing(ROBOT, dynamics)
-                row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics.level, Still(ROBOT.n))
+                row = judged(twin(ROBOT, make=make, seed=seed), task, dynamics, Still(ROBOT.n))
                 add({"arm": name, "group": f"make {make}", "what": f"computed torque, {what}"} | row)
 
 
@@ -120,7 +121,7 @@ def simulated(seeds: Sequence[int]) -> None:
         found = identified(model, *told, f"seed={seed}")
         for what, dynamics in {"nominal": OLD, "identified": found, "true": truth}.items():
             if not known(name, f"computed torque, {what}"):
-                row = judged(arm, TASK.believing(ROBOT, dynamics), dynamics.level, Still(ROBOT.n))
+                row = judged(arm, TASK.believing(ROBOT, dynamics), dynamics, Still(ROBOT.n))
                 add({"arm": name, "group": "simulated", "what": f"computed torque, {what}"} | row)
         for k in TRAININGS:
             if not known(name, f"policy, identified, seed {k}"):
@@ -152,15 +153,13 @@ def training(name: str, *words: str) -> str:
     return str(RUNS / "train" / name)
 
 
-def followed(folder: str) -> tuple[TrackTask, np.ndarray, Acts]:
-    """Return the task of a training, the level of friction of its model, and its policy."""
-    from omegaconf import OmegaConf
-
+def followed(folder: str) -> tuple[TrackTask, Dynamics, Acts]:
+    """Return the task of a training, its model, and its policy."""
     source, trained = trained_config(OmegaConf.create({"policy": folder}))
     robot = make_robot(trained)
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
-    return task, dynamics.level, load_policy(source, robot, task)
+    return task, dynamics, load_policy(source, robot, task)
 
 
 def policy(folder: str, make: int, seed: int, what: str | None = None) -> None:
