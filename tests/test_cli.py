@@ -336,6 +336,9 @@ def test_same_seed_same_training(root, trained):
 
 MISTAKES = {
     "stage=identify arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
+    "stage=watch arm.friction=warm": r"arm.friction: 'warm' is not a number",
+    "stage=watch arm.friction=nan": r"arm.friction: nan is not allowed; a number in \[0.1, 3\] is",
+    "stage=watch arm.late=5": r"arm.late: 5 is not allowed; a number in \[0, 0.02\] is",
     "stage=watch arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
     "algo=tqq": r"algo: no option 'tqq'.*tqc",
     "algo.gama=0.9": r"unknown option 'algo.gama'; did you mean 'algo.gamma'",
