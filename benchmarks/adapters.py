@@ -23,7 +23,6 @@ the payload, the same seconds of the same episodes in all conditions.
 import json
 import sys
 import time
-from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,80 +33,25 @@ from common import ROBOT, ROOT, conf, markdown, side_by_side
 
 from r2s.adaptation import adapters as made
 from r2s.arm.deploy import DrivenArm
-from r2s.arm.hidden_arm import HiddenArm
-from r2s.arm.interface import ArmState
 from r2s.arm.twins import twin
 from r2s.learning.batch import ArmBatch
 from r2s.learning.computed_torque import computed_torque
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import load_policy
 from r2s.physics.payload import FARTHEST_M, Payload, ball
-from r2s.physics.robot import SIM_DT
+from r2s.reporting.statistics import paired
 from r2s.stages.adapting import BESIDE, calibrated
 from r2s.tasks.episode import HOLD_S, rollout
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.track import TrackTask
 
 CONDITIONS: dict[str, dict] = {f"{m:g} kg": {"mass": m} for m in (0.0, 0.5, 1.0, 1.5)}
-CONDITIONS |= {"friction 0.8": {"friction": 0.8}, "5 ms later": {"late": 5}}
+CONDITIONS |= {"friction 0.8": {"friction": 0.8}, "5 ms later": {"late": 0.005}}
 TASKS = {"track": TrackTask, "reach": ReachTask}
 SETTLE_S = 1.0
 TOLD = ("osi", "rma")  # adapters that come with a policy
 RESIDUAL = 0.5  # of those on task=track: with a tenth no action holds 1.5 kg
 KEY = ["twin", "under", "condition", "adapter", "episode"]
-
-
-class Late:
-    """An arm whose commands come `cycles` cycles later."""
-
-    def __init__(self, arm: HiddenArm, cycles: int):
-        self.arm, self.robot, self._cycles = arm, arm.robot, cycles
-
-    def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm; see `Arm`."""
-        self._line = deque(np.zeros((self._cycles, self.robot.n)))
-        self._last = np.zeros(self.robot.n)
-        self.arm.move_to(q)
-        return self.read()
-
-    def read(self) -> ArmState:
-        """Return the state; the last command is the one that was given."""
-        return replace(self.arm.read(), tau_J_d=self._last)
-
-    def command(self, tau: np.ndarray) -> None:
-        """Give a command for a later cycle."""
-        self._line.append(np.array(tau))
-        now, step = self.arm.read().tau_J_d, self.robot.dtau_max * SIM_DT  # which lags where one was lost
-        self.arm.command(now + np.clip(self._line.popleft() - now, -step, step))
-        self._last = np.array(tau)
-
-    def stop(self) -> None:
-        """End the motion."""
-        self.arm.stop()
-
-
-def opened(
-    make: int, seed: int, friction: float = 1.0, late: int = 0, **_: float
-) -> tuple[HiddenArm, HiddenArm | Late]:
-    """Return a twin, and what commands it."""
-    arm = twin(ROBOT, make=make, seed=seed)
-    warm(arm, friction)
-    return arm, Late(arm, late) if late else arm
-
-
-def warm(arm: HiddenArm, friction: float) -> None:
-    """Multiply the friction of a twin, but for what goes with its load."""
-    if friction != 1.0:
-        from r2s.arm import elastic_joints, elastic_twin
-        from r2s.arm import twin as rigid
-
-        elastic = isinstance(arm, elastic_twin.ElasticTwin)
-        rows = (
-            [elastic_joints.C_NEG, elastic_joints.C_POS, elastic_joints.VISCOUS]
-            if elastic
-            else [rigid.C_NEG, rigid.C_POS, rigid.S2]
-        )
-        arm._hidden[rows] *= friction  # type: ignore[attr-defined]
 
 
 def carried(rng: np.random.Generator, mass: float) -> Payload:
@@ -120,11 +64,11 @@ def one(name: str, task, under: str, condition: str, adapter: str, known, policy
     """Return a row per episode of one twin, condition and adapter."""
     make, seed = (int(x) for x in name.split("_"))
     given, rows, (starts, goals, predicted) = CONDITIONS[condition], [], episodes
-    arm, commanded = opened(make, seed, **given)
+    arm = twin(ROBOT, make=make, seed=seed, **{k: v for k, v in given.items() if k != "mass"})
     silent = adapter == "none" or adapter.endswith("_untold")
     works = None if silent else made_of(adapter, known, networks / f"net_m{name}")
     model = known.dynamics
-    driven = DrivenArm(commanded, task, model.level, rotors=model.armature, adapter=works)
+    driven = DrivenArm(arm, task, model.level, rotors=model.armature, adapter=works)
     for k in range(len(goals)):
         thing = carried(np.random.default_rng([make, seed, k]), given.get("mass", 0.0))
         arm.carry(thing if thing.mass > 0 else None)
@@ -181,7 +125,7 @@ def made_of(adapter: str, known, network: Path):
     return getattr(made, name)(known, **settings | {k: yaml.safe_load(v) for k, v in (x.split("=") for x in own)})
 
 
-def paired(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
+def intervals(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
     """Return mean and 95 % interval of a measure, a row per condition and a column per adapter.
 
     Twins are drawn, and of each twin its episodes, the same for all adapters. of_squares: the root
@@ -192,12 +136,8 @@ def paired(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
         wide = part.pivot_table(index=["twin", "episode"], columns="adapter", values=of, sort=False)
         wide = wide.astype(float).dropna()
         each = [w.to_numpy() ** (2 if of_squares else 1) for _, w in wide.groupby("twin")]
-        draws = []
-        for _ in range(2000):
-            twins = [each[i] for i in rng.integers(len(each), size=len(each))]
-            draws.append(np.concatenate([t[rng.integers(len(t), size=len(t))] for t in twins]).mean(0))
         power = 0.5 if of_squares else 1.0
-        low, high = np.quantile(np.array(draws) ** power, [0.025, 0.975], axis=0)
+        low, high = np.quantile(paired(each, rng) ** power, [0.025, 0.975], axis=0)
         middle = np.concatenate(each).mean(0) ** power
         scale, digits = (1, 2) if of_squares else (100, 0)
         cells[condition] = {
@@ -221,7 +161,7 @@ def told(frame: pd.DataFrame, task: str, root: Path) -> str:
     wanted = [("rmse", "RMSE, mm", True)] * (task == "track") + [(*success, False), ("gap", "path gap, mm", True)]
     parts = []
     for of, label, of_squares in wanted:
-        table = paired(frame, of, of_squares)
+        table = intervals(frame, of, of_squares)
         parts.append(table.rename(columns=lambda a, label=label: f"{label}: {a}"))
     table = pd.concat(parts, axis=1)
     names = frame["adapter"].unique()

@@ -218,7 +218,7 @@ def test_the_grid_is_what_its_file_says(tmp_path):
 COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / "commands.md")]
 
 
-COSTLY = ("task=track", "stage=watch")  # test_track.py and test_adaptation.py do it in process
+COSTLY = ("task=track", "stage=watch", "-m stage=transfer")  # others do it in process; six transfers
 TYPED = [
     c for c in COMMANDS if not c.startswith(("resume=", "list", "look", "export"))
 ]  # those have tests of their own
@@ -230,6 +230,13 @@ TYPED = [
 def test_command(command, root, recording, trained, identified):
     """Every `python run.py` line of docs/commands.md ends well and says where its files are."""
     command = command.replace("FILE", str(recording)).replace("IDENTIFY_FOLDER", str(identified))
+    if "adapt=" in command:  # adapters want a model that was identified
+        succeed(f"calibration={identified}", "dr=identified", "name=known", f"root={root}", *SHORT)
+        trained = root / "train" / "known"
+    if "runs/transfer" in command:
+        words = ["stage=transfer", f"policy={trained}", "evaluation.episodes=1", f"root={root}"]
+        succeed(*words, "name=carried", "simulator=none", *TOY)
+        command = command.replace("runs/transfer", f"{root}/transfer")
     command = command.replace("TRAIN_FOLDER", str(trained)).replace("runs/train", f"{root}/train")
     command = command.replace("budget.minutes=4", "budget.minutes=0.05")
     toy = TOY if re.search("stage=|oracle", command) else SHORT
@@ -336,6 +343,9 @@ def test_same_seed_same_training(root, trained):
 
 MISTAKES = {
     "stage=identify arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
+    "stage=watch arm.friction=warm": r"arm.friction: 'warm' is not a number",
+    "stage=watch arm.friction=nan": r"arm.friction: nan is not allowed; a number in \[0.1, 3\] is",
+    "stage=watch arm.late=5": r"arm.late: 5 is not allowed; a number in \[0, 0.02\] is",
     "stage=watch arm.payload=2": r"arm.payload: 2 is not allowed; a number in \[0, 1.5\]",
     "algo=tqq": r"algo: no option 'tqq'.*tqc",
     "algo.gama=0.9": r"unknown option 'algo.gama'; did you mean 'algo.gamma'",

@@ -9,6 +9,7 @@ from r2s.arm import twin as hidden
 from r2s.arm.interface import Arm, ArmStopped
 from r2s.arm.tracking import record
 from r2s.arm.twin import Twin
+from r2s.arm.twins import twin
 from r2s.engines.dart import DartEngine
 from r2s.errors import UserError
 from r2s.excitation.fourier import fourier
@@ -31,6 +32,8 @@ SMALL_ARM = """
   </worldbody>
 </mujoco>
 """
+
+AS_DRAWN = {"friction": 1.0, "late": 0.0}
 
 
 @cache
@@ -139,6 +142,67 @@ def test_answers_after_2_to_5_ms(seed):
         idle.command(np.zeros(7))
         pushed.command(np.full(7, 0.5))
     assert 2 <= begun <= 5
+
+
+@pytest.mark.parametrize("late", [1, 5, 20])
+def test_commands_come_so_many_cycles_later(late):
+    """The same answer, `late` cycles later; the arm says at once what it was told."""
+    begun = {}
+    for cycles in (0, late):
+        idle, pushed = (Twin(panda(), 1, late=cycles * 1e-3) for _ in range(2))
+        for arm in (idle, pushed):
+            arm.move_to(panda().q_home)
+        begun[cycles] = -1
+        while np.array_equal(idle.read().tau_J, pushed.read().tau_J):
+            begun[cycles] += 1
+            idle.command(np.zeros(7))
+            pushed.command(np.full(7, 0.5))
+            assert np.array_equal(pushed.read().tau_J_d, np.full(7, 0.5))
+    assert begun[late] - begun[0] == late
+
+
+def test_no_command_of_one_motion_waits_for_the_next():
+    """What an arm that comes later does after `move_to` does not depend on the motion before."""
+    short, long = (Twin(panda(), 2, late=0.01) for _ in range(2))
+    drive(short, 50)
+    drive(long, 333)
+    assert np.array_equal(drive(short, 100), drive(long, 100))
+
+
+@pytest.mark.parametrize("make", [1, 2])
+def test_friction_and_delay_as_drawn_change_nothing(make):
+    """Typed or not, bit for bit."""
+    bare, typed = (drive(twin(panda(), make=make, seed=3, **given), 400) for given in ({}, AS_DRAWN))
+    assert np.array_equal(bare, typed)
+
+
+@pytest.mark.parametrize("make", [1, 2])
+def test_of_less_friction_more_motion_comes(make):
+    """The same pushes move an arm of 0.8 of its friction farther, one of 1.2 less."""
+    far = {}
+    for share in (0.8, 1.0, 1.2):
+        arm = twin(panda(), make=make, seed=3, friction=share)
+        arm.move_to(panda().q_home)
+        push(arm, np.array([4.0, 0, 0, 0, 0, 0, 0]), 250)
+        far[share] = abs(arm._q[0] - panda().q_home[0])
+    assert far[0.8] > far[1.0] > far[1.2]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"friction": -0.5}, r"arm.friction: -0.5 is not allowed; a number in \[0.1, 3\] is"),
+        ({"friction": float("nan")}, "arm.friction: nan is not allowed"),
+        ({"late": -0.001}, r"arm.late: -0.001 is not allowed; a number in \[0, 0.02\] is"),
+        ({"late": float("nan")}, "arm.late: nan is not allowed"),
+        ({"late": 5}, "arm.late: 5 is not allowed"),
+        ({"late": 0.0015}, "arm.late: 0.0015 is not allowed; whole milliseconds from 0 to 0.02 s are"),
+    ],
+)
+@pytest.mark.parametrize("make", [1, 2])
+def test_a_wrong_friction_or_delay_is_said(make, given, message):
+    with pytest.raises(UserError, match=message):
+        twin(panda(), make=make, **given)
 
 
 @pytest.mark.parametrize(

@@ -97,8 +97,10 @@ class ElasticTwin(HiddenArm):
         stiffness: float | None = None,
         noise: int = 0,
         load: Any = None,
+        friction: float = 1.0,
+        late: float = 0.0,
     ):
-        super().__init__(robot, seed, payload, stiffness, noise, load)
+        super().__init__(robot, seed, payload, stiffness, noise, load, friction, late)
         rng = np.random.default_rng([self._seed, 2])
         self._believed = links_of(robot, robot.mass, robot.com, robot.inertia)
         self._bare = links = draw_links(robot, rng)
@@ -109,6 +111,7 @@ class ElasticTwin(HiddenArm):
         unbalanced = at_home - self._gravity(self._links, robot.q_home)
         inertia = self._mass.copy()
         self._hidden = _draw_joints(robot, rng, inertia, unbalanced)
+        self._hidden[[C_NEG, C_POS, VISCOUS]] *= self._friction
         if stiffness is not None:
             self._hidden[STIFF] = robot.tau_max * stiffness / robot.tau_max.max()
         whole = _critical(self._hidden, inertia)

@@ -4,18 +4,20 @@ Each make (twin.py, elastic_twin.py) draws a robot from its seed around the one 
 and friction of its own. Nothing but the make itself reads what was drawn.
 """
 
+from collections import deque
 from typing import Any
 
 import numpy as np
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.compiled import njit
-from r2s.errors import check_number
+from r2s.errors import UserError, check_number
 from r2s.physics.payload import Links, Payload, payload_of
 from r2s.physics.robot import SIM_DT, Robot
 
 ENCODER = 2e-5  # rad
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
+LATEST_S = 0.02  # s, the most of `late`
 
 
 class HiddenArm:
@@ -26,7 +28,7 @@ class HiddenArm:
 
     A make has `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command, `_hold(payload)`, which
     changes what is in its hand, `_seen()`, the sensors' q, dq and tau_J, `_q` and `_dq`, which the reflexes watch,
-    `_cycle` and `_tau_J_d`.
+    `_cycle` and `_tau_J_d`, and multiplies its friction by `_friction`.
 
     Args:
         robot: what it is believed to be. seed: of the robot drawn around that.
@@ -35,18 +37,34 @@ class HiddenArm:
             nothing.
         stiffness: Nm/rad of the strongest joints' gears, the others in proportion to their torque.
         noise: of the sensors, another stream for each: two recordings of one robot have not the same noise.
+        friction: share of the drawn friction that is there, of all but what goes with the load: below 1 for an arm
+            that has warmed up.
+        late: s, by which commands come later than by the make's own delay; whole milliseconds.
 
     Raises:
-        UserError: a payload or load that cannot be, a stiffness that is not above 0 and finite.
+        UserError: a payload or load that cannot be, a stiffness that is not above 0 and finite, a friction or a delay
+            out of its range.
     """
 
-    def __init__(self, robot: Robot, seed: int, payload: Any, stiffness: float | None, noise: int, load: Any = None):
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        payload: Any,
+        stiffness: float | None,
+        noise: int,
+        load: Any = None,
+        friction: float = 1.0,
+        late: float = 0.0,
+    ):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
         self._payload, self._load = payload_of(payload), payload_of(load, "arm.load")
         self._holds = False
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")
         check_number("arm.noise", noise, "[0, inf)", whole=True)
+        check_number("arm.friction", friction, "[0.1, 3]")
+        self._friction, self._late = float(friction), _cycles_late(late)
         self.robot = robot
         self._seed, self._stream = int(seed), int(noise)
         self._reflexes = Reflexes(robot)
@@ -54,6 +72,8 @@ class HiddenArm:
         self._stopped: str | None = "no motion was started; call move_to first"
         self._cycle, self._tau_J_d = 0, np.zeros(robot.n)
         self._q, self._dq = robot.q_home, np.zeros(robot.n)
+        self._waiting: deque[np.ndarray] = deque()  # commands whose time has not come
+        self._said = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
         """Place the arm at rest at q (n,) rad; friction carries what gravity compensation leaves."""
@@ -64,6 +84,7 @@ class HiddenArm:
         self._cycle = 0
         self._grasp()
         self._start(q)
+        self._waiting, self._said = deque(np.zeros((self._late, self.robot.n))), np.zeros(self.robot.n)
         self._episode += 1
         self._stopped = None
         return self.read()
@@ -71,7 +92,7 @@ class HiddenArm:
     def read(self) -> ArmState:
         """Return the sensors' view of the current cycle."""
         q, dq, tau_J = self._seen()
-        return ArmState(self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._tau_J_d.copy())
+        return ArmState(self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._commanded.copy())
 
     def command(self, tau: np.ndarray) -> None:
         """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
@@ -79,9 +100,9 @@ class HiddenArm:
             raise ArmStopped(f"the arm is stopped: {self._stopped}")
         tau = np.array(tau, dtype=float)
         try:
-            self._reflexes.command(tau, self._tau_J_d)
+            self._reflexes.command(tau, self._commanded)
             self._grasp()
-            self._advance(tau)
+            self._advance(self._due(tau) if self._late else tau)
             self._reflexes.state(self._q, self._dq)
         except ArmStopped as reason:
             self._stopped = str(reason)
@@ -97,6 +118,18 @@ class HiddenArm:
         self._payload = payload
         self._hold(payload if payload is not None and payload.there(self._cycle * SIM_DT) else None)
         self._holds = payload is not None and bool(payload.there(self._cycle * SIM_DT))
+
+    @property
+    def _commanded(self) -> np.ndarray:
+        """(n,) Nm, the last command: that was given where commands come later, else that the arm obeys."""
+        return self._said if self._late else self._tau_J_d
+
+    def _due(self, tau: np.ndarray) -> np.ndarray:
+        """Let a command (n,) Nm wait and return the one whose time has come."""
+        self._waiting.append(tau)
+        self._said = tau
+        now, step = self._tau_J_d, self.robot.dtau_max * SIM_DT  # `now` lags where a command was lost on its way
+        return now + np.clip(self._waiting.popleft() - now, -step, step)
 
     def _grasp(self) -> None:
         """Put the payload on or take it off where it is time."""
@@ -116,6 +149,15 @@ class HiddenArm:
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise NotImplementedError
+
+
+def _cycles_late(late: float) -> int:
+    """Return how many cycles `late` s are; raises UserError where it is no whole number of them, or too many."""
+    check_number("arm.late", late, f"[0, {LATEST_S}]")
+    cycles = round(late / SIM_DT)
+    if abs(late / SIM_DT - cycles) > 1e-6:
+        raise UserError(f"arm.late: {late!r} is not allowed; whole milliseconds from 0 to {LATEST_S} s are")
+    return cycles
 
 
 def draw_links(robot: Robot, rng: np.random.Generator) -> Links:

@@ -61,8 +61,10 @@ class Twin(HiddenArm):
         stiffness: float | None = None,
         noise: int = 0,
         load: Any = None,
+        friction: float = 1.0,
+        late: float = 0.0,
     ):
-        super().__init__(robot, seed, payload, stiffness, noise, load)
+        super().__init__(robot, seed, payload, stiffness, noise, load, friction, late)
         rng = np.random.default_rng([self._seed, 0])
         self._links = links = draw_links(robot, rng)
         self._engine = _engine(robot, links)
@@ -70,6 +72,7 @@ class Twin(HiddenArm):
         at_home = self._nominal.gravity_torque(robot.q_home), self._engine.gravity_torque(robot.q_home)
         inertia = 1 / np.diag(np.linalg.inv(self._nominal.mass_matrix(robot.q_home)))
         self._hidden = _draw_joints(robot, rng, inertia, at_home[0] - at_home[1])
+        self._hidden[[C_NEG, C_POS, S2]] *= self._friction
         if stiffness:
             self._hidden[COMPLIANCE] = robot.tau_max.max() / (robot.tau_max * stiffness)
         if self._load is not None:

@@ -20,6 +20,8 @@ def twin(
     stiffness: float | None = None,
     noise: int = 0,
     load: Any = None,
+    friction: float = 1.0,
+    late: float = 0.0,
 ) -> HiddenArm:
     """Return a hidden twin; the other arguments are those of `HiddenArm`.
 
@@ -32,4 +34,4 @@ def twin(
     check_number("arm.make", make, "[1, inf)", whole=True)
     if make not in MAKES:
         raise UserError(f"arm.make: {make} is not allowed; there are {' and '.join(map(str, MAKES))}")
-    return MAKES[make](robot, seed, payload, stiffness, noise, load)
+    return MAKES[make](robot, seed, payload, stiffness, noise, load, friction, late)

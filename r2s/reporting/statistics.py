@@ -36,6 +36,21 @@ def interval(
     return float(low), float(high)
 
 
+def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Return (DRAWS, A), means of a bootstrap that is paired: what is drawn is the same for all A that are compared.
+
+    Arms are drawn, and of each arm its episodes.
+
+    Args:
+        each: per arm (E, A), a row for each of its episodes. rng: what draws.
+    """
+    draws = []
+    for _ in range(DRAWS):
+        arms = [each[i] for i in rng.integers(len(each), size=len(each))]
+        draws.append(np.concatenate([a[rng.integers(len(a), size=len(a))] for a in arms]).mean(0))
+    return np.array(draws)
+
+
 def improvement(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return (...): probability that a draw of x (..., S) is above one of y (..., T); a tie counts half."""
     above = x[..., :, None] > y[..., None, :]

@@ -1,7 +1,7 @@
 """Finished trainings, read from their run folders; and which of them can be compared at all."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,33 +56,47 @@ def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[s
     Raises:
         UserError: there is no finished training.
     """
-    trained, others = [], {}
-    for folder in map(Path, folders):
-        if why := _why_not(folder):
-            others[folder.name] = why
-            continue
-        try:
-            trained.append(_read(folder))
-        except (KeyError, TypeError, ValueError, yaml.YAMLError):  # somebody wrote into it
-            others[folder.name] = "unreadable"
+    trained, others = trainings_among(folders)
     if not trained:
         seen = f"; seen: {'; '.join(in_words(others))}" if others else ""
         raise UserError(f"runs: no finished run of stage=train among them, such as runs='runs/train/*' has{seen}")
     return trained, others
 
 
-def _why_not(folder: Path) -> str:
-    """Return why a folder is no finished training, "" where it is one."""
+def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
+    """Return what `read_trainings` does, also where there is none."""
+    trained, others = [], {}
+    for folder in map(Path, folders):
+        if why := why_not(folder, "train", FILES):
+            others[folder.name] = why
+            continue
+        try:
+            trained.append(_read(folder))
+        except (KeyError, TypeError, ValueError, yaml.YAMLError):  # somebody wrote into it
+            others[folder.name] = "unreadable"
+    return trained, others
+
+
+def why_not(folder: Path, of: str, files: Iterable[str]) -> str:
+    """Return why a folder is no finished run of the stage `of`, with these files; "" where it is one."""
     try:
         meta = json.loads((folder / "meta.json").read_text())
         stage, status = meta.get("stage", "train"), meta["status"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return "no run folder"
-    if stage != "train":
+    if stage != of:
         return f"stage={stage}"
     if status != "done":
         return UNFINISHED.get(status, status)
-    return "" if all((folder / name).is_file() for name in FILES) else "incomplete"
+    missing = [name for name in files if not (folder / name).is_file()]
+    return f"it has no {missing[0]}" if missing else ""
+
+
+def typed_in(folder: Path) -> dict[str, str]:
+    """Return what was typed for a run: {"dr": "paper", "algo.lr": "5e-4"}."""
+    words = yaml.safe_load((folder / "overrides.yaml").read_text()) or []
+    pairs = (word.lstrip("+~").partition("=") for word in words)
+    return {key: value for key, _, value in pairs}
 
 
 def _read(folder: Path) -> Trained:
@@ -96,11 +110,7 @@ def _read(folder: Path) -> Trained:
         read.add("adapt")
     if name in CONTROLLERS:
         read -= {"budget", "reward"}
-    typed = {}
-    for word in yaml.safe_load((folder / "overrides.yaml").read_text()) or []:
-        key, _, value = word.lstrip("+~").partition("=")
-        if key.split(".")[0] in read | {"experiment"}:
-            typed[key] = value
+    typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
     budget = config.get("budget", {})
     curve = pd.read_csv(folder / "evaluations.csv")
     if curve.empty:
@@ -115,8 +125,8 @@ def _read(folder: Path) -> Trained:
         folder,
         int(config["seed"]),
         name,
-        dict(_flat({k: v for k, v in config.items() if k in read})),
-        dict(_flat({k: v for k, v in config.items() if k in ALIKE}))
+        dict(flat({k: v for k, v in config.items() if k in read})),
+        dict(flat({k: v for k, v in config.items() if k in ALIKE}))
         | {"evaluation.episodes": config.get("evaluation", {}).get("episodes")},
         typed,
         typed.get("experiment") == "toy",
@@ -171,10 +181,10 @@ def in_words(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str
     return [f"{', '.join(names[:most])}{more[reason]} ({reason})" for reason, names in reasons.items()]
 
 
-def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Give ("a.b", value) of nested dicts; classes (`_target_`) are no settings."""
     for key, value in node.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from flat(value, f"{prefix}{key}.")
         elif key != "_target_":
             yield f"{prefix}{key}", value

@@ -109,6 +109,21 @@ def trained_with(source):
     return config.adapt.name if "adapt" in config and is_told(config) else "none"
 
 
+def trained_minutes(cfg, source):
+    """Return the minutes that a training took which conf/adapt alone needs; None where its folder does not say.
+
+    It is that of the policy in `source` where it is told something, that of the network where one is taught.
+    """
+    from r2s.runs import read_meta
+
+    if not is_told(cfg) and not is_taught(cfg):
+        return 0.0
+    try:
+        return read_meta(source if is_told(cfg) else Path(cfg.adapt.network))["wall_clock_s"] / 60
+    except (UserError, KeyError):  # a policy or a network may come without its meta.json
+        return None
+
+
 def told_of(cfg, robot):
     """Return what a policy is told with conf/adapt, `Told`; None: nothing."""
     from r2s.adaptation.telling import said_count

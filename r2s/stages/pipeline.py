@@ -134,7 +134,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return what a chain runs, one {label: words of a command} per step: identify, train, transfer.
 
     The two trainings have the same recipe, time and machine, so that what differs on the arm is the model. With an
-    adapter what the arm carries is not there while it is identified: nobody announces it.
+    adapter what the arm carries, and how it has changed, is not there while it is identified: nobody announces it.
 
     Args:
         cfg: of the pipeline. name: of this chain; its steps are named after it.
@@ -180,8 +180,9 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
         if label == ADAPTED and is_taught(cfg):
             given.append(f"adapt.network={root / 'train' / f'{name}_{ADAPTED}'}")
         transferred[label] = step("transfer", label, *given, typed=overrides if label == ADAPTED else bare)
+    as_it_is = without("arm.payload", "arm.load", "arm.friction", "arm.late") if adapts else overrides
     return [
-        {"identify": step("identify", "identify", typed=without("arm.payload", "arm.load") if adapts else overrides)},
+        {"identify": step("identify", "identify", typed=as_it_is)},
         trained,
         transferred,
     ]

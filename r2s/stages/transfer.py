@@ -1,6 +1,7 @@
 """stage=transfer: the same policy and goals in simulators and on an arm."""
 
 import os
+import shutil
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -9,7 +10,7 @@ from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.progress import Progress
-from r2s.stages.adapting import is_told, make_adapter
+from r2s.stages.adapting import is_told, make_adapter, trained_minutes
 from r2s.stages.build import (
     console,
     is_learner,
@@ -228,6 +229,7 @@ def transfer(cfg, overrides):
     episodes: dict = {}
     there = OnArm([], None, [], None, None)
     with opened as driven, open_run(cfg, overrides, parents=[str(asked.source)]) as run:
+        shutil.copyfile(asked.source / "config.yaml", run.folder / "policy.yaml")
         if twin:  # first: it forks, and then there are no threads yet
             there = on_twin(cfg, asked, opens)
         if asked.draw is not None:
@@ -243,6 +245,8 @@ def transfer(cfg, overrides):
                 there = on_arm(cfg, asked, driven, predicted)
         if name != "none":
             row: dict = {"stops": len(there.stops), "episodes": len(there.tried), "asked": len(goals)}
+            if adapter is not None:
+                row["adapter_minutes"] = trained_minutes(cfg, asked.source)
             if len(there.tried):
                 row = task.measures(there.episodes) | row
                 episodes[name] = there.episodes
