@@ -6,7 +6,7 @@ TWIN is MAKE_SEED, by default the development twins 1_0 1_1 2_0; the judging one
 2_209. Each with its own identified model (stage=identify, a minute or two where it is missing, as m1_0 beneath root),
 under computed torque, or under a training's policy ({} in FOLDER is the twin: runs/train/track_{}_identified_0 are
 those of tracking.py); adapt=history with a network of its own (two minutes of a core). A NAME may have settings
-behind it: rls:filter_s=null. osi and rma are policies of their own, trained for env_steps=300000 where they are
+behind it: observer:filter_s=0.03. osi and rma are policies of their own, trained for env_steps=300000 where they are
 missing, as osi_m1_0 and rma_m1_0 (`told_words`); osi_untold and rma_untold are these without their adapter. Rows go
 to ROOT/bench/adapters.csv, each only once, by several of these beside each other too, if they have other twins. The
 table of what is there is printed: means over twins and episodes with paired 95 % bootstrap intervals. A long run, a

@@ -61,9 +61,9 @@ def observer(known: Known, filter_s: float) -> Observer:
     return Observer(known.arm, filter_s)
 
 
-def rls(known: Known, filter_s: float) -> Compensation:
-    """Return compensation by the recursive estimate: `adapt=rls`; raises UserError as of `Compensation`."""
-    return Compensation(known.arm, known.noise, filter_s)
+def rls(known: Known) -> Compensation:
+    """Return compensation by the recursive estimate: `adapt=rls`."""
+    return Compensation(known.arm, known.noise)
 
 
 def osi(known: Known) -> Telling:

@@ -10,24 +10,24 @@ c^2 - s^2 is an unbiased estimate of c*^2, which gives
 
 (James and Stein's shrinkage of 1961, its positive part, of one number): nothing of what may as well be zero.
 
-What is added follows the motion at once, but a change of the estimate comes in through a low-pass. A step of the
+What is added follows the motion at once, but a new estimate comes in over a span, through a low-pass. A step of the
 torque twists elastic gears, and makes motors run ahead of their links; the balance of momentum takes that for a
-torque that lacks, and so for another payload. On make 2 a step of 30 Nm at each new estimate kept itself going, at
-25 Hz.
+torque that lacks, and so for another payload. On a development twin of make 2 steps of 30 Nm
+kept themselves going, at 25 Hz.
 """
 
 import numpy as np
 
 from r2s.adaptation.believed import Believed
 from r2s.adaptation.estimator import Estimator
-from r2s.adaptation.kalman import Noise
+from r2s.adaptation.kalman import Noise, T
 from r2s.adaptation.momentum import BODY
-from r2s.adaptation.observer import low_pass
 from r2s.compiled import njit
 from r2s.physics.limits import RATE
 from r2s.physics.payload import FARTHEST_M, MOST_KG, WATER
 from r2s.physics.robot import SIM_DT
 
+COMES = -np.expm1(-SIM_DT / T)  # of what is still to come in of an estimate, in a cycle
 RATE_S = 1 / RATE  # s, of the low-pass from which accelerations are told: a late arm bears a loop of that rate
 
 
@@ -36,14 +36,10 @@ class Compensation:
 
     Args:
         arm: what is believed of it. noise: how wrong that may be.
-        filter_s: s, the constant of the low-pass through which a change of the estimate comes in.
-
-    Raises:
-        UserError: a constant that is not above 0.
     """
 
-    def __init__(self, arm: Believed, noise: Noise, filter_s: float):
-        self._arm, self._noise, self._n, self._share = arm, noise, len(arm.level), low_pass(filter_s)
+    def __init__(self, arm: Believed, noise: Noise):
+        self._arm, self._noise, self._n = arm, noise, len(arm.level)
         self.begin()
 
     def begin(self) -> None:
@@ -51,7 +47,7 @@ class Compensation:
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._carried, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
-        self._says, self._lacks = np.zeros(n), np.zeros(n)  # the estimate now; what is still to come in of it
+        self._says, self._lacks = np.zeros(n), np.zeros(n)  # the estimate; what is still to come in of it
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Hear a cycle and return (n,) Nm to add; arguments as of `Adapter`."""
@@ -64,7 +60,7 @@ class Compensation:
         _say(filter, kept, self._carried, self._weight, self._slow, self._says)
         if new:
             self._lacks += self._says - before
-        self._lacks *= 1.0 - self._share
+        self._lacks *= 1.0 - COMES
         return self._says - self._lacks
 
 

@@ -29,7 +29,8 @@ class Observer:
     """
 
     def __init__(self, arm: Believed, filter_s: float):
-        self._arm, self._share = arm, low_pass(filter_s)
+        check_number("filter_s", filter_s, "(0, inf)")
+        self._arm, self._share = arm, -np.expm1(-SIM_DT / filter_s)
         self.begin()
 
     def begin(self) -> None:
@@ -42,12 +43,6 @@ class Observer:
         """Hear a cycle and return (n,) Nm to add; arguments as of `Adapter`."""
         _hear(self._arm, self._kept, self._balance, q, dq, tau, self._share, self._aim, self._lacks)
         return self._lacks
-
-
-def low_pass(filter_s: float) -> float:
-    """Return the share of the way that a low-pass goes in a cycle; arguments and errors as of `Observer`."""
-    check_number("filter_s", filter_s, "(0, inf)")
-    return float(-np.expm1(-SIM_DT / filter_s))
 
 
 @njit(cache=True, error_model="numpy")
