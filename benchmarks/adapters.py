@@ -9,8 +9,8 @@ those of tracking.py); adapt=history with a network of its own (two minutes of a
 behind it: observer:filter_s=0.03. osi and rma are policies of their own, trained for env_steps=300000 where they are
 missing, as osi_m1_0 and rma_m1_0 (`told_words`); osi_untold and rma_untold are these without their adapter. Rows go
 to ROOT/bench/adapters.csv, each only once, by several of these beside each other too, if they have other twins. The
-table of what is there is printed: means over twins and episodes with paired 95 % bootstrap intervals. A long run, a
-quarter of an hour of a core for each policy:
+tables of what is there, of each make, are printed and put into docs/league.md where it has a place for them: means
+over twins and episodes with paired 95 % bootstrap intervals. A long run, a quarter of an hour of a core a policy:
 
     python benchmarks/adapters.py adapters=none,observer,rls,history,osi,osi_untold,rma,rma_untold \
         env_steps=1500000 1_0 1_1 2_0
@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import yaml
-from common import ROBOT, ROOT, conf, markdown, side_by_side
+from common import MACHINE, ROBOT, ROOT, conf, markdown, put_table, side_by_side
 
 from r2s.adaptation import adapters as made
 from r2s.arm.deploy import DrivenArm
@@ -165,7 +165,6 @@ def told(frame: pd.DataFrame, task: str, root: Path) -> str:
         parts.append(table.rename(columns=lambda a, label=label: f"{label}: {a}"))
     table = pd.concat(parts, axis=1)
     names = frame["adapter"].unique()
-    table = table[[c for a in names for c in table.columns if c.endswith(f": {a}")]]
     cost = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'us'].mean():.0f}" for a in names)
     stops = ", ".join(f"{a} {frame.loc[frame['adapter'] == a, 'stopped'].sum():.0f}" for a in names)
     trained = ", ".join(f"{a} {minutes(a, root, task, list(frame['twin'].unique())):.0f}" for a in names)
@@ -231,7 +230,12 @@ def main() -> None:
                 seconds = time.process_time() - began
                 print(f"{name} {condition}, {adapter}: {rmse:.2f} mm ({seconds:.0f} s of a core)", flush=True)
     frame = pd.read_csv(path)
-    print(told(frame[(frame["under"] == under) & frame["twin"].isin(names)], kind, root))
+    frame = frame[(frame["under"] == under) & frame["twin"].isin(names) & frame["adapter"].isin(wanted)]
+    for make, own in frame.groupby(frame["twin"].str[0]):
+        seeds = ", ".join(sorted(name[2:] for name in own["twin"].unique()))
+        head = f"Make {make}, twins {seeds}, {own['episode'].nunique()} episodes each, on {MACHINE}:"
+        print(text := f"{head}\n\n{told(own, kind, root)}\n")
+        put_table(ROOT / "docs" / "league.md", f"{under}, make {make}", text)
 
 
 if __name__ == "__main__":

@@ -127,6 +127,14 @@ def put_section(page: Path, heading: str, parts: Sequence[str]) -> None:
     page.write_text(before.rstrip("\n") + "\n\n" + begin + "\n" + "\n\n".join(parts) + "\n" + rest)
 
 
+def put_table(page: Path, name: str, text: str) -> None:
+    """Write what stands on a page between the markers of a table anew, where it has markers of that name."""
+    begin, end = f"<!-- table: {name} -->\n", "<!-- end of the table -->\n"
+    before, found, after = page.read_text().partition(begin)
+    if found:
+        page.write_text(before + begin + text + end + after.partition(end)[2])
+
+
 __all__ = [
     "MACHINE",
     "NEW",
@@ -141,4 +149,4 @@ __all__ = [
     "poses_about",
     "ramp",
 ]
-__all__ += ["markdown", "put_section", "record", "replace", "searches", "side_by_side"]
+__all__ += ["markdown", "put_section", "put_table", "record", "replace", "searches", "side_by_side"]

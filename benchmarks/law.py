@@ -37,7 +37,7 @@ from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
 
 DELAYS_MS = (0, 2, 4, 6, 8)
-GOALS = 20
+GOALS = 50
 ARMS, STEPS, TURNS = 32, 25, 41
 ACTIONS = {"gentle": 0.1, "wild": 0.5}  # standard deviation of random actions: the wild are those of a new policy
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, ROOT, markdown, side_by_side
+from common import MACHINE, ROOT, markdown, put_table, side_by_side
 from payload_parts import (
     FALL,
     JUDGING,
@@ -133,9 +133,7 @@ def write(part: str, rows: pd.DataFrame, command: str) -> None:
     """Print the table of a part and put it between its markers."""
     text = f"`{command}` on {MACHINE}. {said(part, rows)}\n\n{markdown(told(part, rows))}\n"
     print(f"\n{text}")
-    begin, end = f"<!-- table: {part} -->\n", "<!-- end of the table -->\n"
-    before, _, after = DOCS.read_text().partition(begin)
-    DOCS.write_text(before + begin + text + end + after.partition(end)[2])
+    put_table(DOCS, part, text)
 
 
 def wanted(words: dict[str, str], seeds: list[int]) -> list[tuple[int, int]]:
