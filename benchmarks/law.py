@@ -129,7 +129,8 @@ def loaded(folder: str):
 
 def main(folder: str, of_twins: list[str]) -> None:
     """Write docs/law.md."""
-    trained, robot, dynamics, task, policy = loaded(folder)
+    _, robot, dynamics, task, policy = loaded(folder)
+    typed = [w for w in OmegaConf.load(Path(folder) / "overrides.yaml") if not w.startswith(("name=", "threads="))]
     starts, goals = fixed_episodes(robot, task, GOALS)
     rows = {}
     for ms in DELAYS_MS:
@@ -146,8 +147,8 @@ def main(folder: str, of_twins: list[str]) -> None:
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("arm")
     text = f"""# The driver's law at 1 kHz
 
-`python benchmarks/law.py RUN` on {MACHINE}: a policy of {trained.algo.name}, {GOALS} goals on each arm, sensors with
-noise; on a twin a policy that was trained on its identification. The law's action is what is sent less what is asked
+`python benchmarks/law.py RUN OF_TWIN ...` on {MACHINE}, {GOALS} goals on each arm, sensors with noise. RUN is a training
+with `{" ".join(typed)}`; on a twin a policy acts that was trained on its identification. The law's action is what is sent less what is asked
 for; a line is the largest of its spectrum over joints and episodes.
 
 {markdown(table.round(3))}
