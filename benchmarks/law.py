@@ -119,17 +119,17 @@ def costs(policy: Policy | None = None) -> pd.DataFrame:
 
 
 def loaded(folder: str):
-    """Return the config of a training and what it trained with: robot, dynamics, task and policy."""
+    """Return what a training trained with: robot, dynamics, task and policy."""
     source, trained = trained_config(OmegaConf.create({"policy": folder}))
     robot = make_robot(trained)
     dynamics = make_dynamics(trained, robot)
     task = make_task(trained, robot, dynamics)
-    return trained, robot, dynamics, task, load_policy(source, robot, task)
+    return robot, dynamics, task, load_policy(source, robot, task)
 
 
 def main(folder: str, of_twins: list[str]) -> None:
     """Write docs/law.md."""
-    _, robot, dynamics, task, policy = loaded(folder)
+    robot, dynamics, task, policy = loaded(folder)
     typed = [w for w in OmegaConf.load(Path(folder) / "overrides.yaml") if not w.startswith(("name=", "threads="))]
     starts, goals = fixed_episodes(robot, task, GOALS)
     rows = {}
@@ -139,7 +139,7 @@ def main(folder: str, of_twins: list[str]) -> None:
         )
         rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, dynamics, policy, task, starts, goals)
     for own in of_twins:
-        _, robot, dynamics, task, its = loaded(own)
+        robot, dynamics, task, its = loaded(own)
         known = OmegaConf.load(Path(OmegaConf.load(Path(own) / "config.yaml").calibration) / "config.yaml").arm
         starts, goals = fixed_episodes(robot, task, GOALS)
         arm = twin(robot, make=known.make, seed=known.seed)
@@ -147,9 +147,9 @@ def main(folder: str, of_twins: list[str]) -> None:
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("arm")
     text = f"""# The driver's law at 1 kHz
 
-`python benchmarks/law.py RUN OF_TWIN ...` on {MACHINE}, {GOALS} goals on each arm, sensors with noise. RUN is a training
-with `{" ".join(typed)}`; on a twin a policy acts that was trained on its identification. The law's action is what is sent less what is asked
-for; a line is the largest of its spectrum over joints and episodes.
+`python benchmarks/law.py RUN OF_TWIN ...` on {MACHINE}, {GOALS} goals on each arm, sensors with noise.
+RUN is a training with `{" ".join(typed)}`; on a twin a policy acts that was trained on its identification.
+The law's action is what is sent less what is asked for; a line is the largest of its spectrum over joints and episodes.
 
 {markdown(table.round(3))}
 
