@@ -149,7 +149,7 @@ def main(folder: str, of_twins: list[str]) -> None:
 
 `python benchmarks/law.py RUN OF_TWIN ...` on {MACHINE}, {GOALS} goals on each arm, sensors with noise.
 RUN is a training with `{" ".join(typed)}`; on a twin a policy acts that was trained on its identification.
-The law's action is what is sent less what is asked for; a line is the largest of its spectrum over joints and episodes.
+The law's action is what is sent less what is asked for; a line is its spectrum's largest over joints and episodes.
 
 {markdown(table.round(3))}
 
