@@ -127,8 +127,17 @@ def loaded(folder: str):
     return robot, dynamics, task, load_policy(source, robot, task)
 
 
+def which_twin(folder: str):
+    """Return conf/arm of the twin that the calibration of a training was identified on, or end with one line."""
+    found = Path(OmegaConf.load(Path(folder) / "config.yaml").calibration or "") / "config.yaml"
+    if not found.is_file():
+        raise SystemExit(f"error: {folder} was not trained on an identification that is there from here: no {found}")
+    return OmegaConf.load(found).arm
+
+
 def main(folder: str, of_twins: list[str]) -> None:
     """Write docs/law.md."""
+    twins = {own: which_twin(own) for own in of_twins}
     robot, dynamics, task, policy = loaded(folder)
     typed = [w for w in OmegaConf.load(Path(folder) / "overrides.yaml") if not w.startswith(("name=", "threads="))]
     starts, goals = fixed_episodes(robot, task, GOALS)
@@ -138,9 +147,8 @@ def main(folder: str, of_twins: list[str]) -> None:
             robot, replace(dynamics, delay=1e-3 * ms, lag=np.float64(2e-3)), position_noise=1e-5, velocity_noise=3e-3
         )
         rows[f"simulated, {ms} ms + 2 ms of lag"] = judged(arm, dynamics, policy, task, starts, goals)
-    for own in of_twins:
+    for own, known in twins.items():
         robot, dynamics, task, its = loaded(own)
-        known = OmegaConf.load(Path(OmegaConf.load(Path(own) / "config.yaml").calibration) / "config.yaml").arm
         starts, goals = fixed_episodes(robot, task, GOALS)
         arm = twin(robot, make=known.make, seed=known.seed)
         rows[f"twin {known.seed} of make {known.make}"] = judged(arm, dynamics, its, task, starts, goals)

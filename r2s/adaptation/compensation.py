@@ -12,8 +12,8 @@ c^2 - s^2 is an unbiased estimate of c*^2, which gives
 
 What is added follows the motion at once, but a new estimate comes in over a span, through a low-pass. A step of the
 torque twists elastic gears, and makes motors run ahead of their links; the balance of momentum takes that for a
-torque that lacks, and so for another payload. On a development twin of make 2 steps of 30 Nm
-kept themselves going, at 25 Hz.
+torque that lacks, and so for another payload. On a development twin of make 2 steps of 30 Nm kept themselves going,
+at 25 Hz.
 """
 
 import numpy as np

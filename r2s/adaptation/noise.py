@@ -21,7 +21,7 @@ WARMING = 0.02  # 1/sqrt(s): a fifth in 100 s
 DRIFTED, DRIFTING = 0.05, 0.005  # of friction's level; per sqrt(s)
 RESTING = 0.1  # kg^2/s
 CREEPING = 0.01  # 1/sqrt(s)
-LEARNING = 0.04  # of 25 spans, half a second
+LEARNING = 0.04  # per span: what surprises has half a second to become noise
 LASTING = 0.3  # s
 # where no motion without a payload says how wrong the model is: shares of friction's level
 WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
