@@ -62,6 +62,7 @@ def of_events(rows: pd.DataFrame) -> dict[str, str]:
     return within(rows) | {
         "seen in 0.2 s in motion": f"{rows['seen'].sum() - seen} of {2 * len(rows) - rest}",
         "at rest": f"{seen} of {rest}",
+        "all, in 0.2 s of motion": f"{rows['seen_moving'].sum()} of {2 * len(rows)}",
         "other alarms in an hour": f"{rows['false'].mean() * 3600 / SECONDS:.0f}",
         "µs": f"{rows['us'].median():.0f}",
     }

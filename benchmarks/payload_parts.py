@@ -10,10 +10,12 @@ import numpy as np
 import yaml
 from common import ROBOT, fourier, record, replace
 
+from r2s.adaptation.balance import SPAN
 from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.kalman import Noise, T
-from r2s.adaptation.listen import listen, noise
+from r2s.adaptation.listen import learn, listen
+from r2s.adaptation.refinement import Beyond, refined
 from r2s.arm import elastic_joints as elastic
 from r2s.arm import twin as rigid
 from r2s.arm.elastic_twin import ElasticTwin
@@ -28,7 +30,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.recordings.readers import read
 
 SECONDS = 12.0  # of a motion
-LEARN, SOON_S, LATE_S = round(2.0 / T), 0.2, 0.5
+LEARN, SOON_S, LATE_S = round(2.0 / T), 0.2 + 1e-9, 0.5 + 1e-9
 PIECE = 25  # unloaded motions that one estimator hears in a row: 5 minutes
 FALL, TAU_S, COLD, WARMS = 0.25, 60.0, 3, 20  # of friction; motions before it warms, and while
 NEAR = 0.1  # of the change
@@ -43,6 +45,7 @@ class Known(NamedTuple):
     make: int
     seed: int
     dynamics: Dynamics
+    more: Beyond
     noise: Noise
 
     def arm(self, stream: int, **given) -> HiddenArm:
@@ -51,7 +54,8 @@ class Known(NamedTuple):
 
     def ear(self, load=None) -> Estimator:
         """Return an estimator that has heard nothing, of an arm that was told of this load."""
-        return Estimator(believed(ROBOT, loaded(ROBOT, self.dynamics, None, payload_of(load))), self.noise)
+        arm = believed(ROBOT, loaded(ROBOT, self.dynamics, None, payload_of(load)))
+        return Estimator(refined(arm, self.more), self.noise)
 
 
 def folder(root: Path, make: int, seed: int) -> Path:
@@ -75,7 +79,7 @@ def known(root: Path, make: int, seed: int) -> Known:
     space, x = load_parameters(at, ROBOT)
     unloaded = tuple(read(at / f"{name}.npz", torque="commanded") for name in ("train", "validation"))
     dynamics = space.dynamics(x)
-    return Known(make, seed, dynamics, noise(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded))
+    return Known(make, seed, dynamics, *learn(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded))
 
 
 @cache
@@ -125,10 +129,17 @@ def events(of: Known, k: int) -> list[dict]:
     told = listen(ROBOT, ear, heard)
     us = 1e6 * (time.process_time() - began) / len(heard.t)
     at = (thing.on_s, thing.off_s)
-    seen = [min((c - s for c in ear.changes if 0 < c - s <= LATE_S), default=np.nan) for s in at]
-    real = sum(any(0 < c - s <= LATE_S for s in at) for c in ear.changes)
+
+    def moves(since: float, until: float) -> float:
+        """Return for how many s of that time the arm moved."""
+        return T * sum(not e.rests for e in told if since < e.t <= until)
+
+    moved = [[moves(s, c) for c in ear.changes if c > s] for s in at]
+    real = sum(any(c > s and moves(s, c) <= LATE_S for s in at) for c in ear.changes)
+    seen = [min((c - s for c in ear.changes if c > s), default=np.nan) for s in at]
     rests = [all(e.rests for e in told if s <= e.t <= s + SOON_S) for s in at]
     late = {"on_after": seen[0], "off_after": seen[1], "seen": sum(x <= SOON_S for x in seen)}
+    late |= {"seen_moving": sum(min(m, default=np.inf) <= SOON_S for m in moved)}
     late |= {"at_rest": sum(rests), "seen_at_rest": sum(x <= SOON_S for x, r in zip(seen, rests, strict=True) if r)}
     return [errors(told, thing) | late | {"false": len(ear.changes) - real, "us": us}]
 
@@ -220,10 +231,12 @@ def warming(of: Known, k: int) -> list[dict]:
     told, cold, scale, rub, slides = [], [], [], [], []
 
     def spans(cycles: list) -> np.ndarray:
-        """Return means as of a balance: of a span and the one before, a triangle."""
+        """Return means as of a balance: between triangles of two spans each."""
         c = np.cumsum(np.array(cycles), axis=0)
-        means = c[: len(c) // 20 * 20].reshape(-1, 20, *c.shape[1:]).mean(1)
-        return np.diff(means, axis=0) / 20
+        whole = c[: len(c) // SPAN * SPAN].reshape(-1, SPAN, *c.shape[1:])
+        rises = np.arange(1, SPAN + 1) / SPAN**2
+        triangles = np.tensordot(whole[:-1], rises, (1, 0)) + np.tensordot(whole[1:], 1 / SPAN - rises, (1, 0))
+        return np.diff(triangles, axis=0) / SPAN
 
     for i in range(COLD + WARMS):
         since = len(arm.scale)

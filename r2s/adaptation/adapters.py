@@ -13,8 +13,9 @@ from r2s.adaptation.believed import Believed, believed
 from r2s.adaptation.compensation import Compensation
 from r2s.adaptation.history import History, Network, inputs
 from r2s.adaptation.kalman import Noise
-from r2s.adaptation.listen import noise
+from r2s.adaptation.listen import learn
 from r2s.adaptation.observer import Observer
+from r2s.adaptation.refinement import refined
 from r2s.adaptation.telling import Latent, Telling
 from r2s.errors import UserError
 from r2s.files import DAMAGED, whole
@@ -51,9 +52,10 @@ class Known:
         return believed(self.robot, self.dynamics)
 
     @cached_property
-    def noise(self) -> Noise:
-        """How wrong that may be."""
-        return noise(self.robot, self.dynamics, self.posterior, self.unloaded)
+    def learnt(self) -> tuple[Believed, Noise]:
+        """The arm with what motion without a payload says of it, and how wrong that may be."""
+        more, noise = learn(self.robot, self.dynamics, self.posterior, self.unloaded)
+        return refined(self.arm, more), noise
 
 
 def observer(known: Known, filter_s: float) -> Observer:
@@ -63,14 +65,14 @@ def observer(known: Known, filter_s: float) -> Observer:
 
 def rls(known: Known) -> Compensation:
     """Return compensation by the recursive estimate: `adapt=rls`."""
-    return Compensation(known.arm, known.noise)
+    return Compensation(*known.learnt)
 
 
 def osi(known: Known) -> Telling:
     """Return what tells a policy the recursive estimate: `adapt=osi`."""
     place, axes = hand(known.robot)
     mass, moments = known.dynamics.told[0], known.dynamics.told[1:]
-    return Telling(known.arm, known.noise, np.concatenate([[mass], (moments - mass * place) @ axes]))
+    return Telling(*known.learnt, np.concatenate([[mass], (moments - mass * place) @ axes]))
 
 
 def rma(known: Known, network: str | Path | None) -> Latent:

@@ -29,6 +29,8 @@ class Believed(NamedTuple):
     Attributes:
         links: (n, LINK). moments: (n, 4), what gravity compensation believes. hand: (12,). gravity: (3,).
         armature: (n,). offset, load: (n,). drag: (n, 2); as of `Dynamics`.
+        turn: (n, 2) Nm, friction that goes with sin q and cos q. gives: (n,) rad/Nm, by which a gear bends; no
+            identification looks for these (refinement.py).
         table: (n, 3, 2 POINTS - 1) Nm. fastest: (n,) rad/s at its end. presliding: (n,) rad.
         level: (n,) Nm, of sliding friction. edge: (n,) Nm, what holds a joint at rest at most.
         late: (2,) cycles, delay and lag.
@@ -42,6 +44,8 @@ class Believed(NamedTuple):
     offset: np.ndarray
     load: np.ndarray
     drag: np.ndarray
+    turn: np.ndarray
+    gives: np.ndarray
     table: np.ndarray
     fastest: np.ndarray
     presliding: np.ndarray
@@ -76,6 +80,8 @@ def believed(robot: Robot, d: Dynamics) -> Believed:
         offset=np.array(d.offset, dtype=float),
         load=np.array(d.load, dtype=float),
         drag=np.array(d.drag, dtype=float),
+        turn=np.zeros((robot.n, 2)),
+        gives=np.zeros(robot.n),
         table=np.ascontiguousarray(np.stack([up, down, flat]).transpose(2, 0, 1)),
         fastest=fastest,
         presliding=np.array(distance, dtype=float),

@@ -8,7 +8,8 @@ share by which its momentum changes less than is believed, which comes and goes 
 The test is Willsky and Jones' (IEEE TAC 21(1), 1976): for each of the last LATEST spans the filter's signature of a
 jump of the payload that began there, and with a prior of that jump the odds that there was one. Under the model the
 mean of these odds has expectation 1 without a jump, so that by Markov's inequality odds of x have a probability of
-1 / x at most: a threshold of as many as there are tests in an hour allows for one false alarm in that time.
+1 / x at most: a threshold of as many as there are tests in ten hours allows for one false alarm in that time. Errors
+of a model are not as tame as the filter's noise, so that one in an hour needs more than the tests of an hour.
 """
 
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from r2s.physics.robot import SIM_DT
 T = SPAN * SIM_DT
 LATEST = 10  # onsets that are tried: 0.2 s
 JUMP = 4  # numbers of a payload that a jump has: mass and first moments
-THRESHOLD = np.log(3600.0 / T)  # tests in an hour
+THRESHOLD = np.log(36000.0 / T)  # tests in ten hours
 
 
 class Noise(NamedTuple):
@@ -65,10 +66,11 @@ class Noise(NamedTuple):
 class Filter(NamedTuple):
     """x (N,), P (N, N); of each onset f (LATEST, N, 4), information (LATEST, 4, 4) and vector (LATEST, 4).
 
-    counts: (4,): spans, onsets in use, spans at rest in a row, the next onset. odds: (3,): log of the mean odds of a
-    jump, that of the likeliest onset, its number. seen: (2, n): innovations and their variances. rough: (n,), how
-    many times the variance that is known of it a joint's white noise has now: what surprises for long is taken for
-    noise, as of a gear that swings under a load that was never heard before. It is never less than 1.
+    counts: (5,): spans, onsets in use, spans at rest in a row, the next onset, spans whose balances still reach back
+    before the last jump. odds: (3,): log of the mean odds of a jump, that of the likeliest onset, its number. seen:
+    (2, n): innovations and their variances. rough: (n,), how many times the variance that is known of it a joint's
+    white noise has now: what surprises for long is taken for noise, as of a gear that swings under a load that was
+    never heard before. It is never less than 1.
     """
 
     x: np.ndarray
@@ -89,7 +91,7 @@ class Filter(NamedTuple):
         n = (N - BODY) // 4
         return Filter(
             noise.start.copy(), np.diag(prior**2), np.zeros((LATEST, N, JUMP)), np.zeros((LATEST, JUMP, JUMP)),
-            np.zeros((LATEST, JUMP)), np.zeros(4, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.ones(n),
+            np.zeros((LATEST, JUMP)), np.zeros(5, dtype=np.int64), np.zeros(3), np.zeros((2, n)), np.ones(n),
             np.zeros((2, N)),
         )  # fmt: skip
 
@@ -98,6 +100,7 @@ SLOW = 5.0  # times as long as the model's error lasts that of the momentum
 AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
 REST_S = 0.25  # of what friction hides at rest: how long it stays the same
 MOST_SURPRISE = 9.0  # of a span, as a square of standard deviations: one that is a jump says little of the noise
+RAMP = np.array([1 / 6, 5 / 6])  # of a torque that begins with a span, in the balance of that span and of the next
 RESTS = 5  # spans without sliding, from which an arm rests
 
 
@@ -122,6 +125,9 @@ def update(filter, noise, b):
             P[i, i] = min(P[i, i] + noise.resting * T * share * share, max(noise.prior[i] ** 2, P[i, i]))
     for c in range(BODY):
         P[c, c] += (noise.creeping * noise.prior[c]) ** 2 * T
+    if count[4] > 0:
+        count[4] -= 1
+        _afresh(P, noise)
     fade, unsure = np.exp(-T / noise.lasting), filter.work[1]
     for j in range(n):
         e, used, load = E0 + j, slides[j] > 0.0, 0.0
@@ -155,7 +161,7 @@ def update(filter, noise, b):
             for c in range(JUMP):
                 filter.f[k, e, c] *= fade if used else 1.0
                 filter.f[k, a, c] *= slow
-    if moves:
+    if moves and count[4] == 0:
         _begin_onset(filter)
     h, g = filter.work[0], np.empty(JUMP)
     for j in range(n):
@@ -180,8 +186,11 @@ def update(filter, noise, b):
             filter.rough[j] = max(1.0, filter.rough[j] * (1.0 + noise.learning * surprise))
         for k in range(count[1]):
             f, C, d = filter.f[k], filter.information[k], filter.vector[k]
+            age = (count[3] - 1 - k) % LATEST
+            share = RAMP[age] if age < len(RAMP) else 1.0
             for c in range(JUMP):
-                s = payload[j, c] - f[S0 + j, c] * rub[j] - f[O0 + j, c] - f[E0 + j, c] - f[A0 + j, c] * b.change[j]
+                s = share * payload[j, c] - f[S0 + j, c] * rub[j] - f[O0 + j, c]
+                s -= f[E0 + j, c] + f[A0 + j, c] * b.change[j]
                 for i in range(BODY):
                     s -= payload[j, i] * f[i, c]
                 g[c] = s
@@ -282,7 +291,16 @@ def jump(filter, noise):
         for k2 in range(N):
             for m in range(JUMP):
                 filter.P[i, k2] += spread[i, m] * spread[k2, m]
-    for c in range(BODY):  # it may have been within the span: what is found now is a beginning
-        filter.P[c, c] += (noise.prior[c] * (AFRESH if c < JUMP else 1.0)) ** 2
+    _afresh(filter.P, noise)  # it may have been within the span: what is found now is a beginning
+    for c in range(JUMP, BODY):
+        filter.P[c, c] += noise.prior[c] ** 2
     filter.counts[1] = 0
     filter.counts[3] = 0
+    filter.counts[4] = len(RAMP)
+
+
+@njit(cache=True)
+def _afresh(P, noise):
+    """Let mass and first moments be known no better than those of what was just put on."""
+    for c in range(JUMP):
+        P[c, c] += (AFRESH * noise.prior[c]) ** 2

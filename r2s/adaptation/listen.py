@@ -10,6 +10,7 @@ from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.noise import balances, learnt, noise_of, prior_of
+from r2s.adaptation.refinement import Beyond, refined
 from r2s.errors import UserError
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
@@ -25,30 +26,31 @@ def estimator(
     posterior: tuple[ParameterSpace, np.ndarray] | None = None,
     unloaded: tuple[Recording, Recording] | None = None,
 ) -> Estimator:
-    """Return the estimator of an arm.
-
-    Args:
-        robot, dynamics: what is believed of it.
-        posterior: the space and draws of its identification, which say how well friction and offsets are known.
-        unloaded: two recordings of commanded torque without a payload, such as the identification's own: they say
-            how wrong the model is. Without them it is taken to be a tenth of friction.
-    """
-    return Estimator(believed(robot, dynamics), noise(robot, dynamics, posterior, unloaded))
+    """Return the estimator of an arm; arguments as of `learn`."""
+    more, noise = learn(robot, dynamics, posterior, unloaded)
+    return Estimator(refined(believed(robot, dynamics), more), noise)
 
 
-def noise(
+def learn(
     robot: Robot,
     dynamics: Dynamics,
-    posterior: tuple[ParameterSpace, np.ndarray] | None,
-    unloaded: tuple[Recording, Recording] | None,
-) -> Noise:
-    """Return how wrong what is believed of an arm may be; arguments as of `estimator`."""
+    posterior: tuple[ParameterSpace, np.ndarray] | None = None,
+    unloaded: tuple[Recording, Recording] | None = None,
+) -> tuple[Beyond, Noise]:
+    """Return what motion without a payload says of an arm beyond its identification, and how wrong that may be.
+
+    Args:
+        robot, dynamics: what is believed of the arm.
+        posterior: the space and draws of its identification, which say how well friction and offsets are known.
+        unloaded: two recordings of commanded torque without a payload, such as the identification's own. Without
+            them nothing is beyond it, and the model's error is taken to be a tenth of friction.
+    """
     arm = believed(robot, replace(dynamics, told=np.zeros(4)))  # as it was when it was identified
     prior = prior_of(*posterior) if posterior is not None else None
     if unloaded is None:
-        return noise_of(arm, prior)
+        return Beyond.none(robot.n), noise_of(arm, prior)
     train, other = (balances(arm, at_rate(robot, r)) for r in unloaded)
-    return learnt(arm, prior, train, other)
+    return learnt(robot, arm, prior, train, other)
 
 
 def at_rate(robot: Robot, recording: Recording) -> Recording:

@@ -9,8 +9,10 @@ from r2s.adaptation.balance import Balance, Kept, observe
 from r2s.adaptation.believed import FIRM, Believed
 from r2s.adaptation.kalman import Filter, Noise, T, update
 from r2s.adaptation.momentum import BODY
+from r2s.adaptation.refinement import LEAST, Beyond, beyond, corrected
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.payload import FARTHEST_M, MOST_KG
+from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 MASS = MOST_KG / np.sqrt(3)  # kg, root mean square of what is uniform up to the most
@@ -26,9 +28,7 @@ LASTING = 0.3  # s
 # where no motion without a payload says how wrong the model is: shares of friction's level
 WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
 LAGS = range(3, 16)  # spans, between which the errors of a balance have forgotten the noise of the speeds
-LEAST = 50  # spans of sliding that say something
 FINEST = 0.03  # of the level: better nobody knows friction
-RIDGE = 1e-3
 LEAST_SCALE, MOST_SCALE, ROUNDS = 0.5, 1.5, 8
 LOADED = 0.015  # Nm per Nm of a payload: friction that goes with load
 
@@ -90,35 +90,41 @@ def balances(arm: Believed, recording: Recording) -> list[Balance]:
     return out
 
 
-def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: list[Balance]) -> Noise:
-    """Return the noise that motion without a payload has, such as the two motions of an identification.
+def learnt(
+    robot: Robot, arm: Believed, prior: Prior | None, train: list[Balance], unloaded: list[Balance]
+) -> tuple[Beyond, Noise]:
+    """Return what motion without a payload, such as the two of an identification, says beyond `arm`, and its noise.
 
-    `train` says what the model lacks of inertia and delay. `unloaded`, which should be other motion, says the rest.
-    Per joint: the model's error from covariances at lags of 60 to 300 ms, white noise and its growth with the
-    momentum's rate from what is left. Then all of a joint's are scaled so that the filter's innovations on that
-    motion have the variances that it believes, in the 99th percentile too, where there is more of that, and all
-    joints' until no odds of a payload are above the number of spans. Friction and offsets begin with what that motion
-    says.
+    What all of it says is used in the end. The noise is that of `unloaded`, which should be other motion, with what
+    `train` alone says. Per joint: the model's error from covariances at lags of 60 to 300 ms, white noise and its
+    growth with the momentum's rate from what is left. Then all of a joint's are scaled so that the filter's
+    innovations on that motion have the variances that it believes, in the 99th percentile too, where there is more of
+    that, and all joints' until no odds of a payload are above the number of spans. Friction and offsets begin with
+    what all of the motion says.
     """
-    noise, n = noise_of(arm, prior)._replace(learning=0.0), len(arm.level)
-    inertia, late = np.zeros((n, n)), np.zeros((n, n))
-    for j in range(n):
-        columns, y, used = _lacking(train, j)
-        if used.sum() >= LEAST:
-            columns, y = columns[used], y[used]
-            size = np.sqrt((columns**2).mean(0)) + 1e-12
-            normal = (columns / size).T @ (columns / size) + RIDGE * len(y) * np.eye(columns.shape[1])
-            found = np.linalg.solve(normal, (columns / size).T @ y) / size
-            inertia[j], late[j] = found[:n], found[n : 2 * n]
-    noise = noise._replace(inertia=inertia, late=late)
+    some = beyond(robot, arm, train)
+    noise = _of_motion(noise_of(arm, prior)._replace(learning=0.0), corrected(robot, arm, some, unloaded))
+    more = beyond(robot, arm, [*train, *unloaded])
+    filter = _run(_bare(noise), corrected(robot, arm, more, [*train, *unloaded]))[0]
+    n = len(arm.level)
+    start, prior_now = np.zeros_like(noise.prior), noise.prior.copy()
+    drift = np.concatenate([np.full(n, WARMED), DRIFTED * arm.level])
+    slow = slice(BODY, BODY + 2 * n)
+    start[slow] = filter.x[slow]
+    prior_now[slow] = np.hypot(np.sqrt(np.diag(filter.P)[slow]), drift)
+    noise = noise._replace(inertia=more.inertia, late=more.late, prior=prior_now, start=start, learning=LEARNING)
+    return more, noise
+
+
+def _of_motion(noise: Noise, unloaded: list[Balance]) -> Noise:
+    """Return the noise that these balances without a payload have."""
+    n, level = len(noise.level), noise.level
     change = np.array([b.change for b in unloaded])
     white, moving, model = (getattr(noise, name).copy() for name in ("white", "moving", "model"))
     for j in range(n):
-        columns, y, used = _lacking(unloaded, j)
+        own, y, used = _plain(unloaded, j)
         if used.sum() < LEAST:
             continue
-        y = y - columns[:, :n] @ inertia[j] - columns[:, n : 2 * n] @ late[j]
-        own = columns[:, 2 * n :]
         error = np.where(used, y - own @ np.linalg.lstsq(own[used], y[used], rcond=None)[0], 0.0)
         alike = []
         for lag in LAGS:
@@ -127,12 +133,12 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
                 alike.append((error[lag:] * error[:-lag])[both].mean() / np.exp(-lag * T / LASTING))
         most = error[used].std()
         model[j] = np.sqrt(max(np.mean(alike), 0.0)) if alike else model[j]
-        model[j] = max(min(model[j], most), FINEST * arm.level[j])
+        model[j] = max(min(model[j], most), FINEST * level[j])
         square = error[used] ** 2
         weight = 1 / (square.mean() + change[used, j] ** 2 * 1e-2)
         both = np.column_stack([np.ones(used.sum()), change[used, j] ** 2]) * weight[:, None]
         (floor, grows), _ = nnls(both, square * weight)
-        white[j] = np.sqrt(max(floor - model[j] ** 2, (0.1 * most) ** 2, (FINEST * arm.level[j]) ** 2))
+        white[j] = np.sqrt(max(floor - model[j] ** 2, (0.1 * most) ** 2, (FINEST * level[j]) ** 2))
         moving[j] = np.sqrt(grows)
     noise = noise._replace(white=white, moving=moving, model=model, prior=_with_model(noise.prior, model, moving))
     for _ in range(2):
@@ -142,13 +148,7 @@ def learnt(arm: Believed, prior: Prior | None, train: list[Balance], unloaded: l
         if (most := _odds(noise, unloaded)) <= allowed:
             break
         noise = _scaled(noise, np.full(n, min(np.sqrt(most / allowed), MOST_SCALE)))
-    filter = _run(_bare(noise), [*train, *unloaded])[0]
-    start, prior_now = np.zeros_like(noise.prior), noise.prior.copy()
-    drift = np.concatenate([np.full(n, WARMED), DRIFTED * arm.level])
-    slow = slice(BODY, BODY + 2 * n)
-    start[slow] = filter.x[slow]
-    prior_now[slow] = np.hypot(np.sqrt(np.diag(filter.P)[slow]), drift)
-    return noise._replace(prior=prior_now, start=start, learning=LEARNING)
+    return noise
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
@@ -157,12 +157,10 @@ def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["moving"]))
 
 
-def _lacking(rows: list[Balance], j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what joint j's balances may be made of (M, 2 n + 2), the balances (M,), and where it slid (M,)."""
-    faster, firmer = np.array([b.faster for b in rows]), np.array([b.firmer for b in rows])
+def _plain(rows: list[Balance], j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return joint j's friction and ones (M, 2), its balances (M,), and where it slid (M,)."""
     own = np.array([[b.rub[j], 1.0] for b in rows])
-    y = np.array([b.y[j] for b in rows])
-    return np.column_stack([faster, firmer, own]), y, np.array([b.slides[j] > 0 for b in rows])
+    return own, np.array([b.y[j] for b in rows]), np.array([b.slides[j] > 0 for b in rows])
 
 
 def _with_model(prior: np.ndarray, model: np.ndarray, moving: np.ndarray) -> np.ndarray:
