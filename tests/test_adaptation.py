@@ -15,7 +15,7 @@ from r2s.adaptation.kalman import BODY, Filter, update
 from r2s.adaptation.listen import at_rate, learn, listen, table
 from r2s.adaptation.momentum import WIDE, momentum
 from r2s.adaptation.noise import balances, learnt, noise_of
-from r2s.adaptation.refinement import FOLLOWED, Beyond, beyond, corrected, refined
+from r2s.adaptation.refinement import Beyond, beyond, corrected, refined
 from r2s.errors import UserError
 from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
@@ -233,8 +233,8 @@ def lacks(arm, rows):
     out = []
     for j in range(7):
         own = np.array([[b.rub[j], 1.0, b.y[j]] for b in rows if b.slides[j] > 0])
-        found = np.linalg.lstsq(own[:, :FOLLOWED], own[:, 2], rcond=None)[0]
-        out.append(np.sqrt(np.mean((own[:, 2] - own[:, :FOLLOWED] @ found) ** 2)))
+        found = np.linalg.lstsq(own[:, :2], own[:, 2], rcond=None)[0]
+        out.append(np.sqrt(np.mean((own[:, 2] - own[:, :2] @ found) ** 2)))
     return np.array(out)
 
 
@@ -274,8 +274,9 @@ def test_corrected_balances_are_those_of_the_refined_arm():
     more = more._replace(inertia=np.zeros((7, 7)), late=np.zeros((7, 7)))
     quick, exact = corrected(robot(), arm, more, rows), balances(refined(arm, more), data)
     slides = np.array([b.slides > 0 for b in rows])
-    plain, means, cycles = (np.array([b.y for b in x])[slides] for x in (rows, quick, exact))
-    assert np.sqrt(np.mean((means - cycles) ** 2)) < 0.05 * np.sqrt(np.mean((plain - cycles) ** 2))
+    for name in ("y", "rub"):
+        plain, means, cycles = (np.array([getattr(b, name) for b in x])[slides] for x in (rows, quick, exact))
+        assert np.sqrt(np.mean((means - cycles) ** 2)) < 0.05 * np.sqrt(np.mean((plain - cycles) ** 2))
     nothing = refined(arm, Beyond.none(7))
     for one, two in zip(arm, nothing, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-15)

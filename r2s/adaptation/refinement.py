@@ -24,15 +24,14 @@ LEAST = 50  # spans of sliding that say something
 LONGEST = 15  # spans in a row whose errors are one error
 ROUNDS = 3  # in which the errors' size is found
 SLOW = 0.03  # rad/s, of the term that falls with speed as friction does after a rest
-# of each joint; friction's terms have the sign s of the speed v; the first two are for the filter to follow
-TERMS = ("share of friction", "offset", "s |gravity|", "sin q", "cos q", "s", "s sqrt v", "s / (1 + v / slow)", "v",
-         "s sin q", "s cos q")  # fmt: skip
-FOLLOWED = 2
+# of each joint: a share of its friction, offset, s |gravity|, s, s sqrt v, s / (1 + v / slow), v, s sin q, s cos q,
+# sin q, cos q; s is the sign of the speed v
+SHARE, OFFSET, OF_LOAD, OF_LAW, OF_TURN, OF_DRAG, TERMS = 0, 1, 2, 3, 7, 9, 11
 # standard deviations of priors: what goes with friction's level in shares of it
 LINK_SHARE, LINK_M = 0.02, 0.002  # of a link's mass, and of its centre
 LOAD, DRAG = 0.01, 0.15  # Nm per Nm; Nm
 LAW, TURN = 0.2, 0.03  # of the level
-KNOWN = 0.3  # of the level and Nm
+KNOWN = 0.3  # of friction, and Nm
 ROTOR, LATE, GIVES = 0.1, 0.002, 1e-4  # kg m^2, s, rad/Nm
 
 
@@ -40,26 +39,20 @@ class Beyond(NamedTuple):
     """What is beyond an identification of n joints.
 
     Attributes:
-        links: (n, 4) kg and kg m, mass and first moment of each link. load: (n,). drag: (n, 2) Nm.
-        gives: (n,) rad/Nm, of each gear.
-        law: (n, 4), s, sqrt, slow and v of `TERMS`. turn: (n, 2) Nm, friction once per turn of the joint.
-        inertia: (n, n) kg m^2, late: (n, n) s, as of `Noise`.
+        links: (n, 4) kg and kg m, mass and first moment of each link. gives: (n,) rad/Nm, of each gear.
+        own: (n, TERMS), of each joint. inertia: (n, n) kg m^2, late: (n, n) s, as of `Noise`.
     """
 
     links: np.ndarray
     gives: np.ndarray
-    load: np.ndarray
-    drag: np.ndarray
-    law: np.ndarray
-    turn: np.ndarray
+    own: np.ndarray
     inertia: np.ndarray
     late: np.ndarray
 
     @staticmethod
     def none(n: int) -> "Beyond":
         """Return that of an arm of n joints of which nothing more is known."""
-        shapes = [(n, 4), (n,), (n,), (n, 2), (n, 4), (n, 2), (n, n), (n, n)]
-        return Beyond(*map(np.zeros, shapes))
+        return Beyond(*map(np.zeros, ((n, 4), (n,), (n, TERMS), (n, n), (n, n))))
 
 
 def beyond(robot: Robot, arm: Believed, rows: list[Balance]) -> Beyond:
@@ -89,11 +82,7 @@ def beyond(robot: Robot, arm: Believed, rows: list[Balance]) -> Beyond:
             if len(left):
                 size[j] = max(np.sqrt(np.mean((left - one @ out[at]) ** 2)), 1e-6 * arm.level[j])
     links, gives, terms = out[: 4 * n].reshape(n, 4), out[4 * n : L], out[L:].reshape(n, K)
-    F, T = FOLLOWED, len(TERMS)
-    return Beyond(
-        links, gives, terms[:, F], terms[:, F + 1 : F + 3], terms[:, F + 3 : F + 7], terms[:, F + 7 : T],
-        terms[:, T : T + n], terms[:, T + n :],
-    )  # fmt: skip
+    return Beyond(links, gives, terms[:, :TERMS], terms[:, TERMS : TERMS + n], terms[:, TERMS + n :])
 
 
 def refined(arm: Believed, more: Beyond) -> Believed:
@@ -104,26 +93,30 @@ def refined(arm: Believed, more: Beyond) -> Believed:
     links[:, MASS], links[:, COM : COM + 3] = mass, moment / mass[:, None]
     side = np.linspace(-1, 1, table.shape[2])
     v = side**2 * arm.fastest[:, None]
-    signed = more.law[:, :1] + more.law[:, 1:2] * np.sqrt(v) + more.law[:, 2:3] / (1 + v / SLOW)
+    own, grows = more.own, 1.0 + more.own[:, SHARE]
+    firm, root, slow, viscous = own[:, OF_LAW:OF_TURN].T[..., None]
+    signed = firm + root * np.sqrt(v) + slow / (1 + v / SLOW)
+    table *= grows[:, None, None]
     table[:, UP] += signed
     table[:, DOWN] += signed
-    table[:, FLAT] += more.law[:, 3:] * np.sign(side) * v
+    table[:, FLAT] += viscous * np.sign(side) * v
     return arm._replace(
-        links=links, table=table, load=arm.load + more.load, drag=arm.drag - more.drag, turn=arm.turn + more.turn,
-        gives=arm.gives + more.gives,
+        links=links, table=table, gives=arm.gives + more.gives, offset=arm.offset - own[:, OFFSET],
+        load=grows * arm.load + own[:, OF_LOAD], turn=grows[:, None] * arm.turn + own[:, OF_TURN:OF_DRAG],
+        drag=arm.drag - own[:, OF_DRAG:],
     )  # fmt: skip
 
 
 def corrected(robot: Robot, arm: Believed, more: Beyond, rows: list[Balance]) -> list[Balance]:
-    """Return balances that were made with `arm` as the arm with `more` would have made them, but for their friction.
+    """Return balances that were made with `arm` as the arm with `more` would have made them.
 
-    Inertia and delay are taken out, too. `rub` stays that of `arm`: the filter follows shares of it.
+    Inertia and delay are taken out, too.
     """
     links, own, y, _ = _columns(robot, arm, rows)
-    terms = np.concatenate([more.load[:, None], more.drag, more.law, more.turn, more.inertia, more.late], 1)
-    left = y - links @ np.concatenate([more.links.ravel(), more.gives])
-    left -= np.einsum("tjk,jk->tj", own[..., FOLLOWED:], terms)
-    return [b._replace(y=one) for b, one in zip(rows, left, strict=True)]
+    each = own * np.concatenate([more.own, more.inertia, more.late], 1)
+    left = y - links @ np.concatenate([more.links.ravel(), more.gives]) - each.sum(-1)
+    rub = np.array([b.rub for b in rows]) + each[..., SHARE] + each[..., OF_LOAD:OF_DRAG].sum(-1)
+    return [b._replace(y=one, rub=two) for b, one, two in zip(rows, left, rub, strict=True)]
 
 
 def _columns(
@@ -141,8 +134,8 @@ def _columns(
     links = regressor(robot, q, v, faster, arm.gravity)[..., :4].reshape(samples, n, 4 * n)
     links = np.concatenate([links, -np.array([b.bent for b in rows])], -1)
     s, speed = np.sign(v), np.abs(v)
-    terms = [rub, np.ones_like(q), s * weight, np.sin(q), np.cos(q), s, s * np.sqrt(speed), s / (1 + speed / SLOW), v]
-    terms += [s * np.sin(q), s * np.cos(q)]
+    terms = [rub, np.ones_like(q), s * weight, s, s * np.sqrt(speed), s / (1 + speed / SLOW), v]
+    terms += [s * np.sin(q), s * np.cos(q), np.sin(q), np.cos(q)]
     shared = [np.broadcast_to(x[:, None], (samples, n, n)) for x in (faster, firmer)]
     return links, np.concatenate([np.stack(terms, -1), *shared], -1), y, slides > 0
 
@@ -157,5 +150,5 @@ def _of_joints(arm: Believed) -> np.ndarray:
     """Return (n, K), standard deviations of a joint's own terms."""
     n, level = len(arm.level), np.maximum(arm.level, 1e-6)[:, None]
     one = np.ones((n, 1))
-    parts = [KNOWN * one, KNOWN * one, LOAD * one, DRAG * one, DRAG * one, *[LAW * level] * 4, *[TURN * level] * 2]
+    parts = [KNOWN * one, KNOWN * one, LOAD * one, *[LAW * level] * 4, *[TURN * level] * 2, *[DRAG * one] * 2]
     return np.concatenate([*parts, np.full((n, n), ROTOR), np.full((n, n), LATE)], 1)
