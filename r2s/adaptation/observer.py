@@ -2,7 +2,7 @@
 
 With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum tells the lacking torque d without
 accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006), here as
-its mean over 20 ms (balance.py), which a low-pass of first order follows: filter_s dd^/dt = d - d^. Commands go
+a mean over three spans (balance.py), which a low-pass of first order follows: filter_s dd^/dt = d - d^. Commands go
 through the identified delay and lag first.
 
 A joint that does not slide all the time may be held by anything within its edges: d is somewhere between two bounds

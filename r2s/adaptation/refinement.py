@@ -7,7 +7,7 @@ about zero, of the size that such things have: ridge regression, or the mean of 
 (Bishop 2006, 3.3). The rows are balances of momentum (balance.py), which need no accelerations.
 
 A gear gives: its link goes with the motor less what it bends by, torque / K, and so a balance that takes the link for
-the motor lacks M d2(torque)/dt2 / K, with 15 kNm/rad on a Panda 0.7 Nm where a torque swings by 20 Nm at 7 Hz.
+the motor lacks M d2(torque)/dt2 / K, with 15 kNm/rad on a Panda 0.7 Nm where a torque swings by 4 Nm at 7 Hz.
 """
 
 from typing import NamedTuple

@@ -37,7 +37,7 @@ class Transferred:
     adapter: str
     """Of conf/adapt."""
     settings: dict[str, Any]
-    """Of the adapter, but what belongs to one arm: {"filter_s": 0.06}."""
+    """Of the adapter, but what belongs to one arm: {"filter_s": 0.087}."""
     arm: str
     """Which arm: "twin, make 1, seed 0"."""
     asked: dict[str, Any]
