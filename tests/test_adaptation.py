@@ -20,7 +20,7 @@ from r2s.errors import UserError
 from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.newton_euler import MASS, WORK, equations, links_of
 from r2s.physics.payload import carrying, loaded, moment, payload_of
 from r2s.physics.rigid_body import LinkInertia
 from r2s.physics.robot import SIM_DT, load_robot
@@ -277,6 +277,10 @@ def test_corrected_balances_are_those_of_the_refined_arm():
     for name in ("y", "rub"):
         plain, means, cycles = (np.array([getattr(b, name) for b in x])[slides] for x in (rows, quick, exact))
         assert np.sqrt(np.mean((means - cycles) ** 2)) < 0.05 * np.sqrt(np.mean((plain - cycles) ** 2))
+    none = arm.links.copy()
+    none[4, MASS] = 0.0
+    for part in refined(arm._replace(links=none), beyond(robot(), arm._replace(links=none), rows)):
+        assert np.isfinite(part).all()
     nothing = refined(arm, Beyond.none(7))
     for one, two in zip(arm, nothing, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-15)

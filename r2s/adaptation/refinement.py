@@ -88,9 +88,10 @@ def beyond(robot: Robot, arm: Believed, rows: list[Balance]) -> Beyond:
 def refined(arm: Believed, more: Beyond) -> Believed:
     """Return the arm with what is beyond its identification, but for inertia and delay, which `Noise` has."""
     links, table = arm.links.copy(), arm.table.copy()
-    mass = np.maximum(arm.links[:, MASS] + more.links[:, 0], 0.5 * arm.links[:, MASS])
-    moment = arm.links[:, MASS, None] * arm.links[:, COM : COM + 3] + more.links[:, 1:]
-    links[:, MASS], links[:, COM : COM + 3] = mass, moment / mass[:, None]
+    before, weighs = arm.links[:, MASS, None], arm.links[:, MASS] > 0.0
+    mass = np.maximum(before + more.links[:, :1], 0.5 * before)[weighs]
+    moment = (before * arm.links[:, COM : COM + 3] + more.links[:, 1:])[weighs]
+    links[weighs, MASS], links[weighs, COM : COM + 3] = mass[:, 0], moment / mass
     side = np.linspace(-1, 1, table.shape[2])
     v = side**2 * arm.fastest[:, None]
     own, grows = more.own, 1.0 + more.own[:, SHARE]
@@ -142,7 +143,7 @@ def _columns(
 
 def _of_links(arm: Believed) -> np.ndarray:
     """Return (n, 4) kg and kg m, standard deviations of masses and first moments."""
-    mass = arm.links[:, MASS, None]
+    mass = np.maximum(arm.links[:, MASS, None], 1e-6)
     return np.concatenate([LINK_SHARE * mass, np.repeat(LINK_M * mass, 3, 1)], 1)
 
 
