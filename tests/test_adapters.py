@@ -9,12 +9,13 @@ import pytest
 from conftest import conf
 from omegaconf import OmegaConf
 
-from r2s.adaptation.adapters import NETWORK, Known, history, load_network, observer, rls, save_network
+from r2s.adaptation.adapters import Known, history, observer, rls
 from r2s.adaptation.balance import SPAN, Balance
 from r2s.adaptation.believed import believed
 from r2s.adaptation.compensation import RATE_S, thing, weigh
 from r2s.adaptation.history import SPANS, History, Network, Seen, inputs
 from r2s.adaptation.kalman import BODY, Filter
+from r2s.adaptation.network_file import NETWORK, load_network, save_network
 from r2s.adaptation.noise import noise_of
 from r2s.adaptation.observer import Observer
 from r2s.arm.driven import Driven

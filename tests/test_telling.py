@@ -14,8 +14,9 @@ from omegaconf import OmegaConf
 from test_adapters import FILTER_S, PANDA, known, swing, truth
 
 from r2s.adaptation.adapter import Tells
-from r2s.adaptation.adapters import NETWORK, history, osi, rma, save_network
+from r2s.adaptation.adapters import history, osi, rma
 from r2s.adaptation.history import Network, inputs
+from r2s.adaptation.network_file import NETWORK, save_network
 from r2s.adaptation.observer import Observer
 from r2s.adaptation.telling import Latent, said_count, said_scale
 from r2s.adaptation.telling import truth as right

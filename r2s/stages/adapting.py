@@ -187,8 +187,8 @@ def make_lessons(cfg):
 
 def teach(cfg, overrides, keep):
     """Train the network of conf/adapt for the arm of `calibration=`; keep(cfg, folder) copies what was identified."""
-    from r2s.adaptation.adapters import NETWORK, save_network
     from r2s.adaptation.believed import believed
+    from r2s.adaptation.network_file import NETWORK, save_network
     from r2s.learning import history
     from r2s.learning.randomization import identified
 
@@ -219,8 +219,8 @@ def listening(lessons):
 
 def teach_latent(cfg, folder, robot, task, center, draw, policy):
     """Train what says the latent of a policy, into its run folder; return a row of the summary."""
-    from r2s.adaptation.adapters import NETWORK, save_network
     from r2s.adaptation.believed import believed
+    from r2s.adaptation.network_file import NETWORK, save_network
     from r2s.learning import student
 
     began, lessons = time.process_time(), lessons_of(cfg)
