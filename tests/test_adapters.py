@@ -318,6 +318,10 @@ def test_a_network_is_kept_for_the_model_that_it_was_taught_for(tmp_path):
     assert np.array_equal(kept(x), network(x))
     with pytest.raises(UserError, match=r"was taught for another model; train it with this calibration="):
         load_network(tmp_path / NETWORK, believed(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019"))))
+    with np.load(tmp_path / NETWORK) as saved:
+        np.savez(tmp_path / "old.npz", **{k: a for k, a in saved.items() if k != "hears"})
+    with pytest.raises(UserError, match=r"was taught with other balances of momentum; train it again"):
+        load_network(tmp_path / "old.npz", known().arm)
     good = (tmp_path / NETWORK).read_bytes()
     (tmp_path / NETWORK).write_bytes(good[: len(good) // 2])
     with pytest.raises(UserError, match=r"^network: .* cannot be read: "):

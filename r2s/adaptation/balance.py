@@ -27,6 +27,9 @@ LEFT, RUBBED, MOMENTUM, ANGLE, SPEED, MOTOR, SUMS = range(7)
 NOW, COMING, BEGUN, BEFORE = range(4)  # sums of a triangle that ends with this span, of one that begins with it, ...
 RISES = SPAN * (SPAN + 1) // 2  # weights 1 to SPAN of the side of a triangle that begins; SPAN - 1 to 0 is the other
 
+# of a torque that begins with a span, by how much the balance of that span and the next hears it: the spline's
+RAMP = np.array([1 / 6, 5 / 6])
+
 
 class Kept(NamedTuple):
     """What is remembered of n joints from cycle to cycle; a payload's ten numbers have columns of their own."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from r2s.adaptation.balance import SPAN
+from r2s.adaptation.balance import RAMP, SPAN
 from r2s.adaptation.momentum import BODY
 from r2s.compiled import njit
 from r2s.physics.robot import SIM_DT
@@ -100,7 +100,6 @@ SLOW = 5.0  # times as long as the model's error lasts that of the momentum
 AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
 REST_S = 0.25  # of what friction hides at rest: how long it stays the same
 MOST_SURPRISE = 9.0  # of a span, as a square of standard deviations: one that is a jump says little of the noise
-RAMP = np.array([1 / 6, 5 / 6])  # of a torque that begins with a span, in the balance of that span and of the next
 RESTS = 5  # spans without sliding, from which an arm rests
 
 

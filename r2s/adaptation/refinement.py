@@ -2,7 +2,7 @@
 
 An identification searches what its recording demands: a term that would improve little stays out, as it trades with
 others. For an estimate of what a hand carries little counts: 0.1 Nm at 0.5 m is 20 g. Here nothing is chosen. Each
-joint has all terms of `TERMS`, all links have masses and first moments, all gears give, and each number has a prior
+joint has all terms named below, all links have masses and first moments, all gears give, and each number has a prior
 about zero, of the size that such things have: ridge regression, or the mean of the posterior of a linear model
 (Bishop 2006, 3.3). The rows are balances of momentum (balance.py), which need no accelerations.
 
@@ -21,7 +21,7 @@ from r2s.physics.rigid_body import regressor
 from r2s.physics.robot import Robot
 
 LEAST = 50  # spans of sliding that say something
-LONGEST = 15  # spans in a row whose errors are one error
+LONGEST = 15  # spans in a row whose errors are one error: 0.3 s, LASTING of noise.py
 ROUNDS = 3  # in which the errors' size is found
 SLOW = 0.03  # rad/s, of the term that falls with speed as friction does after a rest
 # of each joint: a share of its friction, offset, s |gravity|, s, s sqrt v, s / (1 + v / slow), v, s sin q, s cos q,
@@ -123,7 +123,7 @@ def corrected(robot: Robot, arm: Believed, more: Beyond, rows: list[Balance]) ->
 def _columns(
     robot: Robot, arm: Believed, rows: list[Balance]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what links (T, n, 4 n) and each joint's own terms (T, n, K) make of balances, these, and what slid."""
+    """Return what links and gears (T, n, 5 n) and own terms (T, n, K) make of balances, these, and what slid."""
     q, v, rub, y, slides, faster, firmer = (
         np.array([getattr(b, name) for b in rows]) for name in ("q", "dq", "rub", "y", "slides", "faster", "firmer")
     )
