@@ -24,7 +24,9 @@ from r2s.physics.robot import SIM_DT
 Z = 1.96  # standard deviations of a 95 % interval
 LEAST_KG = 0.02  # below that nobody asks where its centre is
 AFTER = round(0.5 / T)  # spans of motion after a rest, in which what is carried now and before are compared
-OTHER = chi2.isf(T / 3600.0, JUMP)  # squared distance that two estimates of one thing have once in an hour of tests
+# squared distance that two estimates of one thing have once in an hour of tests; twice, as errors of a model last
+OTHER = 2.0 * chi2.isf(T / 3600.0, JUMP)
+CURVE = 0.02  # of friction: it changes by more than one share says, as its curve over speed is not what was believed
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class Estimator:
             centre_half=spread if heavy else np.full(3, np.nan),
             tensor=tensor,
             friction=1.0 + x[BODY : BODY + n],
-            friction_half=half[BODY : BODY + n],
+            friction_half=np.hypot(half[BODY : BODY + n], Z * CURVE),
             offset=-(x[BODY + n : BODY + 2 * n]),
             offset_half=half[BODY + n : BODY + 2 * n],
             rests=not (self._balance.slides > 0).any(),

@@ -10,6 +10,10 @@ jump of the payload that began there, and with a prior of that jump the odds tha
 mean of these odds has expectation 1 without a jump, so that by Markov's inequality odds of x have a probability of
 1 / x at most: a threshold of as many as there are tests in ten hours allows for one false alarm in that time. Errors
 of a model are not as tame as the filter's noise, so that one in an hour needs more than the tests of an hour.
+
+Nor is a balance taken for more than a normal error allows: beyond TAME standard deviations it weighs less, by Huber's
+function (Robust Statistics, 1981). A joint that lets go, or a gear that swings, is far off for a span or two and tells
+of no payload; what is put on or taken off goes on.
 """
 
 from typing import NamedTuple
@@ -99,6 +103,7 @@ class Filter(NamedTuple):
 SLOW = 5.0  # times as long as the model's error lasts that of the momentum
 AFRESH = 0.2  # of the prior, by which a payload that was just put on is unknown
 REST_S = 0.25  # of what friction hides at rest: how long it stays the same
+TAME = 1.5  # standard deviations of a balance, beyond which it weighs less
 MOST_SURPRISE = 9.0  # of a span, as a square of standard deviations: one that is a jump says little of the noise
 RESTS = 5  # spans without sliding, from which an arm rests
 
@@ -180,8 +185,9 @@ def update(filter, noise, b):
             S += h[c] * payload[j, c]
             v -= x[c] * payload[j, c]
         filter.seen[0, j], filter.seen[1, j] = v, S
+        S *= max(1.0, np.sqrt(v * v / S) / TAME)
         if slides[j] > 0.0:
-            surprise = min(v * v / S, MOST_SURPRISE) - 1.0
+            surprise = min(v * v / filter.seen[1, j], MOST_SURPRISE) - 1.0
             filter.rough[j] = max(1.0, filter.rough[j] * (1.0 + noise.learning * surprise))
         for k in range(count[1]):
             f, C, d = filter.f[k], filter.information[k], filter.vector[k]

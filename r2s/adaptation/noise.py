@@ -18,18 +18,20 @@ from r2s.recordings.recording import Recording
 MASS = MOST_KG / np.sqrt(3)  # kg, root mean square of what is uniform up to the most
 MOMENT = MASS * FARTHEST_M / np.sqrt(5)  # kg m, of each axis, for centres uniform in the ball
 TENSOR = 4e-3  # kg m^2: 0.87 kg, 5 cm from the hand and 5 cm thick
-WARMED = 0.1  # share of friction that warmth may have changed since the identification
-WARMING = 0.02  # 1/sqrt(s): a fifth in 100 s
-DRIFTED, DRIFTING = 0.05, 0.005  # of friction's level; per sqrt(s)
-RESTING = 0.1  # kg^2/s
-CREEPING = 0.01  # 1/sqrt(s)
+WARMED = 0.07  # share of friction that warmth may have changed since the identification
+WARMING = 0.007  # 1/sqrt(s): 7 % in 100 s
+DRIFTED, DRIFTING = 0.02, 0.003  # of friction's level; per sqrt(s)
+RESTING = 0.02  # kg^2/s: after a second as wide as what friction hides, b / (r g), 0.1 to 0.25 kg
+CREEPING = 0.003  # 1/sqrt(s)
 LEARNING = 0.04  # per span: what surprises has half a second to become noise
 LASTING = 0.3  # s
 # where no motion without a payload says how wrong the model is: shares of friction's level
 WHITE, MOVING, MODEL, TURNING = 0.2, 0.1, 0.1, 0.1
 LAGS = range(3, 16)  # spans, between which the errors of a balance have forgotten the noise of the speeds
 FINEST = 0.03  # of the level: better nobody knows friction
+SHARPER = 0.7  # times the noise of a model that has learnt from half as much; chosen on development twins
 LEAST_SCALE, MOST_SCALE, ROUNDS = 0.5, 1.5, 8
+FAR = 3.0  # standard deviations: what is farther off counts as that far, as the filter weighs it less
 LOADED = 0.015  # Nm per Nm of a payload: friction that goes with load
 
 
@@ -98,12 +100,12 @@ def learnt(
     What all of it says is used in the end. The noise is that of `unloaded`, which should be other motion, with what
     `train` alone says. Per joint: the model's error from covariances at lags of 60 to 300 ms, white noise and its
     growth with the momentum's rate from what is left. Then all of a joint's are scaled so that the filter's
-    innovations on that motion have the variances that it believes, in the 99th percentile too, where there is more of
-    that, and all joints' until no odds of a payload are above the number of spans. Friction and offsets begin with
-    what all of the motion says.
+    innovations on that motion have the variances that it believes, and all joints' until no odds of a payload are
+    above the number of spans. Friction and offsets begin with what all of the motion says.
     """
     some = beyond(robot, arm, train)
     noise = _of_motion(noise_of(arm, prior)._replace(learning=0.0), corrected(robot, arm, some, unloaded))
+    noise = _scaled(noise, np.full(len(arm.level), SHARPER))
     more = beyond(robot, arm, [*train, *unloaded])
     filter = _run(_bare(noise), corrected(robot, arm, more, [*train, *unloaded]))[0]
     n = len(arm.level)
@@ -193,10 +195,10 @@ def _odds(noise: Noise, unloaded: list[Balance]) -> float:
 
 def _surprise(noise: Noise, unloaded: list[Balance]) -> np.ndarray:
     """Return (n,), by how much the innovations are larger than the filter believes, where it knows of no payload."""
-    surprise = _run(_bare(noise), unloaded)[1][len(unloaded) // 10 :]  # offsets are being found
+    surprise = np.abs(_run(_bare(noise), unloaded)[1])[len(unloaded) // 10 :]  # offsets are being found
     scale = np.ones(surprise.shape[1])
     for j in range(len(scale)):
         own = surprise[np.isfinite(surprise[:, j]), j]
         if len(own) >= LEAST:
-            scale[j] = max(np.sqrt(np.mean(own**2)), np.quantile(np.abs(own), 0.99) / 2.576)
+            scale[j] = np.sqrt(np.mean(np.minimum(own, FAR) ** 2))
     return scale
