@@ -11,7 +11,7 @@ from conftest import conf
 from r2s.adaptation.balance import SPAN, Balance
 from r2s.adaptation.believed import believed
 from r2s.adaptation.estimator import Estimator, body
-from r2s.adaptation.kalman import BODY, Filter, update
+from r2s.adaptation.kalman import BODY, TAME, Filter, update
 from r2s.adaptation.listen import at_rate, learn, listen, table
 from r2s.adaptation.momentum import WIDE, momentum
 from r2s.adaptation.noise import balances, learnt, noise_of
@@ -305,6 +305,34 @@ def test_what_surprises_for_long_is_taken_for_noise(times, low, high):
     still = Filter.fresh(noise)
     update(still, noise._replace(learning=0.0), b)
     assert (still.rough == 1.0).all()
+
+
+def test_what_is_far_off_moves_the_estimate_as_what_is_a_little_off():
+    """Beyond TAME standard deviations by Huber's function, in proportion before; its odds of a jump are at most z TAME / 2.
+
+    A scalar off by z of its S standard deviations gives at most z^2 / 2 of log likelihood, and S is z / TAME times as
+    large where that is above 1.
+    """
+    arm, noise = quiet()
+    rows = balances(arm, recording())
+
+    def after(z):
+        filter = Filter.fresh(noise)
+        for b in rows[:60]:
+            update(filter, noise, b)
+        trial = Filter(*(a.copy() for a in filter))
+        update(trial, noise, rows[60])
+        before, v, S = filter.x.copy(), trial.seen[0, 6], trial.seen[1, 6]
+        b = rows[60]._replace(y=rows[60].y.copy())
+        b.y[6] += z * np.sqrt(S) - v
+        update(filter, noise, b)
+        others = np.sum(filter.seen[0, :6] ** 2 / filter.seen[1, :6])
+        return filter.x - before, filter.odds[0], others
+
+    plain, near, far, farther = (after(z) for z in (0.0, 0.5 * TAME, 4 * TAME, 40 * TAME))
+    assert np.abs(far[0] - farther[0]).max() < 1e-9
+    assert np.allclose(far[0] - plain[0], 2 * (near[0] - plain[0]), atol=1e-3 * np.abs(far[0]).max())
+    assert farther[1] < 40 * TAME * TAME / 2 + farther[2]
 
 
 def test_an_interval_is_wide_at_rest_and_narrow_in_motion():

@@ -11,9 +11,8 @@ mean of these odds has expectation 1 without a jump, so that by Markov's inequal
 1 / x at most: a threshold of as many as there are tests in ten hours allows for one false alarm in that time. Errors
 of a model are not as tame as the filter's noise, so that one in an hour needs more than the tests of an hour.
 
-Nor is a balance taken for more than a normal error allows: beyond TAME standard deviations it weighs less, by Huber's
-function (Robust Statistics, 1981). A joint that lets go, or a gear that swings, is far off for a span or two and tells
-of no payload; what is put on or taken off goes on.
+Nor are errors normal: a joint that lets go, or a gear that swings, is far off for a span or two. Beyond TAME standard
+deviations a balance weighs less, by Huber's function (Robust Statistics, 1981); what is put on or taken off goes on.
 """
 
 from typing import NamedTuple
