@@ -308,7 +308,7 @@ def test_what_surprises_for_long_is_taken_for_noise(times, low, high):
 
 
 def test_what_is_far_off_moves_the_estimate_as_what_is_a_little_off():
-    """Beyond TAME standard deviations by Huber's function, in proportion before; its odds of a jump are at most z TAME / 2.
+    """In proportion up to TAME standard deviations, beyond them no more; odds of a jump are at most z TAME / 2.
 
     A scalar off by z of its S standard deviations gives at most z^2 / 2 of log likelihood, and S is z / TAME times as
     large where that is above 1.
