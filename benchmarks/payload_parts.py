@@ -148,10 +148,7 @@ def quiet(of: Known, k: int) -> list[dict]:
     """Return the alarms of five minutes of unloaded motion, one estimator and one arm all along."""
     arm, ear = of.arm(1000 + k), of.ear()
     for i in range(PIECE):
-        heard = record(arm, motion(PIECE * k + i), laden=True)
-        ear.begin()
-        for q, dq, tau in zip(heard.q, heard.dq, heard.tau, strict=True):
-            ear(q, dq, tau)
+        listen(ROBOT, ear, record(arm, motion(PIECE * k + i), laden=True))
     minutes = PIECE * SECONDS / 60
     return [{"minutes": minutes, "alarms": len(ear.changes), "at_s": " ".join(f"{c:.2f}" for c in ear.changes)}]
 
