@@ -24,7 +24,7 @@ WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern;
     "known_truth": (r"\d+",),
     "grid": (r"\d+(,\d+)*", NUMBER),
     "least_squares": (NUMBER,),
-    "payload": (PARTS, r"root=.+", r"make=[12]", r"(motions|minutes)=[1-9]\d*", r"\d+"),
+    "payload": (PARTS, r"(root|keep)=.+", r"make=[12]", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
     "twins": (r"make=[12]", r"\d+"),

@@ -1,23 +1,32 @@
 """Identification at work on twins with their identified models: payloads, false alarms, friction that warms, setLoad.
 
-`python benchmarks/payload.py [part=PART,...] [make=2] [root=RUNS] [motions=N] [minutes=N] [SEED ...]`, by default
-all parts and development seeds 0-5 of both makes; the judging seeds are 100-109, of make 1, and 200-209, of make 2. A
-twin that was not identified yet is, as m1_0 beneath ROOT/identify, a minute or two; judge_100 is found there too.
+`python benchmarks/payload.py [part=PART,...] [make=2] [root=RUNS] [motions=N] [minutes=N] [keep=FOLDER]
+[CONSTANT=X ...] [SEED ...]`, by default all parts and development seeds 0-5 of both makes; the judging seeds are
+100-109, of make 1, and 200-209, of make 2. A twin that was not identified yet is, as m1_0 beneath ROOT/identify, a
+minute or two; judge_100 is found there too.
 
 - `events`: motions=4 of 12 s, with pauses, each with a payload of U(0.05, 1.5) kg, its centre uniform within 7.5 cm,
   put on at U(2, 4) s and taken off at U(7, 9) s. Its mass is asked for when the arm has moved for 2 s since it was
   put on, pauses not counted, or just before it is taken off.
 - `quiet`: minutes=5 of unloaded motion, a multiple of 5, and its alarms. minutes=60 does what is missing of an hour:
-  40 s of a core for 5 minutes of a twin, and a minute for their motions, which all twins share.
+  a minute of a core for 5 minutes of a twin, and another for their motions, which all twins share.
 - `warming`: friction falls to 0.75 of what it was, 1 - 0.25 (1 - exp(-t / 60 s)), over 4 minutes after 36 s.
 - `load`: motions=4 with a payload all along, of which the arm itself was told right, half, nothing, or half too much.
 
 Rows go to ROOT/bench/payload_PART.csv, each only once: what is missing is done, by several of these beside each
 other too, if they have other twins. Tables of the twins that were asked for go to docs/payload.md.
+
+To tune: keep=FOLDER keeps recordings (2 MB for a motion; none of `load`), so that listening to them again takes a
+sixth of the time. A word in capitals is a constant of r2s/adaptation, as TAME=9 SHARPER=1; rows then go to files with
+these words in their names, and tables are only printed.
 """
 
+import os
+import subprocess
 import sys
+import tempfile
 import time
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +84,7 @@ def of_quiet(rows: pd.DataFrame) -> dict[str, str]:
         "minutes": f"{60 * hours:.0f}",
         "alarms": f"{rows['alarms'].sum()}",
         "in an hour": f"{rows['alarms'].sum() / hours:.1f}",
+        "largest log odds": f"{rows['odds'].max():.0f}",
     }
 
 
@@ -130,11 +140,29 @@ def said(part: str, rows: pd.DataFrame) -> str:
     }[part]
 
 
-def write(part: str, rows: pd.DataFrame, command: str) -> None:
-    """Print the table of a part and put it between its markers."""
+def write(part: str, rows: pd.DataFrame, command: str, page: Path | None) -> None:
+    """Print the table of a part and put it between its markers on the page."""
     text = f"`{command}` on {MACHINE}. {said(part, rows)}\n\n{markdown(told(part, rows))}\n"
     print(f"\n{text}")
-    put_table(DOCS, part, text)
+    if page is not None:
+        put_table(page, part, text)
+
+
+def tuned(constants: dict[str, str]) -> None:
+    """Set constants of r2s/adaptation wherever they are, in a process of its own: what was compiled holds others."""
+    rooms = [module for name, module in sys.modules.items() if name.startswith("r2s.adaptation.")]
+    names = {name for module in rooms for name, x in vars(module).items() if isinstance(x, float) and name.isupper()}
+    for name in constants:
+        if name not in names:
+            near = get_close_matches(name, names, 1)
+            sys.exit(f"error: no number {name} in r2s/adaptation" + (f"; did you mean {near[0]}?" if near else ""))
+    if constants and "R2S_TUNED" not in os.environ:
+        with tempfile.TemporaryDirectory() as folder:
+            own = {"R2S_TUNED": "1", "NUMBA_CACHE_DIR": folder}
+            sys.exit(subprocess.run([sys.executable, *sys.argv], env=os.environ | own).returncode)
+    for module in rooms:
+        for name in constants.keys() & vars(module).keys():
+            setattr(module, name, float(constants[name]))
 
 
 def wanted(words: dict[str, str], seeds: list[int]) -> list[tuple[int, int]]:
@@ -157,6 +185,8 @@ def wanted(words: dict[str, str], seeds: list[int]) -> list[tuple[int, int]]:
 def main() -> None:
     """Identify what is missing, do what is missing, write the tables."""
     words = dict(w.split("=", 1) for w in sys.argv[1:] if "=" in w)
+    tuned(constants := {k: v for k, v in words.items() if k.isupper()})
+    keep = Path(words["keep"]) if "keep" in words else None
     parts = words.get("part", ",".join(PARTS)).split(",")
     root, motions, minutes = (
         Path(words.get("root", ROOT / "runs")),
@@ -172,16 +202,17 @@ def main() -> None:
         for m, s in twins
         if not (folder(root, m, s) / "posterior.npz").is_file()
     )
-    command = " ".join(["python benchmarks/payload.py", *(w for w in sys.argv[1:] if not w.startswith("root="))])
+    said_words = [w for w in sys.argv[1:] if not w.startswith(("root=", "keep="))]
+    command = " ".join(["python benchmarks/payload.py", *said_words])
     for part in parts:
-        path = root / "bench" / f"payload_{part}.csv"
+        path = root / "bench" / f"{'_'.join(['payload', part, *(f'{k}={v}' for k, v in constants.items())])}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         there = set(map(tuple, pd.read_csv(path)[KEY].to_numpy())) if path.is_file() else set()
         # the twins of a piece share its motions, which take longer to plan than to record
         jobs = [(*t, k) for k in range(pieces[part]) for t in twins if (*t, k) not in there]
         for i, (make, seed, k) in enumerate(jobs, 1):
             began = time.process_time()
-            rows = pd.DataFrame(PARTS[part](known(root, make, seed), k))
+            rows = pd.DataFrame(PARTS[part](known(root, make, seed, keep), k))
             for at, value in enumerate((make, seed, k)):
                 rows.insert(at, KEY[at], value)
             rows.to_csv(path, mode="a", header=not path.is_file(), index=False)
@@ -195,7 +226,7 @@ def main() -> None:
         asked = [
             (m, s, k) in {(*t, k) for t in twins for k in range(pieces[part])} for m, s, k in rows[KEY].to_numpy()
         ]
-        write(part, rows[asked], command)
+        write(part, rows[asked], command, None if constants else DOCS)
 
 
 if __name__ == "__main__":

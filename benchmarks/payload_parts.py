@@ -1,7 +1,9 @@
 """What benchmarks/payload.py measures on one twin, a row or more of each piece of it."""
 
+import pickle
 import sys
 import time
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +25,7 @@ from r2s.arm.hidden_arm import HiddenArm
 from r2s.arm.interface import ArmState
 from r2s.arm.twins import twin
 from r2s.compiled import njit
+from r2s.files import whole
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import FARTHEST_M, MOST_KG, loaded, payload_of
@@ -47,6 +50,7 @@ class Known(NamedTuple):
     dynamics: Dynamics
     more: Beyond
     noise: Noise
+    keep: Path | None = None
 
     def arm(self, stream: int, **given) -> HiddenArm:
         """Return the twin, cold, with another noise for each stream."""
@@ -56,6 +60,17 @@ class Known(NamedTuple):
         """Return an estimator that has heard nothing, of an arm that was told of this load."""
         arm = believed(ROBOT, loaded(ROBOT, self.dynamics, None, payload_of(load)))
         return Estimator(refined(arm, self.more), self.noise)
+
+    def kept(self, name: str, made: Callable[[], list]) -> list:
+        """Return what `made` returns, from `keep` where it was made before."""
+        if self.keep is None:
+            return made()
+        path = self.keep / f"m{self.make}_{self.seed}_{name}.pickle"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with whole(path) as part:
+                part.write_bytes(pickle.dumps(made()))
+        return pickle.loads(path.read_bytes())
 
 
 def folder(root: Path, make: int, seed: int) -> Path:
@@ -73,13 +88,13 @@ def folder(root: Path, make: int, seed: int) -> Path:
 
 
 @cache
-def known(root: Path, make: int, seed: int) -> Known:
-    """Return what the identification of a twin says."""
+def known(root: Path, make: int, seed: int, keep: Path | None = None) -> Known:
+    """Return what the identification of a twin says; recordings are kept in `keep`."""
     at = folder(root, make, seed)
     space, x = load_parameters(at, ROBOT)
     unloaded = tuple(read(at / f"{name}.npz", torque="commanded") for name in ("train", "validation"))
     dynamics = space.dynamics(x)
-    return Known(make, seed, dynamics, *learn(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded))
+    return Known(make, seed, dynamics, *learn(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded), keep)
 
 
 @cache
@@ -124,7 +139,8 @@ def events(of: Known, k: int) -> list[dict]:
     """Return what is told of a payload that is put on and taken off in motion k."""
     given = drawn(np.random.default_rng([of.make, of.seed, k]))
     thing, ear = payload_of(given), of.ear()
-    heard = record(of.arm(100 + k, payload=given), motion(k), laden=True)
+    arm = of.arm(100 + k, payload=given)
+    (heard,) = of.kept(f"events_{k}", lambda: [record(arm, motion(k), laden=True)])
     began = time.process_time()
     told = listen(ROBOT, ear, heard)
     us = 1e6 * (time.process_time() - began) / len(heard.t)
@@ -147,10 +163,11 @@ def events(of: Known, k: int) -> list[dict]:
 def quiet(of: Known, k: int) -> list[dict]:
     """Return the alarms of five minutes of unloaded motion, one estimator and one arm all along."""
     arm, ear = of.arm(1000 + k), of.ear()
-    for i in range(PIECE):
-        listen(ROBOT, ear, record(arm, motion(PIECE * k + i), laden=True))
-    minutes = PIECE * SECONDS / 60
-    return [{"minutes": minutes, "alarms": len(ear.changes), "at_s": " ".join(f"{c:.2f}" for c in ear.changes)}]
+    motions, odds = range(PIECE * k, PIECE * (k + 1)), -np.inf
+    for heard in of.kept(f"quiet_{k}", lambda: [record(arm, motion(i), laden=True) for i in motions]):
+        odds = max(odds, *(now.odds for now in listen(ROBOT, ear, heard)))
+    at = " ".join(f"{c:.2f}" for c in ear.changes)
+    return [{"minutes": PIECE * SECONDS / 60, "alarms": len(ear.changes), "at_s": at, "odds": odds}]
 
 
 def load(of: Known, k: int) -> list[dict]:
@@ -220,27 +237,34 @@ def rubs(p, s):
     return out
 
 
+def warmed(twin: HiddenArm, begins: float, k: int) -> list[tuple]:
+    """Return of each motion the recording, Nm of friction in each cycle, and the scale of it."""
+    arm, out = Warming(twin, begins), []
+    for i in range(COLD + WARMS):
+        since = len(arm.scale)
+        heard = record(arm, motion(100 * k + i), laden=True)
+        out.append((heard, np.array(arm.rubbed[since:]), np.array(arm.scale[since:])))
+    return out
+
+
 def warming(of: Known, k: int) -> list[dict]:
     """Return how friction that warms up is followed, a row per joint.
 
     The truth is the share of what is believed that fits the twin's own friction best while a joint slides, with a
     constant: one number of the cold joint, times the scale that is imposed.
     """
-    begins = COLD * SECONDS
-    arm, ear = Warming(of.arm(300 + k), begins), of.ear()
+    begins, ear = COLD * SECONDS, of.ear()
     told, cold, scale, rub, slides = [], [], [], [], []
 
-    def spans(cycles: list) -> np.ndarray:
+    def spans(cycles: np.ndarray) -> np.ndarray:
         """Return means as of a balance: between triangles of two spans each."""
-        c = np.cumsum(np.array(cycles), axis=0)
+        c = np.cumsum(cycles, axis=0)
         whole = c[: len(c) // SPAN * SPAN].reshape(-1, SPAN, *c.shape[1:])
         rises = np.arange(1, SPAN + 1) / SPAN**2
         triangles = np.tensordot(whole[:-1], rises, (1, 0)) + np.tensordot(whole[1:], 1 / SPAN - rises, (1, 0))
         return np.diff(triangles, axis=0) / SPAN
 
-    for i in range(COLD + WARMS):
-        since = len(arm.scale)
-        heard = record(arm, motion(100 * k + i), laden=True)
+    for heard, rubbed, factors in of.kept(f"warming_{k}", lambda: warmed(of.arm(300 + k), begins, k)):
         mine: list[tuple] = []
 
         def hears(now: Estimate, mine=mine) -> None:
@@ -248,7 +272,7 @@ def warming(of: Known, k: int) -> list[dict]:
             mine.append((now, b.rub.copy(), b.slides > 0))
 
         listen(ROBOT, ear, heard, hears)
-        seen, factor = spans(arm.rubbed[since:]), spans(arm.scale[since:])
+        seen, factor = spans(rubbed), spans(factors)
         m = min(len(mine), len(seen))
         told += [now for now, _, _ in mine[:m]]
         rub += [r for _, r, _ in mine[:m]]

@@ -83,3 +83,34 @@ def test_an_identification_is_found_by_either_name_and_is_of_that_twin(tmp_path)
     identified("judge_101", 1, 102)
     with pytest.raises(SystemExit, match="judge_101 is of make 1, seed 102; make 1, seed 101 is wanted"):
         folder(tmp_path, 1, 101)
+
+
+def test_what_is_kept_is_made_once(tmp_path):
+    from payload_parts import Known
+
+    of, made = Known(2, 3, None, None, None, tmp_path / "kept"), []
+
+    def record():
+        made.append(1)
+        return [np.arange(3.0)]
+
+    for _ in range(2):
+        (heard,) = of.kept("events_0", record)
+        assert heard.tolist() == [0.0, 1.0, 2.0]
+    assert len(made) == 1
+    of._replace(keep=None).kept("events_0", record)
+    assert len(made) == 2
+
+
+def test_a_constant_is_set_wherever_it_is(monkeypatch):
+    from payload import tuned
+
+    from r2s.adaptation import estimator, kalman
+
+    for module in (kalman, estimator):
+        monkeypatch.setattr(module, "THRESHOLD", kalman.THRESHOLD)  # as it was, when the test is over
+    monkeypatch.setenv("R2S_TUNED", "1")
+    tuned({"THRESHOLD": "12.5"})
+    assert kalman.THRESHOLD == estimator.THRESHOLD == 12.5
+    with pytest.raises(SystemExit, match="no number TAMEE in r2s/adaptation; did you mean TAME"):
+        tuned({"TAMEE": "2"})
