@@ -26,6 +26,7 @@ from r2s.reporting.comparison import (
 )
 from r2s.reporting.grouping import LONGEST, group
 from r2s.reporting.statistics import improvement, interquartile_mean, interval
+from r2s.reporting.tables import scores_rows
 from r2s.reporting.trainings import comparable, in_words, read_trainings
 from r2s.runs import Run
 from r2s.stages.build import CONF
@@ -166,6 +167,26 @@ def test_runs_that_cannot_be_compared_are_set_apart_and_why_is_said(user_folder)
     assert others["cut"] == others["edited"] == "unreadable"
     assert others["notes"] == others["readme.txt"] == "no run folder"
     assert comparable([r for r in trained if r.toy])[1] == {}
+
+
+def test_a_training_whose_arms_were_stopped_is_compared(tmp_path):
+    """Its distance is infinite, null in a summary, in some evaluations or in all; other measures are as they are."""
+    for name, at in {"early": 0, "always": slice(None), "never": []}.items():
+        write_run(tmp_path / name)
+        curve = pd.read_csv(tmp_path / name / "evaluations.csv")
+        curve.loc[curve.index[at], "distance_median_m"] = np.inf
+        curve.to_csv(tmp_path / name / "evaluations.csv", index=False)
+    summary = json.loads((tmp_path / "always" / "summary.json").read_text())
+    summary["last"]["distance_median_m"] = None
+    (tmp_path / "always" / "summary.json").write_text(json.dumps(summary))
+    trained, others = read_trainings(sorted(tmp_path.iterdir()))
+    assert not others
+    table = summary_table({"all": trained}).set_index("measure")
+    assert table.loc["distance_median_m", "high"] == np.inf
+    assert table.loc["return_paper", "iqm"] == -90.0
+    assert np.isfinite(table.drop("distance_median_m")[["iqm", "low", "high"]].astype(float)).all(axis=None)
+    cell = scores_rows(summary_table({"all": trained})).loc["all", "median\ndistance, mm"]
+    assert cell.endswith(", -]")
 
 
 def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):

@@ -96,5 +96,6 @@ def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np
     """
     curves = [r.curve for r in group]
     grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)
-    values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
+    with np.errstate(invalid="ignore"):  # infinite where arms were stopped: no curve there
+        values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
     return grid, np.stack([interquartile_mean(values), values.min(-1), values.max(-1)])

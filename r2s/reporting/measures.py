@@ -5,6 +5,7 @@ A run folder does not name its task's class; the keys of its rows say what it wa
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import isinf
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Measure:
     lower: bool = False
 
     def cell(self, value: float, digits: int | None = None) -> str:
-        """Return a value as tables show it."""
-        return f"{self.scale * value:.{self.digits if digits is None else digits}f}"
+        """Return a value as tables show it; "-" where arms were stopped, so that it is infinite."""
+        return "-" if isinf(value) else f"{self.scale * value:.{self.digits if digits is None else digits}f}"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ def interquartile_mean(x: np.ndarray) -> np.ndarray:
     """
     x, s = np.sort(x, axis=-1), x.shape[-1]
     weight = np.clip(np.minimum(np.arange(1, s + 1) - s / 4, s - s / 4 - np.arange(s)), 0.0, 1.0)
-    return x @ (weight / weight.sum())
+    return np.where(weight > 0, x, 0.0) @ (weight / weight.sum())  # what is left out may be infinite
 
 
 def interval(
@@ -32,7 +32,11 @@ def interval(
     """
     rng = np.random.default_rng(seed)
     drawn = [x[rng.integers(len(x), size=(DRAWS, len(x)))] for x in strata]
-    low, high = np.quantile(statistic(drawn), [0.025, 0.975])
+    found, levels = statistic(drawn), [0.025, 0.975]
+    if np.isfinite(found).all():
+        low, high = np.quantile(found, levels)
+    else:  # nothing lies between infinities
+        low, high = np.quantile(found, levels, method="inverted_cdf")
     return float(low), float(high)
 
 

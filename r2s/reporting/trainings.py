@@ -11,7 +11,7 @@ import pandas as pd
 import yaml
 
 from r2s.errors import UserError
-from r2s.reporting.measures import shown
+from r2s.reporting.measures import ALL, shown
 
 # parts of a config that a training reads, beside its seed: runs that agree in them are seeds of one group
 READ = ("algo", "budget", "calibration", "dr", "friction", "inertia", "reward")
@@ -118,9 +118,12 @@ def _read(folder: Path) -> Trained:
     measures = shown(curve.columns).compared
     last = json.loads((folder / "summary.json").read_text())["last"]
     last = {k: np.nan if v is None else float(v) for k, v in last.items()}  # null: no episode had one
+    for measure in (m for m in measures if ALL[m].lower):  # of arms that were all stopped
+        curve[measure] = curve[measure].astype(float).fillna(np.inf)
+        last[measure] = np.inf if np.isnan(last[measure]) else last[measure]
     rows = curve[["env_steps", "wall_clock_s", *measures]].astype(float).to_numpy()
-    if not np.isfinite([*rows.ravel(), *(last[m] for m in measures)]).all():
-        raise ValueError("an evaluation that is not finite")
+    if np.isnan([*rows.ravel(), *(last[m] for m in measures)]).any():
+        raise ValueError("an evaluation that is no number")
     return Trained(
         folder,
         int(config["seed"]),
