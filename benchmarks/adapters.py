@@ -137,12 +137,14 @@ def intervals(frame: pd.DataFrame, of: str, of_squares: bool) -> pd.DataFrame:
         wide = wide.astype(float).dropna()
         each = [w.to_numpy() ** (2 if of_squares else 1) for _, w in wide.groupby("twin")]
         power = 0.5 if of_squares else 1.0
-        low, high = np.quantile(paired(each, rng) ** power, [0.025, 0.975], axis=0)
+        with np.errstate(invalid="ignore"):  # infinite where an arm was stopped
+            low, high = np.quantile(paired(each, rng) ** power, [0.025, 0.975], axis=0)
         middle = np.concatenate(each).mean(0) ** power
         scale, digits = (1, 2) if of_squares else (100, 0)
+        ended = np.isinf(np.concatenate(each)).sum(0)  # of episodes in which the arm was stopped
         cells[condition] = {
-            a: f"{scale * m:.{digits}f} [{scale * x:.{digits}f}, {scale * y:.{digits}f}]"
-            for a, m, x, y in zip(wide.columns, middle, low, high, strict=True)
+            a: f"{scale * m:.{digits}f} [{scale * x:.{digits}f}, {scale * y:.{digits}f}]" if not k else f"{k} stopped"
+            for a, m, x, y, k in zip(wide.columns, middle, low, high, ended, strict=True)
         }
     return pd.DataFrame(cells).T
 
