@@ -205,7 +205,7 @@ def main() -> None:
     said_words = [w for w in sys.argv[1:] if not w.startswith(("root=", "keep="))]
     command = " ".join(["python benchmarks/payload.py", *said_words])
     for part in parts:
-        path = root / "bench" / f"{'_'.join(['payload', part, *(f'{k}={v}' for k, v in constants.items())])}.csv"
+        path = root / "bench" / f"{'_'.join(['payload', part, *('='.join(c) for c in constants.items())])}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         there = set(map(tuple, pd.read_csv(path)[KEY].to_numpy())) if path.is_file() else set()
         # the twins of a piece share its motions, which take longer to plan than to record
