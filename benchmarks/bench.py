@@ -1,6 +1,6 @@
-"""make bench: what r2s costs over its peers, as ratios measured in one run. Writes runs/bench/bench.json.
+"""Measure the cost of r2s over its peers as ratios (`make bench`). Writes runs/bench/bench.json.
 
-Every ratio alternates r2s and its peer and takes the median, so that a machine that slows down slows both.
+Every ratio alternates r2s and its peer and takes the median, so that a slower machine slows both down.
 """
 
 import copy
@@ -17,15 +17,15 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from common import MACHINE, NEW, ROBOT, ROOT, conf
+from common import MACHINE, NEW, ROBOT, ROOT, conf, default_task
 from rich.console import Console
 from rich.table import Table
 
-from r2s.arm.twin import Twin
+from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.learning.env import TaskEnv
-from r2s.learning.randomization import Around
+from r2s.learning.randomization import UniformRandomization
 from r2s.learning.tqc import TQC
-from r2s.learning.train import keep_memory, products
+from r2s.learning.train import keep_memory, matmul_precision
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
 from r2s.tasks.reach import ReachTask
@@ -34,19 +34,19 @@ REPEATS = 15
 
 
 def duel(ours: Callable[[], object], peer: Callable[[], object], work: float) -> tuple[float, float]:
-    """Return (ours, peer): median rates, work per second, of calls in turn; a call may say how long it took, s."""
+    """Return median rates of both, work per second, of alternating calls; a call may return its own duration, s."""
     seconds: list[list[float]] = [[], []]
     for k in range(REPEATS + 2):
         for side, call in enumerate((ours, peer)):
             began = time.perf_counter()
-            told = call()
+            duration = call()
             if k >= 2:
-                seconds[side].append(told if isinstance(told, float) else time.perf_counter() - began)
+                seconds[side].append(duration if isinstance(duration, float) else time.perf_counter() - began)
     return work / float(np.median(seconds[0])), work / float(np.median(seconds[1]))
 
 
 def friction(robot, dynamics, threads: int) -> tuple[float, float]:
-    """Batched rollouts with friction, breakaway and offsets against the bare Batch, steps/s."""
+    """Compare batched rollouts with friction, breakaway and offsets with the bare Batch, steps/s."""
     arms, steps = 256, 200
     tau = 0.3 * np.cumsum(np.random.default_rng(0).normal(size=(arms, steps, robot.n)), axis=1)
     sim = Simulator(robot, dynamics, arms, threads)
@@ -66,9 +66,11 @@ def friction(robot, dynamics, threads: int) -> tuple[float, float]:
 
 
 def environment(robot, dynamics, threads: int) -> tuple[float, float]:
-    """TorchRL environment with observation, reward and randomised resets against its bare physics, arm steps/s."""
-    arms, steps, task = 32, 50, ReachTask(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
-    env = TaskEnv(robot, task, Around(robot, dynamics, **conf("dr/paper")), arms, nthread=threads, stagger=True)
+    """Compare the TorchRL environment (observation, reward, randomised resets) with its bare physics, arm steps/s."""
+    arms, steps, task = 32, 50, default_task("reach")
+    env = TaskEnv(
+        robot, task, UniformRandomization(robot, dynamics, **conf("dr/paper")), arms, nthread=threads, stagger=True
+    )
     state = env.reset()
     action = env.action_spec.rand()
     bare = mujoco.batch.Batch(robot.model(gravity=False), arms, threads)
@@ -88,9 +90,9 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
 
 
 def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
-    """TQC updates against TorchRL's eager TQCLoss with the same networks, batch and optimiser, updates/s.
+    """Compare TQC updates with TorchRL's eager TQCLoss, same networks, batch and optimiser, updates/s.
 
-    Ours are compiled, as a training's are; `matmul` is the precision of their products (r2s/learning/train.py).
+    Updates of r2s are compiled, same as in training; `matmul` is the precision of their matrix products.
     """
     from tensordict import TensorDict
     from tensordict.nn import TensorDictModule
@@ -103,7 +105,7 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, b = len(mean), robot.n, 256
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
-    with products(matmul):
+    with matmul_precision(matmul):
         algo.compile(b)
 
     class Critic(nn.Module):
@@ -133,7 +135,7 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     batch["terminated"] = torch.zeros(b)
 
     def ours() -> None:
-        with products(matmul):
+        with matmul_precision(matmul):
             for _ in range(10):
                 algo.update(batch)
 
@@ -149,11 +151,11 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
 
 
 class Sb3:
-    """sb3-contrib's TQC in its own virtual environment, runs/bench/sb3, made at the first use."""
+    """sb3-contrib's TQC in its own virtual environment, runs/bench/sb3, created at the first use."""
 
     @staticmethod
     def python() -> Path:
-        """Return the interpreter of that environment; make it where it is missing."""
+        """Return the interpreter of that environment; create the environment if it is missing."""
         folder = ROOT / "runs" / "bench" / "sb3"
         python = folder / "bin" / "python"
         if not (folder / ".ready").is_file():
@@ -171,7 +173,7 @@ class Sb3:
         assert self._process.stdout.readline().strip() == "ready"
 
     def update(self, threads: int, count: int) -> float:
-        """Return the seconds that `count` updates take."""
+        """Return the duration of `count` updates, s."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(f"{threads} {count}\n")
@@ -183,7 +185,7 @@ class Sb3:
 
 
 def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, float]:
-    """TQC updates with replay sampling against sb3-contrib's `train`, which samples too, in turn, updates/s."""
+    """Compare TQC updates with replay sampling with sb3-contrib's `train`, which samples too, updates/s."""
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -191,7 +193,7 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
     mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
     d, n, count = len(mean), robot.n, 50
     algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
-    with products(matmul):
+    with matmul_precision(matmul):
         algo.compile(256)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
     rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
@@ -199,7 +201,7 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
     replay.extend(TensorDict(rows, batch_size=[2000]))
 
     def ours() -> None:
-        with products(matmul):
+        with matmul_precision(matmul):
             for _ in range(count):
                 algo.update(replay.sample())
 
@@ -207,8 +209,8 @@ def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, floa
 
 
 def twin(robot) -> tuple[float, float]:
-    """The hidden twin against the arm that it stands for, cycles/s."""
-    arm, count, rates = Twin(robot, 0), 2000, []
+    """Compare the rate of the rigid twin with real time, cycles/s."""
+    arm, count, rates = RigidTwin(robot, 0), 2000, []
     for _ in range(REPEATS):
         arm.move_to(robot.q_home)
         began = time.perf_counter()
@@ -220,10 +222,10 @@ def twin(robot) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run all and print one table."""
+    """Run all comparisons and print one table."""
     robot, dynamics = ROBOT, NEW
     cores = os.cpu_count() or 1
-    keep_memory()  # as a training does
+    keep_memory()  # same as in training
     rows, sb3 = {"hidden twin / real time, cycles/s, 1 thread": twin(robot)}, Sb3()
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"

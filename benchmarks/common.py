@@ -1,11 +1,12 @@
-"""What the benchmarks share: the Panda, its published and its true values, settings from conf/, runs, tables."""
+"""Shared by the benchmarks: the Panda with published and true values, settings of conf/, runs, result pages."""
 
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import pandas as pd
@@ -15,120 +16,178 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
-WORDS: dict[str, tuple[str, ...]] = {  # that a script takes, each as a pattern; who is not here looks for itself
-    **dict.fromkeys(("bench", "gallery"), ()),
-    "adapters": (r"(root|task|episodes|policy|adapters|env_steps)=.+", r"\d_\d+"),
+ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments; scripts not listed check their own
+    **dict.fromkeys(("bench", "gallery", "watchdog"), ()),
+    "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
     "algorithms": ("trials",),
     "families": (r"\d+",),
-    "faults": ("kills", "places", "files", "mutations", "page"),
     "known_truth": (r"\d+",),
     "grid": (r"\d+(,\d+)*", NUMBER),
     "least_squares": (NUMBER,),
-    "payload": (PARTS, r"(root|keep)=.+", r"make=[12]", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
+    "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
-    "twins": (r"make=[12]", r"\d+"),
+    "twins": (r"variant=(rigid|elastic)", r"\d+"),
 }
 
 
-def check_words() -> None:
-    """End the script that was started, with one line, where a word after its name is not one that it takes."""
+def check_arguments() -> None:
+    """End a script with one line if it takes no such argument."""
     script = Path(sys.argv[0])
-    if script.resolve().parent != ROOT / "benchmarks" or script.stem not in WORDS:
+    if script.resolve().parent != ROOT / "benchmarks" or script.stem not in ARGUMENTS:
         return
     for word in sys.argv[1:]:
-        if not any(re.fullmatch(pattern, word) for pattern in WORDS[script.stem]):
-            allowed = ", ".join(WORDS[script.stem]) or "nothing"
-            print(f"error: {script.name}: '{word}' is not allowed after its name; {allowed} is", file=sys.stderr)
-            sys.exit(2)
+        if not any(re.fullmatch(pattern, word) for pattern in ARGUMENTS[script.stem]):
+            allowed = ", ".join(ARGUMENTS[script.stem]) or "no arguments"
+            sys.exit(f"error: {script.name}: unknown argument '{word}'; allowed: {allowed}")
 
 
-def say(kind, error, trace) -> None:
-    """Say in one line, as r2s does, that somebody pressed Ctrl-C."""
+def report_interrupt(kind, error, trace) -> None:
+    """Answer Ctrl-C with one line instead of a traceback."""
     if issubclass(kind, KeyboardInterrupt):
-        print("\ninterrupted; what was written stays, and is not done again", file=sys.stderr)
+        print("\ninterrupted; finished results are kept and not repeated", file=sys.stderr)
     else:
         sys.__excepthook__(kind, error, trace)
 
 
-check_words()
-sys.excepthook = say
+check_arguments()
+sys.excepthook = report_interrupt
 
 from hydra.utils import instantiate  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
 
 from r2s.arm.ramp import poses_about, ramp  # noqa: E402
-from r2s.arm.tracking import record  # noqa: E402
+from r2s.arm.recorder import record  # noqa: E402
+from r2s.arm.simulated import SimulatedArm  # noqa: E402
 from r2s.excitation.fourier import fourier  # noqa: E402
 from r2s.identification.settings import Settings  # noqa: E402
 from r2s.physics.dynamics import nominal_dynamics  # noqa: E402
 from r2s.physics.robot import OF_TASKS, load_robot  # noqa: E402
-from r2s.provenance import cpu  # noqa: E402
+from r2s.provenance import cpu, git  # noqa: E402
+from r2s.tasks.reach import ReachTask  # noqa: E402
+from r2s.tasks.track import TrackTask  # noqa: E402
 
 
 def conf(path: str) -> dict:
-    """Read one file of conf/: the arguments of what its `_target_` names, for the Panda."""
+    """Return the arguments in one file of conf/, without `_target_`; tasks with the Panda's values."""
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     if path.startswith("task/"):
         panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
         document = OmegaConf.to_container(OmegaConf.create({"robot": panda, "task": document}), resolve=True)["task"]
-    beside = {"_target_", "defaults", *(OF_TASKS if path.startswith("robot/") else ())}
-    return {k: v for k, v in document.items() if k not in beside}
+    dropped = {"_target_", "defaults", *(OF_TASKS if path.startswith("robot/") else ())}
+    return {k: v for k, v in document.items() if k not in dropped}
 
 
 MACHINE = f"{cpu()}, {os.cpu_count()} cores"
+RESULTS = ROOT / "benchmarks" / "results"
 ROBOT = load_robot(**conf("robot/panda"))
 OLD = nominal_dynamics(ROBOT, **conf("friction/gaz2019"))
 NEW = nominal_dynamics(ROBOT, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-SETTINGS = conf("config")["identify"]
-STEADY = ("algo.lr=1e-3", "algo.tau=0.01")  # of trainings of 5 minutes and more; conf/algo/tqc.yaml is for 2 to 5
+JUDGING = {"rigid": range(100, 110), "elastic": range(200, 210)}  # twin seeds that nothing is tuned on
+VARIANT_SEED = {"rigid": 1, "elastic": 2}  # first number of the random seeds of a variant's payloads
+SENSOR_NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}  # rad, rad/s: standard deviations
+
+
+def twin_variant(seed: int) -> str:
+    """Return the variant of twin to which a judging seed belongs; rigid for all others."""
+    return next((variant for variant, seeds in JUDGING.items() if seed in seeds), "rigid")
 
 
 def searches(name: str, **change) -> list:
-    """Return the searches of conf/search/<name>.yaml; seeds are 0."""
+    """Return the searches of conf/search/<name>.yaml with seed 0."""
     text = (ROOT / "conf" / "search" / f"{name}.yaml").read_text().replace("${seed}", "0")
     return [instantiate(s | {k: v for k, v in change.items() if k in s}) for s in yaml.safe_load(text)]
 
 
-def how(torque: str = "commanded", **change) -> Settings:
-    """Return the settings of `identify` as stage=identify gives them, but for the family."""
-    own = {k: v for k, v in SETTINGS.items() if k != "validation_fraction"}
-    return Settings(**own | {k: own[k][torque] for k in ("terms", "prior", "extra", "spare")} | change)
+def identify_settings(torque: str = "commanded", **change) -> Settings:
+    """Return the settings of stage=identify, except for the family."""
+    own = {k: v for k, v in conf("identify/default").items() if k != "validation_fraction"}
+    per_torque = ("terms", "prior", "candidate_terms", "prunable_terms")
+    return Settings(**own | {k: own[k][torque] for k in per_torque} | change)
 
 
-def side_by_side(jobs: Sequence[Sequence[str]]) -> None:
-    """Run commands of one thread each, as many at once as this process may use cores."""
+def default_task(name: str) -> ReachTask | TrackTask:
+    """Return task=reach or task=track of the Panda."""
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in conf(f"task/{name}").items()}
+    return {"reach": ReachTask, "track": TrackTask}[name](**settings)
+
+
+def simulated_arm(truth, seed: int) -> SimulatedArm:
+    """Return a simulated Panda of known truth with sensor noise."""
+    return SimulatedArm(ROBOT, truth, **SENSOR_NOISE, seed=seed)
+
+
+def load_training(folder: str | Path):
+    """Return robot, dynamics, task and policy of a run folder of stage=train."""
+    from r2s.learning.policy import load_policy
+    from r2s.stages.build import make_dynamics, make_robot, make_task
+    from r2s.stages.transfer import trained_config
+
+    source, trained = trained_config(OmegaConf.create({"policy": str(folder)}))
+    robot = make_robot(trained)
+    dynamics = make_dynamics(trained, robot)
+    task = make_task(trained, robot, dynamics)
+    return robot, dynamics, task, load_policy(source, robot, task)
+
+
+def stamp(command: str) -> str:
+    """Return machine, date, commit and command, as every page of benchmarks/results/ states them."""
+    return f"{MACHINE}; {date.today()}; commit {(git()['commit'] or 'unknown')[:7]}; `{command}`."
+
+
+def run_parallel(jobs: Iterable[Sequence[str]]) -> None:
+    """Run commands of run.py with one thread each on all cores of this process; skip finished ones."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     waiting, running = list(jobs), []
     while waiting or running:
         while waiting and len(running) < cores:
-            command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "only_missing=true"]
+            command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "skip_completed=true"]
             running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
         if (first := running.pop(0)).wait():
             sys.exit(f"failed: {' '.join(map(str, first.args))}")
 
 
+def identify_twins(twins: Iterable[tuple[str, int, Path]], root: Path) -> None:
+    """Identify twins (variant, seed, run folder) whose run folder has no posterior yet."""
+    run_parallel(
+        ["stage=identify", "arm=twin", f"arm.variant={v}", f"arm.seed={s}", f"root={root}", f"name={folder.name}"]
+        for v, s, folder in twins
+        if not (folder / "posterior.npz").is_file()
+    )
+
+
 def markdown(table: pd.DataFrame) -> str:
     """Return a table of strings as markdown, the index first."""
     head = [str(table.index.name or ""), *map(str, table.columns)]
-    lines = [
-        head,
-        ["---"] * len(head),
-        *([str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)),
-    ]
+    rows = [[str(i), *map(str, row)] for i, row in zip(table.index, table.values, strict=True)]
+    lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line).replace("\n", " ") + " |" for line in lines)
 
 
+def markdown_rows(rows: dict, name: str = "") -> str:
+    """Return {row: {column: cell}} as markdown."""
+    return markdown(pd.DataFrame.from_dict(rows, orient="index").rename_axis(name))
+
+
+def write_page(name: str, title: str, command: str, parts: Sequence[str]) -> None:
+    """Write benchmarks/results/<name>.md: title, provenance and paragraphs."""
+    script = f"benchmarks/{Path(sys.argv[0]).name}"
+    text = [f"# {title}", f"Written by `{script}`. {stamp(command)}", *parts]
+    (RESULTS / f"{name}.md").write_text("\n\n".join(text) + "\n")
+    print(f"written: benchmarks/results/{name}.md")
+
+
 def put_section(page: Path, heading: str, parts: Sequence[str]) -> None:
-    """Write a section of a page anew, up to the next of its level; at its end where there is none of that name."""
+    """Replace a section of a page, up to the next of its level; append it if the page has no such section."""
     begin = f"## {heading}\n"
     before, _, after = page.read_text().partition(begin)
     rest = after[after.find("\n## ") :] if "\n## " in after else ""
     page.write_text(before.rstrip("\n") + "\n\n" + begin + "\n" + "\n\n".join(parts) + "\n" + rest)
+    print(f"written: benchmarks/results/{page.name}, {heading}")
 
 
 def put_table(page: Path, name: str, text: str) -> None:
-    """Write what stands on a page between the markers of a table anew, where it has markers of that name."""
+    """Replace a table of a page between its markers, if the page has them."""
     begin, end = f"<!-- table: {name} -->\n", "<!-- end of the table -->\n"
     before, found, after = page.read_text().partition(begin)
     if found:
@@ -136,17 +195,17 @@ def put_table(page: Path, name: str, text: str) -> None:
 
 
 __all__ = [
+    "JUDGING",
     "MACHINE",
     "NEW",
     "OLD",
+    "RESULTS",
     "ROBOT",
     "ROOT",
-    "SETTINGS",
-    "STEADY",
-    "conf",
-    "fourier",
-    "how",
-    "poses_about",
-    "ramp",
+    "SENSOR_NOISE",
+    "VARIANT_SEED",
+    "SimulatedArm",
 ]
-__all__ += ["markdown", "put_section", "put_table", "record", "replace", "searches", "side_by_side"]
+__all__ += ["conf", "default_task", "fourier", "identify_settings", "identify_twins", "load_training", "markdown"]
+__all__ += ["markdown_rows", "poses_about", "put_section", "put_table", "ramp", "record", "replace", "run_parallel"]
+__all__ += ["searches", "simulated_arm", "stamp", "twin_variant", "write_page"]

@@ -1,26 +1,35 @@
-"""Does friction.family=auto pick the family that data were made with?
+"""Test whether friction.family=auto selects the family that generated the data.
 
-`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous, Stribeck and bristle friction
-about the paper's level, records 15 s of each (sensor noise, delay and breakaway as in benchmarks/known_truth.py), and
-compares the families as stage=identify does. Writes docs/families.md.
+`python benchmarks/families.py [SEEDS]` draws arms with sigmoid, Coulomb + viscous, Stribeck and presliding friction
+around the paper's level, records 15 s of each (sensor noise, delay and breakaway as in known_truth.py), and compares
+the families same as stage=identify. Writes benchmarks/results/families.md.
 """
 
 import sys
 import time
 
 import numpy as np
-from common import MACHINE, NEW, OLD, ROBOT, ROOT, fourier, how, record, replace
+from common import (
+    NEW,
+    OLD,
+    ROBOT,
+    fourier,
+    identify_settings,
+    markdown_rows,
+    record,
+    replace,
+    simulated_arm,
+    write_page,
+)
 
-from r2s.arm.simulated import SimulatedArm
-from r2s.identification.family_selection import compare_families
 from r2s.identification.identify import STANDSTILL
+from r2s.identification.structure.cross_validation import CrossValidation
+from r2s.identification.structure.family_selection import compare_families
 from r2s.physics.friction import BRISTLE, FAMILIES, SIGMOID, STRIBECK
-
-NOISE = {"position_noise": 2e-5, "velocity_noise": 3e-3}
 
 
 def draw(family, rng):
-    """Return an arm whose friction is of this family, with the paper's level times U(0.7, 1.3)."""
+    """Return an arm with friction of this family, at the paper's level times U(0.7, 1.3)."""
     n = ROBOT.n
     level = SIGMOID.level(NEW.phi, np.full(n, 1.0)) * rng.uniform(0.7, 1.3, n)
     if family == SIGMOID:
@@ -36,36 +45,30 @@ def draw(family, rng):
 
 
 def main() -> None:
-    """Run every truth and seed and write the table."""
+    """Run every family and seed and write the table."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 10
-    settings = how()
-    given = [settings.bounds, settings.prior, ["offset", "inertia_scale", "delay"], settings.folds]
-    names = [f.name for f in FAMILIES]
-    picks = {}
-    began = time.perf_counter()
+    settings = identify_settings()
+    given = settings.bounds, settings.prior, settings.folds, 10.0  # Hz, low-pass
+    terms = ["offset", "inertia_scale", "delay"]
+    names, picks, began = [f.name for f in FAMILIES], {}, time.perf_counter()
     for family in FAMILIES:
         picks[family.name] = []
         for seed in range(seeds):
             truth = draw(family, np.random.default_rng([FAMILIES.index(family), seed]))
-            arm = SimulatedArm(ROBOT, truth, **NOISE, seed=seed)
-            motion = record(arm, fourier(ROBOT, duration=15.0, seed=seed))
-            chosen = compare_families(ROBOT, OLD, motion, *given, {"cutoff_hz": 10.0}, lambda row: None, STANDSTILL)
+            motion = record(simulated_arm(truth, seed), fourier(ROBOT, duration=15.0, seed=seed))
+            cv = CrossValidation(ROBOT, OLD, motion, *given, report=lambda row: None)
+            chosen = compare_families(cv, terms, STANDSTILL)
             picks[family.name].append(names[chosen["best"]])
-            told = ", ".join(f"{n} {e:.3f}" for n, e in zip(names, chosen["error"], strict=True))
-            print(f"{family.name}, seed {seed}: {picks[family.name][-1]} ({told})", flush=True)
+            errors = ", ".join(f"{n} {e:.3f}" for n, e in zip(names, chosen["error"], strict=True))
+            print(f"{family.name}, seed {seed}: {picks[family.name][-1]} ({errors})", flush=True)
     seconds = (time.perf_counter() - began) / (len(FAMILIES) * seeds)
-    lines = [
-        "# Right family: what friction.family=auto picks",
-        "",
-        f"`python benchmarks/families.py` on {MACHINE}, {seeds} seeds each, {seconds:.0f} s each with its recording.",
-        "Asked: the right one in at least 9 of 10.",
-        "",
-        "| data made with | " + " | ".join(f"picked {n}" for n in names) + " |",
-        "|---|" + "---|" * len(names),
+    table = {truth: {f"picked {n}": picked.count(n) for n in names} for truth, picked in picks.items()}
+    parts = [
+        f"{seeds} seeds per family, {seconds:.0f} s each with the recording. Target: 9 of 10.",
+        markdown_rows(table, "data made with"),
     ]
-    lines += [f"| {t} | " + " | ".join(str(p.count(n)) for n in names) + " |" for t, p in picks.items()]
-    (ROOT / "docs" / "families.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines[5:]))
+    title = "Friction family selected by `friction.family=auto`"
+    write_page("families", title, "python benchmarks/families.py", parts)
 
 
 if __name__ == "__main__":

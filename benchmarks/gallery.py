@@ -1,9 +1,9 @@
-"""The pictures of docs/gallery.md: arms, overlays before and after, friction, learning, transfers, the viewer.
+"""Draw the pictures of docs/gallery.md: arms, overlays before and after, friction, learning, transfers, the viewer.
 
-`python benchmarks/gallery.py` makes the runs that are missing (twin 0 and the Kinova's recordings identified, the
-trainings of benchmarks/minutes.py compared, the first of them taken to twin 0: a quarter of an hour on two cores) and
-writes docs/gallery/*.png, each at most 150 kB. The viewer is drawn where Xvfb and a Vulkan driver are, such as
-Mesa's (Debian: xvfb mesa-vulkan-drivers libxkbcommon-x11-0); elsewhere its pictures stay as they are.
+`python benchmarks/gallery.py` runs what is missing (identification of twin 0 and of the Kinova's recordings, the
+trainings of benchmarks/minutes.py, a comparison, a transfer to twin 0: a quarter of an hour on two cores) and writes
+docs/gallery/*.png, each at most 150 kB. Pictures of the viewer need Xvfb and a Vulkan driver such as Mesa's (Debian:
+xvfb mesa-vulkan-drivers libxkbcommon-x11-0); without them they stay unchanged.
 """
 
 import os
@@ -16,68 +16,68 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, conf, side_by_side
+from common import ROOT, conf, run_parallel
 from matplotlib.figure import Figure
 from pictures import FLOOR, frame_of, picture
 from PIL import Image
 
 from r2s.physics.robot import load_robot
-from r2s.reporting.colours import KNOWN
-from r2s.reporting.log_rows import without_pauses
+from r2s.reporting.figures.colours import KNOWN
+from r2s.reporting.figures.log_rows import without_pauses
 
 NAME = "gallery"  # of the run folders
 OUT = ROOT / "docs" / "gallery"
 RUNS = ROOT / "runs"
-ARMS = {"panda": "#3b8fe0", "kinova_gen3": "#3daa6d", "ur10e": "#c9a227", "iiwa14": "#d65f9e", "xarm7": "#9b7ede"}
-SEEDS = range(95, 98)  # of trainings that are compared, those of benchmarks/minutes.py
-MOST_BYTES = 150_000
+TINTS = {"panda": "#3b8fe0", "kinova_gen3": "#3daa6d", "ur10e": "#c9a227", "iiwa14": "#d65f9e", "xarm7": "#9b7ede"}
+SEEDS = range(95, 98)  # of the compared trainings
+MAX_BYTES = 150_000
 WIDTH = 1100  # pixels
 SECONDS = 8.0  # of torque
-SHADOW_M = 0.15  # beside the arms
+SHADOW_M = 0.15  # room for the shadow beside an arm
 DISPLAY = ":97"
 
 
 def save(image: Image.Image, name: str, colours: int = 128, width: int = WIDTH) -> None:
-    """Write docs/gallery/NAME.png, small: at most `width` pixels wide, of few colours."""
+    """Write docs/gallery/NAME.png with few colours and at most `width` pixels width."""
     if image.width > width:
         image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
     image.convert("RGB").quantize(colours).save(OUT / f"{name}.png", optimize=True)
     size = (OUT / f"{name}.png").stat().st_size
-    if size > MOST_BYTES:
-        raise SystemExit(f"{name}.png has {size} bytes; at most {MOST_BYTES} are")
+    if size > MAX_BYTES:
+        raise SystemExit(f"{name}.png: expected at most {MAX_BYTES} bytes, got {size}")
     print(f"written: docs/gallery/{name}.png, {size / 1e3:.0f} kB")
 
 
-def of_figure(figure: Figure, name: str) -> None:
-    """Write a figure of matplotlib."""
+def save_figure(figure: Figure, name: str) -> None:
+    """Write a Matplotlib figure."""
     out = BytesIO()
     figure.savefig(out, dpi=110)
     save(Image.open(out), name)
 
 
 def arms() -> None:
-    """Draw the arms that come with r2s, each at home."""
+    """Draw the arms that come with r2s in their home postures."""
     robots = {
         name: load_robot(**{key: value for key, value in conf(f"robot/{name}").items() if key != "defaults"})
-        for name in ARMS
+        for name in TINTS
     }
     frames = np.array([frame_of(robot.q_home[None], robot) for robot in robots.values()])
-    bottom, top = frames[:, 2].min(), frames[:, 3].max()  # one scale for all
+    bottom, top = frames[:, 2].min(), frames[:, 3].max()  # one scale for all arms
     left, right = frames[:, 0].min(), frames[:, 1].max() + SHADOW_M
     figure = Figure(figsize=(11, 0.3 + 2.2 * (top - bottom) / (right - left)))
     for k, (name, robot) in enumerate(robots.items()):
         frame = left, right, bottom, top
-        seen, arm, light = picture(robot.q_home, ARMS[name], frame, robot, 1.3 * WIDTH / 5 / (right - left))
+        seen, arm, light = picture(robot.q_home, TINTS[name], frame, robot, 1.3 * WIDTH / 5 / (right - left))
         axis = figure.add_axes((0.2 * k, 0.0, 0.2, 0.88))
         axis.imshow(np.where(arm[..., None], seen, FLOOR * light[..., None]), extent=frame)
         axis.set_title(name, fontsize=12)
         axis.set_axis_off()
     figure.set_facecolor(tuple(FLOOR))
-    of_figure(figure, "arms")
+    save_figure(figure, "arms")
 
 
 def before_and_after(folder: Path, joints: Sequence[int], name: str) -> None:
-    """Draw measured torque with the nominal model's (left) and the identified one's (right): the paper's figure."""
+    """Draw measured torque with that of the nominal (left) and the identified model (right), same as in the paper."""
     saved = dict(np.load(folder / "torque.npz"))
     clock, _ = without_pauses(saved["t"])
     rows = clock <= SECONDS
@@ -93,32 +93,24 @@ def before_and_after(folder: Path, joints: Sequence[int], name: str) -> None:
             axis.spines[["top", "right"]].set_visible(False)
         pair[0].set_ylabel("torque, Nm")
     for axis in axes[-1]:
-        axis.set_xlabel("time, s, motion that was not fitted")
+        axis.set_xlabel("time, s, held-out motion")
     lines = [line for axis in axes[0] for line in axis.get_lines()]
-    told = {str(line.get_label()): line for line in lines}
-    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=3, frameon=False)
-    of_figure(figure, name)
+    by_label = {str(line.get_label()): line for line in lines}
+    figure.legend(by_label.values(), by_label.keys(), loc="outside lower center", ncols=3, frameon=False)
+    save_figure(figure, name)
 
 
 def viewer(recording: Path, name: str) -> None:
-    """Take a picture of the viewer as it opens a recording, on a screen that nobody sees."""
+    """Take a picture of the viewer with a recording, on a virtual screen."""
     if not shutil.which("Xvfb"):
-        print(f"docs/gallery/{name}.png stays as it is: no Xvfb here")
+        print(f"docs/gallery/{name}.png stays unchanged: Xvfb is not installed")
         return
     shot = OUT / f"{name}_raw.png"
     screen = subprocess.Popen(["Xvfb", DISPLAY, "-screen", "0", "1400x900x24"], stderr=subprocess.DEVNULL)
     try:
         time.sleep(2)
-        words = [
-            Path(sys.executable).parent / "rerun",
-            recording,
-            "--window-size",
-            "1300x800",
-            "--renderer",
-            "vulkan",
-            "--screenshot-to",
-            shot,
-        ]
+        words = [Path(sys.executable).parent / "rerun", recording, "--window-size", "1300x800"]
+        words += ["--renderer", "vulkan", "--screenshot-to", shot]
         env = os.environ | {"DISPLAY": DISPLAY}
         subprocess.run(words, env=env, check=True, timeout=180, capture_output=True)
         with Image.open(shot) as image:
@@ -130,16 +122,16 @@ def viewer(recording: Path, name: str) -> None:
 
 
 def make_runs() -> None:
-    """Run what is missing; what is there is left alone."""
-    side_by_side(
+    """Run what is missing."""
+    run_parallel(
         [
             ["stage=identify", f"name={NAME}", "data.seconds=10"],
             ["stage=identify", f"name={NAME}_kinova", "data=kinova_gen3"],
         ]
     )
     minutes = [["algo=tqc", "dr=paper", "budget.minutes=4", f"seed={s}", f"name=four_{s}"] for s in SEEDS]
-    side_by_side([*minutes, ["algo=oracle", "dr=paper", "name=minutes_oracle"]])
-    side_by_side(
+    run_parallel([*minutes, ["algo=oracle", "dr=paper", "name=minutes_oracle"]])
+    run_parallel(
         [
             ["stage=transfer", f"policy={RUNS / 'train' / f'four_{SEEDS[0]}'}", f"name={NAME}"],
             ["stage=compare", 'runs="runs/train/[fm]*_[9o]*"', f"name={NAME}"],
@@ -148,7 +140,7 @@ def make_runs() -> None:
 
 
 def main() -> None:
-    """Make what is missing, then draw."""
+    """Run what is missing, then draw."""
     os.chdir(ROOT)
     OUT.mkdir(exist_ok=True)
     make_runs()

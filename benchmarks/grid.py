@@ -1,8 +1,8 @@
-"""The paper's grid search, run once: 48 trainings of one seed, and a search of a quarter as many beside it.
+"""Run the paper's grid search (48 trainings of one seed) and a search with a quarter as many trials.
 
 `python benchmarks/grid.py [SEEDS] [MINUTES]`, by default 0 and 2.5, runs `+experiment=paper_grid` and then
-`+experiment=tune`, both only what is missing, so they can be stopped; then it writes "The paper's grid" in
-docs/algorithms.md. Run folders: runs/train/{grid,tuned}_*, runs/tune/tuned.
+`+experiment=tune`, skipping finished trainings; then it writes "The paper's grid" in
+benchmarks/results/algorithms.md. Run folders: runs/train/{grid,tuned}_*, runs/tune/tuned.
 """
 
 import os
@@ -11,17 +11,17 @@ import sys
 from collections.abc import Sequence
 
 import pandas as pd
-from common import MACHINE, ROOT, markdown, put_section
+from common import RESULTS, ROOT, markdown, put_section, stamp
 
-from r2s.reporting.comparison import sensitivity_table
-from r2s.reporting.grouping import group
-from r2s.reporting.trainings import Trained, read_trainings
+from r2s.reporting.comparison.grouping import group
+from r2s.reporting.comparison.scores import sensitivity_table
+from r2s.reporting.comparison.trainings import Trained, read_trainings
 from r2s.reporting.tuning import against_table
-from r2s.stages.tune import MEASURES
+from r2s.tasks.reach import REACH
 
 ALGORITHMS = ("tqc", "sac", "td3", "ddpg")
 AXES = {"algo.lr": "lr", "algo.batch_size": "batch", "algo.gamma": "gamma"}
-MEASURE = "return_paper"  # what settings are chosen by
+MEASURE = "return_paper"  # selects the best setting; larger is better
 SHOWN = {"success_1cm": ("< 1 cm, %", 100, 1), "success_5mm": ("< 5 mm, %", 100, 1)}
 SHOWN |= {"rest": ("at rest, %", 100, 1), "return_paper": ("return", 1, 1), "env_steps": ("1000 env steps", 1e-3, 0)}
 TRIALS = 12
@@ -30,31 +30,25 @@ GRID = "runs/train/grid_*"
 
 
 def run(words: Sequence[str]) -> None:
-    """Run a command of r2s; end where it fails."""
+    """Run a command of r2s; end the script if it fails."""
     if subprocess.call([sys.executable, "run.py", *words], cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}):
         sys.exit(f"failed: {' '.join(words)}")
 
 
-def trainings() -> list[Trained]:
-    """Return the finished jobs of the grid."""
-    return read_trainings(sorted(ROOT.glob(GRID)))[0]
-
-
 def settings(jobs: list[Trained]) -> pd.DataFrame:
-    """Return a row per algorithm and setting, mean over seeds: what chose it, its last policy on unseen goals."""
+    """Return a row per algorithm and setting, mean over seeds: selection score, and last policy on unseen goals."""
     rows = []
     for r in jobs:
         axes = {axis: r.settings[key] for key, axis in AXES.items()}
-        rows.append({"algo": r.algo, **axes, "chosen by": r.curve[MEASURE].iloc[-1], **r.last})
-    return pd.DataFrame(rows).groupby(["algo", *AXES.values()], as_index=False)[["chosen by", *SHOWN]].mean()
+        rows.append({"algo": r.algo, **axes, "selected by": r.curve[MEASURE].iloc[-1], **r.last})
+    return pd.DataFrame(rows).groupby(["algo", *AXES.values()], as_index=False)[["selected by", *SHOWN]].mean()
 
 
 def best_table(each: pd.DataFrame) -> pd.DataFrame:
-    """Return the setting of each algorithm that its own evaluations chose, on goals that they never saw."""
-    best = each.loc[each.groupby("algo")["chosen by"].idxmax()].set_index("algo").loc[list(ALGORITHMS)]
-    out = pd.DataFrame(
-        {"setting": [f"lr {r.lr:g}, batch {r.batch:.0f}, gamma {r.gamma:g}" for r in best.itertuples()]}
-    )
+    """Return the setting of each algorithm that its evaluations selected, scored on unseen goals."""
+    best = each.loc[each.groupby("algo")["selected by"].idxmax()].set_index("algo").loc[list(ALGORITHMS)]
+    settings = [f"lr {r.lr:g}, batch {r.batch:.0f}, gamma {r.gamma:g}" for r in best.itertuples()]
+    out = pd.DataFrame({"setting": settings})
     out.index = pd.Index(best.index, name="best of each")
     for key, (title, scale, digits) in SHOWN.items():
         out[title] = (scale * best[key]).map(lambda x, d=digits: f"{x:.{d}f}")
@@ -62,7 +56,7 @@ def best_table(each: pd.DataFrame) -> pd.DataFrame:
 
 
 def spread_table(jobs: list[Trained], each: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Return best, median and worst over the settings of each algorithm, and who loses least from best to median."""
+    """Return best, median and worst setting per algorithm, and the smallest loss from best to median."""
     out, least, grouped = {}, {}, group(jobs).members
     for key in ("success_1cm", "return_paper"):
         title, scale, _ = SHOWN[key]
@@ -84,9 +78,9 @@ def axes_table(each: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(columns).loc[list(ALGORITHMS)].rename_axis("median return")
 
 
-def written(seeds: str, minutes: float) -> list[str]:
-    """Return the section."""
-    jobs = trainings()
+def section(seeds: str, minutes: float) -> list[str]:
+    """Return the paragraphs of the section."""
+    jobs = read_trainings(sorted(ROOT.glob(GRID)))[0]
     each = settings(jobs)
     spread, least = spread_table(jobs, each)
     order = {
@@ -98,26 +92,25 @@ def written(seeds: str, minutes: float) -> list[str]:
     ranks = "; ".join(f"by {title.removesuffix(', %')}: {' > '.join(names)}" for title, names in order.items())
     loses = "; ".join(f"by {title.removesuffix(', %')}: {name}" for title, name in least.items())
     text = [
-        f"`python benchmarks/grid.py` on {MACHINE}: conf/experiment/paper_grid.yaml with budget.minutes={minutes:g} "
-        f"and seed {seeds}, {len(jobs)} jobs of one thread. Of each algorithm the setting is shown that the return "
-        "of its last evaluation chose; the numbers are of its last policy on goals, starts and arms that nothing "
-        "was chosen on.",
+        f"{stamp('python benchmarks/grid.py')} conf/experiment/paper_grid.yaml with budget.minutes={minutes:g} and "
+        f"seed {seeds}, {len(jobs)} jobs. The return of the last evaluation selects a setting; the table shows its "
+        "last policy on other goals, starts and arms.",
         markdown(best_table(each)),
-        f"Best setting of each, {ranks}: TQC {leads}. Least lost from the best to the median setting, {loses}: that "
-        f"TQC is the least sensitive is {holds}. With one seed a difference of some points is chance.",
+        f"Best setting of each, {ranks}: TQC {leads}. Smallest loss from the best to the median setting, {loses}: "
+        f"TQC as the least sensitive is {holds}. With one seed a difference of some points is chance.",
         markdown(spread),
         markdown(axes_table(each)),
     ]
     trials = pd.read_csv(TUNED / "trials.csv")
-    against = against_table(trials, MEASURE, str(ROOT / GRID), MEASURES[MEASURE] == "maximize")
+    against = against_table(trials, MEASURE, str(ROOT / GRID), not REACH[MEASURE].lower_is_better)
     assert against is not None
     counts = trials["state"].value_counts()
     shown = against.map(lambda x: f"{x:.4g}").set_index("minutes").rename_axis("minutes of training")
     return [
         *text,
-        f"`+experiment=tune` with {len(trials)} trials of as many minutes ({counts.get('complete', 0)} came to their "
-        f"end, {counts.get('pruned', 0)} were stopped): the best return so far at equal compute. The grid's is the "
-        "mean over random orders of its jobs. Returns are of the last evaluations, by which either chooses.",
+        f"`+experiment=tune` with {len(trials)} trials of as many minutes ({counts.get('complete', 0)} finished, "
+        f"{counts.get('pruned', 0)} were stopped early): best return so far at equal compute; the grid's is the mean "
+        "over random orders.",
         markdown(shown),
     ]
 
@@ -130,8 +123,7 @@ def main() -> None:
     if not (TUNED / "trials.csv").is_file():
         begun = [f"resume={TUNED}"] if TUNED.is_dir() else ["name=tuned"]
         run(["+experiment=tune", f"budget.minutes={minutes:g}", f"tune.trials={TRIALS}", "tune.startup=4", *begun])
-    put_section(ROOT / "docs" / "algorithms.md", "The paper's grid", written(seeds, minutes))
-    print("written: docs/algorithms.md")
+    put_section(RESULTS / "algorithms.md", "The paper's grid", section(seeds, minutes))
 
 
 if __name__ == "__main__":

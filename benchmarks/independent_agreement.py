@@ -1,8 +1,8 @@
-"""Do the arms of benchmarks/independent_arms.py move as those of another simulator, under the same commands?
+"""Check whether arms of another simulator move like those of independent_arms.py under the same commands.
 
 `python benchmarks/independent_agreement.py FOLDER ...` takes arms with a truth.json, cuts their training motion into
-windows of 0.1 s in which all joints slide, starts each from the measured state and replays its commands. What is left
-must be what noise of the start states grows to: as much as on arms of benchmarks/independent_arms.py itself.
+windows of 0.1 s in which all joints slide, starts each from the measured state and replays its commands. The
+remaining error must be what noise of the start states grows to: same as on arms of independent_arms.py itself.
 """
 
 import json
@@ -16,19 +16,19 @@ from numba import njit
 from scipy.signal import savgol_filter
 
 STEPS, LOCAL, SLIDES = 100, 31, 0.05  # ms, ms, rad/s
-BEFORE = 40  # ms of commands that the lag remembers
+BEFORE = 40  # ms of earlier commands: 20 times the longest lag
 
 
 @njit(cache=True)
 def replay(arm, state, tau, out):
-    """Fill out (T, N) rad with the angles before each of the commands tau (T, N) Nm."""
+    """Fill out (T, N) rad with the angles before each command tau (T, N) Nm."""
     for k in range(len(tau)):
         out[k] = state.q
         cycle(arm, state, tau[k])
 
 
 def sliding(arm, truth: dict, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> State:
-    """Return an arm that slides at q, dq (7,) after the commands tau (BEFORE, 7), bristles as in steady motion."""
+    """Return an arm sliding at q, dq (7,) after commands tau (BEFORE, 7), bristles in steady state."""
     bristle, drive = np.zeros(7), tau[0].copy()
     if arm.kind == LUGRE:
         viscous = np.where(dq > 0, truth["friction"]["fv_pos"], truth["friction"]["fv_neg"]) * dq
@@ -37,7 +37,7 @@ def sliding(arm, truth: dict, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) ->
         q.copy(), np.zeros(7), bristle, np.ones(7, int), np.ones(7), np.ones(7), drive, np.empty((HISTORY, 7))
     )
     standing.line[:] = tau[0]
-    frozen = arm._replace(kind=0, low=np.full(7, -1e9), high=np.full(7, 1e9))  # only its delay and lag go on
+    frozen = arm._replace(kind=0, low=np.full(7, -1e9), high=np.full(7, 1e9))  # only delay and lag advance
     for u in tau:
         cycle(frozen, standing, u)
     moving = standing._replace(dq=dq.copy(), stuck=np.zeros(7, int), way=np.sign(dq))
@@ -45,7 +45,7 @@ def sliding(arm, truth: dict, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) ->
 
 
 def agreement(folder: Path) -> tuple[int, np.ndarray]:
-    """Return how many windows there are, and the RMS error (7,) rad of angles after 0.1 s."""
+    """Return the number of windows and the RMS error (7,) rad of angles after 0.1 s."""
     truth = json.loads((folder / "truth.json").read_text())
     arm = make_arm(truth)
     with np.load(folder / "train.npz") as z:

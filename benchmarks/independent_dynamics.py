@@ -1,15 +1,15 @@
-"""An arm that shares no code with r2s: rigid links, friction that sticks exactly, delay and lag, at 0.1 ms.
+"""Simulate an arm that shares no code with r2s: rigid links, exact stick-slip, delay and lag, at 0.1 ms.
 
     M(q) ddq + c(q, dq) + g(q) = tau_drive + g_nominal(q) + offset - tau_f,    tau_drive = lag(delay(command))
 
-Masses and centres are nominal ones, so gravity and its compensation cancel. A joint at rest holds while the net
-torque on it (all but friction) lies in its band; the other joints' accelerations are part of it, so a joint that
-another one pulls lets go. A joint comes to rest where its velocity crosses 0, or is at most `v_stick`, with the net
-torque inside the band (not within 5 ms of its release). Both are located in time to 1e-12 s. LuGre has no such rule:
-bristles hold.
+Masses and centres are nominal, so gravity and its compensation cancel. A joint at rest holds while its net torque
+(all but friction) lies in its band. The net torque includes the accelerations of the other joints, so one joint can
+pull another one loose. A joint comes to rest if its velocity crosses 0, or is at most `v_stick`, with the net torque
+inside the band (not within 5 ms of its release). Both events are located in time to 1e-12 s. LuGre has no such rule:
+bristles hold the joint.
 
-Rigid bodies are spatial vectors about the base's origin (Featherstone 2008, ch. 5 and 6), the arm Franka's own table
-of (modified) Denavit-Hartenberg parameters. Integration is the classical Runge-Kutta of fourth order.
+Rigid bodies are spatial vectors about the base's origin (Featherstone 2008, ch. 5 and 6); the arm is Franka's table
+of (modified) Denavit-Hartenberg parameters. Integration is the classical fourth-order Runge-Kutta method.
 """
 
 from collections import namedtuple
@@ -19,25 +19,25 @@ from numba import njit
 
 N = 7
 CYCLE = 1e-3  # s, one command each
-HISTORY = 16  # commands that are kept: the longest delay is one less, in ms
-SETTLE = 5e-3  # s after its release in which a joint is not at rest, however slow
-MANY = 1000  # events in 1 ms: more is a mistake
-SMOOTH, COULOMB, LUGRE = range(3)  # kinds of law: eq. (5); Coulomb, Stribeck and viscous per direction; with bristles
+HISTORY = 16  # stored commands: the longest delay is one less, in ms
+SETTLE = 5e-3  # s after its release during which a joint cannot come to rest
+MAX_EVENTS = 1000  # in 1 ms: more indicates an error
+SMOOTH, COULOMB, LUGRE = range(3)  # friction laws: eq. (5); Coulomb, Stribeck and viscous per direction; bristles
 ALPHA = np.array([0.0, -1.0, 1.0, 1.0, -1.0, 1.0, 1.0])  # in right angles
 A = np.array([0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088])  # m
 D = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])  # m
 
 # mass (N,), com (N, 3), tensor (N, 3, 3) about com; kind, law (N, 9): phi1..3, or fc, fv, fs of + and -, vs, sigma0
-# and sigma1; offset, low, high (N,) Nm; v_stick rad/s, delay and lag s, step: the longest, s
+# and sigma1; offset, low, high (N,) Nm; v_stick rad/s, delay and lag s, step: the longest step, s
 Arm = namedtuple("Arm", "mass com tensor kind law offset low high v_stick delay lag step")
-# q, dq, bristle (N,) rad, rad/s, rad; stuck, way (N,) 1 or 0 and the direction of motion; since (N,) s from its
-# release; drive (N,) Nm behind the lag; line (HISTORY, N) Nm, commands, the newest last
+# q, dq, bristle (N,) rad, rad/s, rad; stuck (N,) 1 or 0; way (N,) direction of motion; since (N,) s after release;
+# drive (N,) Nm after the lag; line (HISTORY, N) Nm, commands, the newest last
 State = namedtuple("State", "q dq bristle stuck way since drive line")
 
 
 @njit(cache=True)
 def rigid_body(q, dq, mass, com, tensor, gravity, M, bias):
-    """Fill M (N, N) kg m^2 and bias (N,) Nm, the torque of ddq = 0, at q, dq (N,) with gravity m/s^2 downwards."""
+    """Fill M (N, N) kg m^2 and bias (N,) Nm, the torque at ddq = 0, for q, dq (N,) and gravity m/s^2 downwards."""
     axis, arm, J, h, f = np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((N, 6))
     R, P = np.eye(3), np.zeros(3)
     w, v, aw, av = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
@@ -104,7 +104,7 @@ def rigid_body(q, dq, mass, com, tensor, gravity, M, bias):
     m = 0.0
     for k in range(N - 1, -1, -1):
         m += mass[k]
-        if k < N - 1:  # what is beyond the joint moves as one body
+        if k < N - 1:  # composite body of all links beyond the joint
             h[k] += h[k + 1]
             J[k] += J[k + 1]
             f[k] += f[k + 1]
@@ -124,7 +124,7 @@ def rigid_body(q, dq, mass, com, tensor, gravity, M, bias):
 
 @njit(cache=True)
 def friction(kind, p, v, way, bristle):
-    """Return (Nm, rad/s): the torque at v rad/s of a joint that slides `way` (1 or -1), and how its bristle bends."""
+    """Return friction, Nm, and bristle rate, rad/s, of a joint that slides at v rad/s to the side `way` (1 or -1)."""
     if kind == SMOOTH:
         return p[0] / (1.0 + np.exp(-p[1] * (v + p[2]))) - p[0] / (1.0 + np.exp(-p[1] * p[2])), 0.0
     side = 0 if (v > 0.0 if kind == LUGRE else way > 0) else 1
@@ -137,7 +137,7 @@ def friction(kind, p, v, way, bristle):
 
 @njit(cache=True)
 def accelerate(arm, q, dq, bristle, stuck, way, drive, M, bias, ddq, bends, net):
-    """Fill ddq, bends, and net (N,) Nm: what friction must balance where a joint is stuck."""
+    """Fill ddq, bristle rates, and net (N,) Nm: the torque that static friction balances in a stuck joint."""
     rigid_body(q, dq, arm.mass, arm.com, arm.tensor, 0.0, M, bias)
     free, at = np.empty(N, np.int64), 0
     for j in range(N):
@@ -149,7 +149,7 @@ def accelerate(arm, q, dq, bristle, stuck, way, drive, M, bias, ddq, bends, net)
             free[at] = j
             at += 1
     L = np.empty((N, N))
-    for a in range(at):  # Cholesky, and forward substitution as it goes
+    for a in range(at):  # Cholesky factor with forward substitution
         i = free[a]
         for b in range(a + 1):
             s = M[i, free[b]]
@@ -174,7 +174,7 @@ def accelerate(arm, q, dq, bristle, stuck, way, drive, M, bias, ddq, bends, net)
 
 @njit(cache=True)
 def advance(arm, q, dq, bristle, stuck, way, drive, command, h, out):
-    """Fill out (3, N) with q, dq and bristle after h s of one command."""
+    """Fill out (3, N) with q, dq and bristle after h s of a constant command."""
     M, bias, net, late = np.empty((N, N)), np.empty(N), np.empty(N), np.empty(N)
     k, at = np.empty((3, N)), np.empty((3, N))
     out[0], out[1], out[2] = q, dq, bristle
@@ -198,7 +198,7 @@ def advance(arm, q, dq, bristle, stuck, way, drive, command, h, out):
 
 @njit(cache=True)
 def lagged(drive, command, lag, h, out):
-    """Fill out (N,) Nm with the drive h s later."""
+    """Fill out (N,) Nm with the drive torque h s later."""
     left = np.exp(-h / lag) if lag > 0.0 else 0.0
     for j in range(N):
         out[j] = command[j] + (drive[j] - command[j]) * left
@@ -206,23 +206,23 @@ def lagged(drive, command, lag, h, out):
 
 @njit(cache=True)
 def outside(arm, j, net):
-    """Return by how much Nm the net torque is above (or, negative, below) what joint j holds."""
+    """Return how far the net torque is above (positive) or below (negative) the band of joint j, Nm."""
     return net[j] - arm.high[j] if net[j] > arm.high[j] else min(net[j] - arm.low[j], 0.0)
 
 
 @njit(cache=True)
-def needed(arm, s, drive, net):
-    """Fill net (N,) Nm at a state."""
+def net_torque(arm, s, drive, net):
+    """Fill net (N,) Nm of a state."""
     M, bias, ddq, bends = np.empty((N, N)), np.empty(N), np.empty(N), np.empty(N)
     accelerate(arm, s.q, s.dq, s.bristle, s.stuck, s.way, drive, M, bias, ddq, bends, net)
 
 
 @njit(cache=True)
-def let_go(arm, s):
-    """Free the joints that hold more than they can, the worst first."""
+def release(arm, s):
+    """Release the joints whose net torque exceeds their band, the worst first."""
     net = np.empty(N)
     for _ in range(N):
-        needed(arm, s, s.drive, net)
+        net_torque(arm, s, s.drive, net)
         worst, by = -1, 0.0
         for j in range(N):
             beyond = outside(arm, j, net) if s.stuck[j] else 0.0
@@ -237,23 +237,23 @@ def let_go(arm, s):
 
 @njit(cache=True)
 def would_hold(arm, s, j):
-    """Return whether joint j, put to rest as it is, would hold."""
+    """Return whether joint j would hold if it came to rest now."""
     before, moving, net = s.dq[j], s.stuck[j], np.empty(N)
     s.dq[j], s.stuck[j] = 0.0, 1
-    needed(arm, s, s.drive, net)
+    net_torque(arm, s, s.drive, net)
     s.dq[j], s.stuck[j] = before, moving
     return outside(arm, j, net) == 0.0
 
 
 @njit(cache=True)
 def slow(arm, s, j, later):
-    """Return whether a sliding joint is so slow, and `later` s from now so long released, that it may rest."""
+    """Return whether a sliding joint is slow enough, and `later` s from now released long enough, to come to rest."""
     return abs(s.dq[j]) <= arm.v_stick and s.since[j] + later > SETTLE
 
 
 @njit(cache=True)
 def event(arm, s, out, command, h, drive, net):
-    """Return whether within h s a joint stops or lets go; drive (N,) and net (N,) become those after h s."""
+    """Return whether a joint sticks or slips within h s; fill drive (N,) and net (N,) with the values after h s."""
     lagged(s.drive, command, arm.lag, h, drive)
     advance(arm, s.q, s.dq, s.bristle, s.stuck, s.way, s.drive, command, h, out)
     if arm.kind == LUGRE:
@@ -265,7 +265,7 @@ def event(arm, s, out, command, h, drive, net):
         elif out[1, j] * s.way[j] < 0.0 or (slow(arm, then, j, h) and would_hold(arm, then, j)):
             return True
     if held:
-        needed(arm, then, drive, net)
+        net_torque(arm, then, drive, net)
         for j in range(N):
             if s.stuck[j] and outside(arm, j, net) != 0.0:
                 return True
@@ -274,18 +274,18 @@ def event(arm, s, out, command, h, drive, net):
 
 @njit(cache=True)
 def piece(arm, s, command, seconds):
-    """Go on for `seconds` under one command (N,) Nm, from event to event."""
+    """Advance by `seconds` under a constant command (N,) Nm, from event to event."""
     out, drive, net = np.empty((3, N)), np.empty(N), np.empty(N)
     left, events, fresh = seconds, 0, True
     while left > 1e-13:
         if fresh and arm.kind != LUGRE:
-            let_go(arm, s)
+            release(arm, s)
         h = left / np.ceil(left / arm.step - 1e-9)
         fresh = event(arm, s, out, command, h, drive, net)
         if fresh:
             events += 1
-            if events > MANY:
-                raise RuntimeError("a joint stops and starts without end")
+            if events > MAX_EVENTS:
+                raise RuntimeError("a joint sticks and slips without end")
             low, high = 0.0, h
             while high - low > 1e-12:
                 middle = 0.5 * (low + high)
@@ -315,7 +315,7 @@ def piece(arm, s, command, seconds):
 
 @njit(cache=True)
 def cycle(arm, s, command):
-    """Go on by 1 ms; command (N,) Nm is given at its start and felt from `delay` on."""
+    """Advance by 1 ms; command (N,) Nm is sent at its start and acts after `delay`."""
     for k in range(HISTORY - 1):
         s.line[k] = s.line[k + 1]
     s.line[HISTORY - 1] = command
@@ -327,7 +327,7 @@ def cycle(arm, s, command):
 
 
 def at_rest(arm, q):
-    """Return an arm that holds at q (N,) rad without a command."""
+    """Return the state of an arm at rest at q (N,) rad without a command."""
     bristle = arm.offset / arm.law[:, 7] if arm.kind == LUGRE else np.zeros(N)
     stuck = np.full(N, 0 if arm.kind == LUGRE else 1)
     q = np.array(q, dtype=float)

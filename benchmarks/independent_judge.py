@@ -1,12 +1,12 @@
-"""What an identification found, against the truth.json of an arm that was simulated by somebody else.
+"""Score an identification against the truth.json of an arm from another simulator.
 
-`judge` compares a run folder of stage=identify with an arm's folder (benchmarks/independent_arms.py has its format);
-`plain_regression` is what thirty lines of least squares find of the same recording.
+`judge` compares a run folder of stage=identify with an arm's folder (format: benchmarks/independent_arms.py);
+`plain_regression` is a baseline of thirty lines of least squares on the same recording.
 
-Friction and offset of a sliding joint cannot be told apart where friction has two free levels; their difference can.
-It is judged twice: by itself, as the parameters have it, for the arms have nothing else of the kind; and with all
-that an identified arm may have beside it (load, drag, gravity that is not compensated), at the mean over the postures
-of the training motion, which is what it feels in a simulator.
+Friction with a free level per direction does not separate from the offset; their difference is identifiable. It is
+scored twice: for the parameters alone, because the arms have no other torques, and including all torques of the
+identified arm (load, drag, uncompensated gravity) at the mean over the postures of the training motion, which is what
+acts in a simulator.
 """
 
 import json
@@ -19,41 +19,41 @@ from scipy.signal import butter, filtfilt, savgol_filter
 from stick_slip import true_dynamics
 
 from r2s.identification.parameter_file import load_parameters, load_posterior
-from r2s.identification.prediction import _open_loop_ee
+from r2s.identification.prediction import open_loop_error
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
 from r2s.physics.rigid_body import LinkInertia, regressor
 from r2s.recordings.readers import read
 
 FAMILY = {"sigmoid": SIGMOID, "coulomb_viscous": COULOMB, "stribeck": STRIBECK, "lugre": BRISTLE}
-SLOWEST = 0.05  # rad/s: slower, friction is not judged
-FASTEST = 0.95  # quantile of the speeds visited in a direction
-SPEEDS, CHECKED = 40, 5  # of a direction: where friction is compared, and where its interval is
+SLOWEST = 0.05  # rad/s, lowest speed at which friction is scored
+FASTEST = 0.95  # quantile of the visited speeds per direction
+SPEEDS, CHECKED = 40, 5  # points per direction: for the friction error, and for its interval
 POSTURES = 200
-WAYS = (1, -1)
-REACHED = 5e-3  # rad in its own direction: the ramp got there
+DIRECTIONS = (1, -1)
+REACHED = 5e-3  # rad of motion that counts as breakaway
 
 
 def load_truth(folder: Path) -> dict:
-    """Return truth.json with arrays for lists."""
+    """Return truth.json with lists as arrays."""
     truth = json.loads((folder / "truth.json").read_text())
     return {k: np.array(v) if isinstance(v, list) else v for k, v in truth.items()}
 
 
 def visited(q: np.ndarray) -> np.ndarray:
-    """Return (2, 7) rad/s, the fastest speed that counts in both directions of a motion q (T, 7) rad at 1 kHz."""
+    """Return the highest scored speed per direction, (2, 7) rad/s, of a motion q (T, 7) rad at 1 kHz."""
     dq = savgol_filter(q, 31, 3, deriv=1, delta=1e-3, axis=0)
-    return np.array([[np.quantile(x[x > SLOWEST], FASTEST) for x in way * dq.T] for way in WAYS])
+    return np.array([[np.quantile(x[x > SLOWEST], FASTEST) for x in way * dq.T] for way in DIRECTIONS])
 
 
 def speeds(top: np.ndarray, count: int) -> np.ndarray:
-    """Return (2, count, 7) rad/s with their signs: evenly from SLOWEST to `top` (2, 7), both directions."""
+    """Return signed speeds (2, count, 7) rad/s, evenly from SLOWEST to `top` (2, 7), both directions."""
     share = np.linspace(0.0, 1.0, count)[:, None]
-    return np.stack([way * (SLOWEST + share * (t - SLOWEST)) for way, t in zip(WAYS, top, strict=True)])
+    return np.stack([way * (SLOWEST + share * (t - SLOWEST)) for way, t in zip(DIRECTIONS, top, strict=True)])
 
 
-class Pull:
-    """What an identified arm has beside links and friction law, at postures q (T, 7) rad: the mean over them."""
+class OtherTorques:
+    """Torques of an identified arm besides links and friction law, mean over postures q (T, 7) rad."""
 
     def __init__(self, q: np.ndarray):
         still = np.zeros_like(q)
@@ -64,18 +64,18 @@ class Pull:
         self._sin, self._cos = np.sin(q).mean(0), np.cos(q).mean(0)
 
     def constant(self, d: Dynamics) -> np.ndarray:
-        """Return (..., 7) Nm that adds to the command."""
+        """Return the constant torque (..., 7) Nm that adds to the command."""
         error = LinkInertia(d.mass, d.com, d.inertia).standard() - self._nominal
         drag = d.drag[..., 0] * self._sin + d.drag[..., 1] * self._cos
         return d.offset + drag - np.einsum("jkc,...kc->...j", self._mean, error)
 
     def load(self, d: Dynamics) -> np.ndarray:
-        """Return (..., 7) Nm that adds to friction, whichever way the joint slides."""
+        """Return load-dependent friction (..., 7) Nm, independent of the direction."""
         return d.load * self._load
 
 
-def drags(d: Dynamics, dq: np.ndarray, at: Pull | None = None) -> np.ndarray:
-    """Return friction minus offset at dq (..., 7) rad/s, with `at` all that pulls; S dynamics give (S, ..., 7)."""
+def drags(d: Dynamics, dq: np.ndarray, at: OtherTorques | None = None) -> np.ndarray:
+    """Return friction minus offset at dq (..., 7) rad/s, with the torques `at`; S dynamics give (S, ..., 7)."""
     if d.phi.ndim > 2:
         return np.stack([drags(d.one(k), dq, at) for k in range(len(d.phi))])
     if at is None:
@@ -83,14 +83,14 @@ def drags(d: Dynamics, dq: np.ndarray, at: Pull | None = None) -> np.ndarray:
     return d.friction(dq) + np.sign(dq) * at.load(d) - at.constant(d)
 
 
-def edges(d: Dynamics, at: Pull | None = None) -> np.ndarray:
-    """Return (7, 2) Nm: the commands at which a resting joint lets go, negative and positive; `at` as in `drags`."""
+def edges(d: Dynamics, at: OtherTorques | None = None) -> np.ndarray:
+    """Return breakaway commands (7, 2) Nm, negative and positive; `at` same as in `drags`."""
     held = d.family.held(d.phi) if d.family.held is not None else d.breakaway
     return held - (d.offset if at is None else at.constant(d))[:, None]
 
 
 def reached(ramps: dict[str, np.ndarray]) -> np.ndarray:
-    """Return (7, 2) bool: whether a ramp moved the joint in the negative and in the positive direction."""
+    """Return (7, 2) bool: whether a ramp moved the joint in the negative and positive direction."""
     out = np.zeros((7, 2), dtype=bool)
     for joint in range(7):
         for side, sign in enumerate((-1, 1)):
@@ -100,7 +100,7 @@ def reached(ramps: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def judge(run: Path, arm: Path, threads: int = 0) -> dict:
-    """Return what a run folder of stage=identify is worth on the arm of this folder."""
+    """Return the scores of a run folder of stage=identify on the arm of a folder."""
     truth, meta = load_truth(arm), json.loads((run / "meta.json").read_text())
     space, x = load_parameters(run, ROBOT)
     found, draws = space.dynamics(x), space.dynamics(load_posterior(run, space))
@@ -111,40 +111,40 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
     top = visited(q)
     v, some = speeds(top, SPEEDS), speeds(top, CHECKED)
     level = np.abs(friction(truth, v)).mean((0, 1))
-    told = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
+    true_edges = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
     pose = np.median(ramps["q"], axis=0)[None]
 
-    def off(drag: np.ndarray) -> list[float]:
+    def relative_error(drag: np.ndarray) -> list[float]:
         return (100 * np.abs(drag - (friction(truth, v) - truth["offset"])).max((0, 1)) / level).tolist()
 
-    def against(at: Pull | None, at_ramps: Pull | None) -> dict:
+    def scores(at: OtherTorques | None, at_ramps: OtherTorques | None) -> dict:
         low, high = np.quantile(drags(draws, some, at), (0.025, 0.975), axis=0)
-        wanted = friction(truth, some) - truth["offset"]
+        true_drag = friction(truth, some) - truth["offset"]
         constant = found.offset if at is None else at.constant(found)
-        edge = np.where(reached(ramps), np.abs(edges(found, at_ramps) - told), np.nan)
+        edge = np.where(reached(ramps), np.abs(edges(found, at_ramps) - true_edges), np.nan)
         return {
-            "friction": off(drags(found, v, at)),
-            "within": ((low <= wanted) & (wanted <= high)).mean((0, 1)).tolist(),
+            "friction": relative_error(drags(found, v, at)),
+            "within": ((low <= true_drag) & (true_drag <= high)).mean((0, 1)).tolist(),
             "offset": (1e3 * np.abs(constant - truth["offset"])).tolist(),
             "edges": (1e3 * edge).tolist(),
         }
 
-    late, true_late = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
-    between = np.quantile(np.atleast_1d(late), (0.025, 0.975))
+    latency, true_latency = np.asarray(draws.delay) + np.asarray(draws.lag), truth["delay_s"] + truth["lag_s"]
+    interval = np.quantile(np.atleast_1d(latency), (0.025, 0.975))
     validation = read(arm / "validation.npz", torque="commanded")
     true = true_dynamics(truth)
-    ahead = [_open_loop_ee(ROBOT, d, validation, threads)["0.5"] for d in (found, true)]
-    return against(None, None) | {
+    ahead = [open_loop_error(ROBOT, d, validation, threads)["0.5"] for d in (found, true)]
+    return scores(None, None) | {
         "true family": truth["family"],
         "paper": truth["paper"],
         "family": found.family.name,
         "right": found.family == FAMILY[truth["family"]],
-        "felt": against(Pull(q[:: len(q) // POSTURES]), Pull(pose)),
-        "plain": off(plain_regression(arm / "train.npz")(v)),
-        "late": 1e3 * float(found.delay + found.lag),
-        "true late": 1e3 * true_late,
-        "late within": bool(between[0] <= true_late <= between[1]),
-        "late interval": (1e3 * between).tolist(),
+        "total": scores(OtherTorques(q[:: len(q) // POSTURES]), OtherTorques(pose)),
+        "plain": relative_error(plain_regression(arm / "train.npz")(v)),
+        "latency": 1e3 * float(found.delay + found.lag),
+        "true latency": 1e3 * true_latency,
+        "latency within": bool(interval[0] <= true_latency <= interval[1]),
+        "latency interval": (1e3 * interval).tolist(),
         "ee": ahead[0],
         "true ee": ahead[1],
         "seconds": meta["wall_clock_s"],
@@ -153,10 +153,10 @@ def judge(run: Path, arm: Path, threads: int = 0) -> dict:
 
 
 class Plain:
-    """What least squares found: friction minus offset is straight in either direction."""
+    """A least-squares model: friction minus offset is affine in speed per direction."""
 
     def __init__(self, levels: np.ndarray, delay: float):
-        self.levels, self.delay = levels, delay  # (7, 4): at 0, up and down, and slopes; s
+        self.levels, self.delay = levels, delay  # (7, 4): levels at 0 and slopes, both directions; s
 
     def __call__(self, dq: np.ndarray) -> np.ndarray:
         """Return friction minus offset (..., 7) Nm at dq (..., 7) rad/s."""
@@ -165,10 +165,10 @@ class Plain:
 
 
 def plain_regression(path: Path) -> Plain:
-    """Return least squares of a recording: tensor scales, Coulomb and viscous friction of each direction, a delay.
+    """Fit tensor scales, Coulomb and viscous friction per direction and a delay to a recording by least squares.
 
-    Both sides of the equation are low-passed at 8 Hz, delays of 0 to 8 ms are tried, and rows within 80 ms of a speed
-    below 0.1 rad/s are left out.
+    Both sides of the equation pass an 8 Hz low-pass. The delay is the best of 0 to 8 ms. Rows within 80 ms of a speed
+    below 0.1 rad/s are excluded.
     """
     with np.load(path) as z:
         raw, tau = z["q"], z["tau_J_d"].astype(float)
@@ -193,9 +193,9 @@ def plain_regression(path: Path) -> Plain:
     for j in range(n):
         block = np.zeros((len(raw), n + 4 * n))
         block[:, :n], block[:, n + 4 * j : n + 4 * (j + 1)] = scaled[:, j], laws[:, j]
-        late = np.stack([np.interp(rows - ms, rows, tau[:, j]) for ms in delays], 1)
+        delayed = np.stack([np.interp(rows - ms, rows, tau[:, j]) for ms in delays], 1)
         blocks.append(block[~near[:, j]])
-        sides.append((slow(late) - rest[:, j : j + 1])[~near[:, j]])
+        sides.append((slow(delayed) - rest[:, j : j + 1])[~near[:, j]])
     a, b = np.concatenate(blocks), np.concatenate(sides)
     found = np.linalg.lstsq(a, b, rcond=None)[0]
     best = int(((a @ found - b) ** 2).mean(0).argmin())

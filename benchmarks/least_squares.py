@@ -1,9 +1,9 @@
-"""Our least squares beside MuJoCo's, `mujoco.minimize.least_squares`, on the problems that an identification solves.
+"""Compare r2s's least squares with `mujoco.minimize.least_squares` on the problems of an identification.
 
 `python benchmarks/least_squares.py [SEEDS] [SECONDS]` records SECONDS (10) of the simulated Panda of known_truth.py
-per seed (4) and identifies it with search=replays. Each least-squares problem on the way is solved by both, from the
-same start, with the same Jacobian, until a step gains less than the same share of the cost. Then each identifies the
-arm alone. Writes docs/least_squares.md.
+per seed (4) and identifies it on torque, then on replays. Both solvers solve each least-squares problem on the way,
+from the same start, with the same Jacobian, until a step gains less than the same share of the cost. Then each solver
+identifies the arm alone. Writes benchmarks/results/least_squares.md.
 """
 
 import contextlib
@@ -15,30 +15,39 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, markdown, poses_about, ramp, record, searches
-from known_truth import NOISE, TERMS, TRUTH
+from common import (
+    OLD,
+    ROBOT,
+    identify_settings,
+    markdown,
+    poses_about,
+    ramp,
+    searches,
+    simulated_arm,
+    write_page,
+)
+from known_truth import TERMS, TRUTH, friction_error, record_excitation
 from mujoco.minimize import IterLog, least_squares
 
-from r2s.arm.simulated import SimulatedArm
 from r2s.identification.identify import identify
-from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.prediction import prediction_errors
 from r2s.identification.problem import Problem, Report
+from r2s.identification.search.levenberg_marquardt import minimize
 
 OURS = "ours"
-MUJOCOS = {  # options; the last come nearest to ours: damping relative to the diagonal of J^T J, in large steps
+MUJOCOS = {  # options; the last ones resemble r2s most: damping relative to the diagonal of J^T J, in large steps
     "mujoco": {},
     "mujoco, x_scale=jac": {"x_scale": "jac"},
     "mujoco, x_scale=jac, mu_factor=10": {"x_scale": "jac", "mu_factor": 10.0},
 }
 
 
-class EnoughError(Exception):
-    """A step gained less than asked for."""
+class ConvergedError(Exception):
+    """A step gained less than ftol."""
 
 
-class Counted:
-    """A residual (C, P) -> (C, R) and its Jacobian (P,) -> (R, P) that count their calls and keep the best u (P,)."""
+class CountedProblem:
+    """Residual (C, P) -> (C, R) and Jacobian (P,) -> (R, P) with call counts and the best u (P,)."""
 
     def __init__(self, residual: Callable, jacobian: Callable):
         self._residual, self._jacobian = residual, jacobian
@@ -59,30 +68,26 @@ class Counted:
         return self._jacobian(u)
 
 
-DECISION = (  # of the day on which this was first run; read it again beside new tables
-    "Ours. With its default options MuJoCo's takes up to five times as many candidates. With the two options it",
-    "takes fewer, and in all less time, but on one arm's first replay problem it stopped 280 above the least",
-    "cost, and the worst arm's friction and offsets came out worse. The tables were made on a machine that did",
-    "other work beside: the seconds are rough, costs and counts are not.",
+DECISION = (  # from the first tables; check it against new ones
+    "r2s keeps its own solver. MuJoCo's default options take up to five times as many candidates. With x_scale=jac "
+    "and mu_factor=10 it is faster, but on one arm it stopped 280 above the least cost, and the worst arm's friction "
+    "and offsets came out worse."
 )
 
 
-def ours(problem: Counted, start: np.ndarray, jacobians: int, ftol: float) -> None:
-    """Solve by our solver, from `start` (P,), with so many Jacobians at most."""
-    minimise(problem.residual, problem.jacobian, start, jacobians, ftol)
+def ours(problem: CountedProblem, start: np.ndarray, jacobians: int, ftol: float) -> None:
+    """Run the solver of r2s from `start` (P,) with at most `jacobians` Jacobians."""
+    minimize(problem.residual, problem.jacobian, start, jacobians, ftol)
 
 
-def mujocos(problem: Counted, start: np.ndarray, jacobians: int, ftol: float, **options) -> None:
-    """Solve by MuJoCo's solver, with `options` of its own.
+def mujocos(problem: CountedProblem, start: np.ndarray, jacobians: int, ftol: float, **options) -> None:
+    """Run MuJoCo's solver with its `options`; ftol usually ends it before its own step and gradient tolerances."""
 
-    Its tolerances, of the step and the gradient, hardly ever end it before ftol does.
-    """
-
-    def enough(trace: list[IterLog]) -> None:
+    def stop_if_converged(trace: list[IterLog]) -> None:
         if trace[-1].reduction < ftol * trace[-1].objective:
-            raise EnoughError
+            raise ConvergedError
 
-    with contextlib.suppress(EnoughError):
+    with contextlib.suppress(ConvergedError):
         least_squares(
             start,
             lambda u: problem.residual(u.T).T,
@@ -90,7 +95,7 @@ def mujocos(problem: Counted, start: np.ndarray, jacobians: int, ftol: float, **
             jacobian=lambda u, _: problem.jacobian(u[:, 0]),
             max_iter=jacobians,
             verbose=0,
-            iter_callback=enough,
+            iter_callback=stop_if_converged,
             **options,
         )
 
@@ -99,13 +104,13 @@ SOLVERS = {OURS: ours} | {name: partial(mujocos, **options) for name, options in
 
 
 @dataclass
-class Side:
-    """A search that solves its problem by every one of `solvers`, side by side, and returns what the first found.
+class Comparison:
+    """A search that solves its problem with every solver and returns the result of the first.
 
     Attributes:
-        solvers: names in SOLVERS. first: whether the first goes first; the clock may favour one that follows another.
-        level: "torque" or "residual". max_evaluations: Jacobians at most. ftol: relative gain that ends it.
-        rows: of the table, added to.
+        solvers: names in SOLVERS. first: run the first solver first (the order may affect the timing).
+        level: "torque" or "residual". max_evaluations: limit of Jacobians. ftol: relative gain that ends a solver.
+        rows: of the table, appended to.
     """
 
     solvers: list[str]
@@ -117,21 +122,21 @@ class Side:
     local = True
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-        """Return u (P,) from `start` (P,)."""
+        """Return u (P,), found from `start` (P,)."""
         if self.level == "residual":
-            times = len({r["problem"] for r in self.rows if r["problem"].startswith("replays")})
-            return self.solve(f"replays, {times + 1}", problem.residual, lambda u: problem.jacobian(u)[1], start)
-        for name in ("torque", "torque, weighed again"):
-            start = self.solve(name, problem.quick, problem.quick_jacobian, start)
-            problem.quick_data.adapt(problem.space.from_unit(start), fitted=True)
+            runs = len({r["problem"] for r in self.rows if r["problem"].startswith("replays")})
+            return self.solve(f"replays, {runs + 1}", problem.residual, lambda u: problem.linearize(u)[1], start)
+        for name in ("torque", "torque, reweighted"):
+            start = self.solve(name, problem.torque_residual, problem.torque_jacobian, start)
+            problem = problem.torque_reweighted(start)
         return start
 
     def solve(self, name: str, residual: Callable, jacobian: Callable, start: np.ndarray) -> np.ndarray:
-        """Return u (P,) that the first solver found from `start` (P,)."""
-        residual(start[None])  # nothing is loaded or compiled while the clock runs
+        """Return u (P,) of the first solver, found from `start` (P,)."""
+        residual(start[None])  # compile before the clock runs
         found, rows = {}, []
         for solver in self.solvers if self.first else reversed(self.solvers):
-            p = Counted(residual, jacobian)
+            p = CountedProblem(residual, jacobian)
             began = time.perf_counter()
             SOLVERS[solver](p, start, self.max_evaluations, self.ftol)
             seconds = time.perf_counter() - began
@@ -147,22 +152,19 @@ class Side:
         return found[self.solvers[0]]
 
 
-def identified(seed: int, seconds: float, solvers: list[str]) -> tuple[list[dict], dict]:
-    """Identify by the first of `solvers`; return rows of its problems, and how near it came to the truth."""
-    motions = [
-        record(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), fourier(ROBOT, duration=seconds, seed=s))
-        for s in (2 * seed, 2 * seed + 1)
-    ]
-    ramps = ramp(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=seed), poses_about(ROBOT, 1))
+def identify_seed(seed: int, seconds: float, solvers: list[str]) -> tuple[list[dict], dict]:
+    """Identify with the first of `solvers`; return rows of its problems and the errors of the result."""
+    motions = [record_excitation(seed, s, seconds) for s in (2 * seed, 2 * seed + 1)]
+    ramps = ramp(simulated_arm(TRUTH, seed), poses_about(ROBOT, 1))
     rows: list[dict] = []
-    staged = [Side(solvers, seed % 2 == 0, s.level, s.max_evaluations, s.ftol, rows) for s in searches("replays")]
-    d = identify(ROBOT, OLD, motions[0], staged, how(family="sigmoid", terms=TERMS, extra=[]), ramps=ramps).dynamics
-    fastest = np.quantile(np.abs(motions[0].dq), 0.98, axis=0)
-    speeds = np.linspace(-1, 1, 201)[:, None] * fastest
-    curve = np.abs(d.friction(speeds) - TRUTH.friction(speeds)).max(0) / TRUTH.family.level(TRUTH.phi, fastest)
+    plan = [*searches("staged"), *searches("least_squares", max_evaluations=6)]
+    staged = [Comparison(solvers, seed % 2 == 0, s.level, s.max_evaluations, s.ftol, rows) for s in plan]
+    settings = identify_settings(family="sigmoid", terms=TERMS, candidate_terms=[])
+    d = identify(ROBOT, OLD, motions[0], staged, settings, ramps=ramps).dynamics
     ahead = prediction_errors(ROBOT, OLD, d, motions[1], window_s=0.2, cutoff_hz=10.0)["ee_error_mm"]
-    end = {"solver": solvers[0], "curve": 100 * curve.max(), "offset": np.abs(d.offset - TRUTH.offset).max()}
-    end |= {"ahead": ahead["0.5"], **{k: sum(r[k] for r in rows) for k in ("jacobians", "candidates", "seconds")}}
+    end = {"solver": solvers[0], "curve": friction_error(d, motions[0])}
+    end |= {"offset": np.abs(d.offset - TRUTH.offset).max(), "ahead": ahead["0.5"]}
+    end |= {k: sum(r[k] for r in rows) for k in ("jacobians", "candidates", "seconds")}
     print(end, flush=True)
     return [row | {"seed": seed} for row in rows], end | {"seed": seed}
 
@@ -196,40 +198,22 @@ def by_solver(ends: pd.DataFrame) -> pd.DataFrame:
 def main() -> None:
     """Solve and write the page."""
     seeds, seconds = int((sys.argv[1:] or ["4"])[0]), float((sys.argv[2:] or ["10"])[0])
-    rows = pd.DataFrame([row for seed in range(seeds) for row in identified(seed, seconds, list(SOLVERS))[0]])
-    whole = [OURS, list(MUJOCOS)[-1]]
-    ends = [identified(k, seconds, [s])[1] for k in range(seeds) for s in (whole if k % 2 else reversed(whole))]
-    lines = [
-        "# Least squares: ours and MuJoCo's",
-        "",
-        f"`python benchmarks/least_squares.py {seeds} {seconds:g}` on {MACHINE}.",
+    rows = pd.DataFrame([row for seed in range(seeds) for row in identify_seed(seed, seconds, list(SOLVERS))[0]])
+    pair = [OURS, list(MUJOCOS)[-1]]
+    ends = [identify_seed(k, seconds, [s])[1] for k in range(seeds) for s in (pair if k % 2 else reversed(pair))]
+    parts = [
         f"{seeds} simulated arms of known truth, {seconds:g} s of motion, {rows['parameters'].max()} parameters.",
-        "",
         "## The same problems",
-        "",
-        "Identification (search=replays) solves some least-squares problems on its way. Every solver gets each",
-        "of them: the same start, the same Jacobian, the same bound on Jacobians. It ends where a step gains less",
-        "than the same share of the cost. The identification goes on from ours. Medians over the arms.",
-        "",
-        "Costs are sums of squares in standard deviations: moving one parameter by one standard deviation from the",
-        "best adds 1. *Candidates* are evaluations outside of Jacobians.",
-        "",
+        "Each solver gets every problem with the same start, Jacobian and bound on Jacobians; medians over arms. "
+        "Cost: sum of squares in standard deviations. Candidates: evaluations outside of Jacobians.",
         markdown(by_problem(rows)),
-        "",
         "## The whole identification",
-        "",
-        "Every problem is solved by one solver alone, so each goes on from its own answer. Friction and offsets are",
-        "compared with the truth; the end effector's error is on motion that was not fitted. Medians over the arms,",
-        "the worst in brackets.",
-        "",
+        "Errors against the truth on held-out motion; medians over arms, the worst in brackets.",
         markdown(by_solver(pd.DataFrame(ends))),
-        "",
-        "## Which stays",
-        "",
-        *DECISION,
+        DECISION,
     ]
-    (ROOT / "docs" / "least_squares.md").write_text("\n".join(lines) + "\n")
-    print("written: docs/least_squares.md")
+    command = f"python benchmarks/least_squares.py {seeds} {seconds:g}"
+    write_page("least_squares", "Levenberg-Marquardt of r2s and of MuJoCo", command, parts)
 
 
 if __name__ == "__main__":

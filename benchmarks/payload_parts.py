@@ -1,4 +1,4 @@
-"""What benchmarks/payload.py measures on one twin, a row or more of each piece of it."""
+"""Measurements of benchmarks/payload.py on one twin: a row or more per piece."""
 
 import pickle
 import sys
@@ -10,101 +10,103 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
-from common import ROBOT, fourier, record, replace
+from common import JUDGING, ROBOT, VARIANT_SEED, fourier, record, replace
 
-from r2s.adaptation.balance import SPAN
-from r2s.adaptation.believed import believed
+from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
-from r2s.adaptation.kalman import Noise, T
-from r2s.adaptation.listen import learn, listen
-from r2s.adaptation.refinement import Beyond, refined
-from r2s.arm import elastic_joints as elastic
-from r2s.arm import twin as rigid
-from r2s.arm.elastic_twin import ElasticTwin
-from r2s.arm.hidden_arm import HiddenArm
+from r2s.adaptation.kalman import Noise
+from r2s.adaptation.model_correction import ModelCorrection, apply_correction
+from r2s.adaptation.offline_estimation import estimate_recording, fit_correction
+from r2s.adaptation.tuning import SPAN, T
 from r2s.arm.interface import ArmState
-from r2s.arm.twins import twin
+from r2s.arm.twins import elastic_joints as elastic
+from r2s.arm.twins import lugre_joints as lugre
+from r2s.arm.twins.elastic_twin import ElasticTwin
+from r2s.arm.twins.make_twin import make_twin
+from r2s.arm.twins.twin_base import TwinBase
 from r2s.compiled import njit
-from r2s.files import whole
+from r2s.files import atomic_write
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import FARTHEST_M, MOST_KG, loaded, payload_of
+from r2s.physics.payload import FARTHEST_M, MOST_KG, dynamics_with_payload, payload_of
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.readers import read
 
 SECONDS = 12.0  # of a motion
 LEARN, SOON_S, LATE_S = round(2.0 / T), 0.2 + 1e-9, 0.5 + 1e-9
-PIECE = 25  # unloaded motions that one estimator hears in a row: 5 minutes
-FALL, TAU_S, COLD, WARMS = 0.25, 60.0, 3, 20  # of friction; motions before it warms, and while
-NEAR = 0.1  # of the change
+PIECE = 25  # consecutive unloaded motions of one estimator: 5 minutes
+FALL, TAU_S, COLD, WARMS = 0.25, 60.0, 3, 20  # of friction: drop, time constant; motions before and during it
+NEAR = 0.1  # of the friction change
 LAGS_S = np.arange(0.0, 60.5, 0.5)
-TOLD = {"right": 1.0, "half the mass": 0.5, "nothing": 0.0, "half too much": 1.5}  # of the mass
-JUDGING = {1: 100, 2: 200}  # the first of a hundred seeds
+DECLARED = {"right": 1.0, "half the mass": 0.5, "nothing": 0.0, "half too much": 1.5}  # declared / true mass
 
 
-class Known(NamedTuple):
-    """A twin and what its identification says of it."""
+class IdentifiedTwin(NamedTuple):
+    """A twin and its identified model."""
 
-    make: int
+    variant: str
     seed: int
     dynamics: Dynamics
-    more: Beyond
+    correction: ModelCorrection
     noise: Noise
     keep: Path | None = None
 
-    def arm(self, stream: int, **given) -> HiddenArm:
-        """Return the twin, cold, with another noise for each stream."""
-        return twin(ROBOT, make=self.make, seed=self.seed, noise=stream, **given)
+    def arm(self, stream: int, **given) -> TwinBase:
+        """Return the twin, cold, with its own sensor noise per stream."""
+        return make_twin(ROBOT, variant=self.variant, seed=self.seed, noise=stream, **given)
 
-    def ear(self, load=None) -> Estimator:
-        """Return an estimator that has heard nothing, of an arm that was told of this load."""
-        arm = believed(ROBOT, loaded(ROBOT, self.dynamics, None, payload_of(load)))
-        return Estimator(refined(arm, self.more), self.noise)
+    def rng(self, *stream: int) -> np.random.Generator:
+        """Return the random generator of a piece."""
+        return np.random.default_rng([VARIANT_SEED[self.variant], self.seed, *stream])
 
-    def kept(self, name: str, made: Callable[[], list]) -> list:
-        """Return what `made` returns, from `keep` where it was made before."""
+    def estimator(self, declared=None) -> Estimator:
+        """Return a new estimator of an arm with this declared payload."""
+        arm = make_arm_model(ROBOT, dynamics_with_payload(ROBOT, self.dynamics, None, payload_of(declared)))
+        return Estimator(apply_correction(arm, self.correction), self.noise)
+
+    def kept(self, name: str, make: Callable[[], list]) -> list:
+        """Return the result of `make`, or its copy in the folder `keep`."""
         if self.keep is None:
-            return made()
-        path = self.keep / f"m{self.make}_{self.seed}_{name}.pickle"
+            return make()
+        path = self.keep / f"{self.variant}_{self.seed}_{name}.pickle"
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
-            with whole(path) as part:
-                part.write_bytes(pickle.dumps(made()))
+            with atomic_write(path) as part:
+                part.write_bytes(pickle.dumps(make()))
         return pickle.loads(path.read_bytes())
 
 
-def folder(root: Path, make: int, seed: int) -> Path:
-    """Return the identification of a twin beneath root: m{make}_{seed}, or judge_{seed} where only that is there."""
-    names = [f"m{make}_{seed}", f"judge_{seed}"][: 2 if JUDGING[make] <= seed < JUDGING[make] + 100 else 1]
-    there = [root / "identify" / n for n in names if (root / "identify" / n / "posterior.npz").is_file()]
-    if not there:
+def folder(root: Path, variant: str, seed: int) -> Path:
+    """Return the run folder of a twin's identification: identify/VARIANT_SEED, or an existing judge_SEED."""
+    names = [f"{variant}_{seed}", *([f"judge_{seed}"] if seed >= JUDGING[variant][0] else [])]
+    found = [root / "identify" / n for n in names if (root / "identify" / n / "posterior.npz").is_file()]
+    if not found:
         return root / "identify" / names[0]
-    arm = yaml.safe_load((there[0] / "config.yaml").read_text())["arm"]
-    if (arm["make"], arm["seed"]) != (make, seed):
-        sys.exit(
-            f"error: {there[0]} is of make {arm['make']}, seed {arm['seed']}; make {make}, seed {seed} is wanted"
-        )
-    return there[0]
+    arm = yaml.safe_load((found[0] / "config.yaml").read_text())["arm"]
+    if (arm["variant"], arm["seed"]) != (variant, seed):
+        sys.exit(f"error: expected {variant} twin {seed}, got {arm['variant']} twin {arm['seed']} ({found[0]})")
+    return found[0]
 
 
 @cache
-def known(root: Path, make: int, seed: int, keep: Path | None = None) -> Known:
-    """Return what the identification of a twin says; recordings are kept in `keep`."""
-    at = folder(root, make, seed)
+def identified(root: Path, variant: str, seed: int, keep: Path | None = None) -> IdentifiedTwin:
+    """Return a twin with its identified model; `keep` is the folder of kept recordings."""
+    at = folder(root, variant, seed)
     space, x = load_parameters(at, ROBOT)
     unloaded = tuple(read(at / f"{name}.npz", torque="commanded") for name in ("train", "validation"))
     dynamics = space.dynamics(x)
-    return Known(make, seed, dynamics, *learn(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded), keep)
+    correction, noise = fit_correction(ROBOT, dynamics, (space, load_posterior(at, space)), unloaded)
+    return IdentifiedTwin(variant, seed, dynamics, correction, noise, keep)
 
 
 @cache
 def motion(k: int):
-    """Return the k-th calm motion, the same for all twins."""
-    calm = replace(ROBOT, dq_max=0.6 * ROBOT.dq_max, ddq_max=0.6 * ROBOT.ddq_max)
-    return fourier(calm, duration=SECONDS, seed=1000 + k)
+    """Return the k-th slow motion, the same for all twins."""
+    slow = replace(ROBOT, dq_max=0.6 * ROBOT.dq_max, ddq_max=0.6 * ROBOT.ddq_max)
+    return fourier(slow, duration=SECONDS, seed=1000 + k)
 
 
-def drawn(rng: np.random.Generator) -> dict:
+def draw_payload(rng: np.random.Generator) -> dict:
     """Return a payload."""
     way = rng.normal(size=3)
     centre = way / np.linalg.norm(way) * FARTHEST_M * rng.uniform() ** (1 / 3)
@@ -112,93 +114,94 @@ def drawn(rng: np.random.Generator) -> dict:
     return {"mass": float(rng.uniform(0.05, 1.5)), "centre": centre.tolist(), "on_s": float(on), "off_s": float(off)}
 
 
-def asked(told: list[Estimate], thing) -> Estimate:
-    """Return what is told after 2 s of motion with a payload, or just before it is taken off."""
-    carries = [e for e in told if thing.on_s <= e.t < thing.off_s]
-    moves = [e for e in carries if not e.rests]
-    return moves[LEARN] if len(moves) > LEARN else carries[-1]
+def settled_estimate(estimates: list[Estimate], payload) -> Estimate:
+    """Return the estimate after 2 s of motion with a payload, or the last one before its removal."""
+    with_payload = [e for e in estimates if payload.on_s <= e.t < payload.off_s]
+    moving = [e for e in with_payload if not e.rests]
+    return moving[LEARN] if len(moving) > LEARN else with_payload[-1]
 
 
-def errors(told: list[Estimate], thing) -> dict:
-    """Return kg and m by which that is wrong, and the shares of motion and rest in which the mass is covered."""
-    at = asked(told, thing)
-    true = [float(thing.mass) * bool(thing.there(e.t)) for e in told]
-    hit = np.array([abs(e.mass - m) <= e.mass_half for e, m in zip(told, true, strict=True)])
-    settled = np.array([not any(0 <= e.t - s < LATE_S for s in (0.0, thing.on_s, thing.off_s)) for e in told])
-    rests = np.array([e.rests for e in told])
+def errors(estimates: list[Estimate], payload) -> dict:
+    """Return the errors in kg and m, and the shares of motion and rest in which the interval covers the mass."""
+    at = settled_estimate(estimates, payload)
+    true = [float(payload.mass) * bool(payload.attached(e.t)) for e in estimates]
+    covered = np.array([abs(e.mass - m) <= e.mass_half for e, m in zip(estimates, true, strict=True)])
+    changes = (0.0, payload.on_s, payload.off_s)
+    settled = np.array([not any(0 <= e.t - s < LATE_S for s in changes) for e in estimates])
+    rests = np.array([e.rests for e in estimates])
     return {
-        "mass": float(thing.mass),
-        "mass_error": abs(at.mass - float(thing.mass)),
-        "centre_error": float(np.linalg.norm(at.centre - thing.centre)),
-        "moving": np.mean(hit[~rests & settled]),
-        "resting": np.mean(hit[rests & settled]) if (rests & settled).any() else np.nan,
+        "mass": float(payload.mass),
+        "mass_error": abs(at.mass - float(payload.mass)),
+        "centre_error": float(np.linalg.norm(at.centre - payload.centre)),
+        "moving": np.mean(covered[~rests & settled]),
+        "resting": np.mean(covered[rests & settled]) if (rests & settled).any() else np.nan,
     }
 
 
-def events(of: Known, k: int) -> list[dict]:
-    """Return what is told of a payload that is put on and taken off in motion k."""
-    given = drawn(np.random.default_rng([of.make, of.seed, k]))
-    thing, ear = payload_of(given), of.ear()
+def events(of: IdentifiedTwin, k: int) -> list[dict]:
+    """Return the estimates of a payload that is attached and removed in motion k."""
+    given = draw_payload(of.rng(k))
+    payload, estimator = payload_of(given), of.estimator()
     arm = of.arm(100 + k, payload=given)
-    (heard,) = of.kept(f"events_{k}", lambda: [record(arm, motion(k), laden=True)])
+    (recording,) = of.kept(f"events_{k}", lambda: [record(arm, motion(k), loaded=True)])
     began = time.process_time()
-    told = listen(ROBOT, ear, heard)
-    us = 1e6 * (time.process_time() - began) / len(heard.t)
-    at = (thing.on_s, thing.off_s)
+    estimates = estimate_recording(ROBOT, estimator, recording)
+    us = 1e6 * (time.process_time() - began) / len(recording.t)
+    at, alarms = (payload.on_s, payload.off_s), estimator.changes
 
-    def moves(since: float, until: float) -> float:
-        """Return for how many s of that time the arm moved."""
-        return T * sum(not e.rests for e in told if since < e.t <= until)
+    def moving_s(since: float, until: float) -> float:
+        return T * sum(not e.rests for e in estimates if since < e.t <= until)
 
-    moved = [[moves(s, c) for c in ear.changes if c > s] for s in at]
-    real = sum(any(c > s and moves(s, c) <= LATE_S for s in at) for c in ear.changes)
-    seen = [min((c - s for c in ear.changes if c > s), default=np.nan) for s in at]
-    rests = [all(e.rests for e in told if s <= e.t <= s + SOON_S) for s in at]
-    late = {"on_after": seen[0], "off_after": seen[1], "seen": sum(x <= SOON_S for x in seen)}
-    late |= {"seen_moving": sum(min(m, default=np.inf) <= SOON_S for m in moved)}
-    late |= {"at_rest": sum(rests), "seen_at_rest": sum(x <= SOON_S for x, r in zip(seen, rests, strict=True) if r)}
-    return [errors(told, thing) | late | {"false": len(ear.changes) - real, "us": us}]
+    moved = [[moving_s(s, c) for c in alarms if c > s] for s in at]
+    real = sum(any(c > s and moving_s(s, c) <= LATE_S for s in at) for c in alarms)
+    after = [min((c - s for c in alarms if c > s), default=np.nan) for s in at]
+    rests = [all(e.rests for e in estimates if s <= e.t <= s + SOON_S) for s in at]
+    row = {"on_after": after[0], "off_after": after[1], "seen": sum(x <= SOON_S for x in after)}
+    row |= {"seen_moving": sum(min(m, default=np.inf) <= SOON_S for m in moved)}
+    row |= {"at_rest": sum(rests), "seen_at_rest": sum(x <= SOON_S for x, r in zip(after, rests, strict=True) if r)}
+    return [errors(estimates, payload) | row | {"false": len(alarms) - real, "us": us}]
 
 
-def quiet(of: Known, k: int) -> list[dict]:
-    """Return the alarms of five minutes of unloaded motion, one estimator and one arm all along."""
-    arm, ear = of.arm(1000 + k), of.ear()
+def quiet(of: IdentifiedTwin, k: int) -> list[dict]:
+    """Return the alarms in five minutes of unloaded motion of one estimator and one arm."""
+    arm, estimator = of.arm(1000 + k), of.estimator()
     motions, odds = range(PIECE * k, PIECE * (k + 1)), -np.inf
-    for heard in of.kept(f"quiet_{k}", lambda: [record(arm, motion(i), laden=True) for i in motions]):
-        odds = max(odds, *(now.odds for now in listen(ROBOT, ear, heard)))
-    at = " ".join(f"{c:.2f}" for c in ear.changes)
-    return [{"minutes": PIECE * SECONDS / 60, "alarms": len(ear.changes), "at_s": at, "odds": odds}]
+    for recording in of.kept(f"quiet_{k}", lambda: [record(arm, motion(i), loaded=True) for i in motions]):
+        odds = max(odds, *(now.odds for now in estimate_recording(ROBOT, estimator, recording)))
+    at = " ".join(f"{c:.2f}" for c in estimator.changes)
+    return [{"minutes": PIECE * SECONDS / 60, "alarms": len(estimator.changes), "at_s": at, "odds": odds}]
 
 
-def load(of: Known, k: int) -> list[dict]:
-    """Return what is told of a payload that is there all along, whatever the arm itself was told of it."""
-    rng, rows = np.random.default_rng([of.make, of.seed, k, 1]), []
-    given = drawn(rng) | {"mass": float(rng.uniform(0.05, MOST_KG / max(TOLD.values()))), "on_s": 0.0, "off_s": None}
-    for name, share in TOLD.items():
-        told = {"mass": share * given["mass"], "centre": given["centre"]} if share else None
-        ear, arm = of.ear(told), of.arm(200 + k, payload=given, load=told)
-        heard = record(arm, motion(k), laden=True)
-        rows.append({"told": name} | errors(listen(ROBOT, ear, heard), payload_of(given)))
-        rows[-1]["changes"] = len(ear.changes)
+def load(of: IdentifiedTwin, k: int) -> list[dict]:
+    """Return the estimates of a constant payload for several declared payloads of the arm."""
+    rng, rows = of.rng(k, 1), []
+    given = draw_payload(rng) | {"on_s": 0.0, "off_s": None}
+    given["mass"] = float(rng.uniform(0.05, MOST_KG / max(DECLARED.values())))
+    for name, share in DECLARED.items():
+        declared = {"mass": share * given["mass"], "centre": given["centre"]} if share else None
+        estimator = of.estimator(declared)
+        recording = record(of.arm(200 + k, payload=given, declared_payload=declared), motion(k), loaded=True)
+        row = {"declared": name} | errors(estimate_recording(ROBOT, estimator, recording), payload_of(given))
+        rows.append(row | {"changes": len(estimator.changes)})
     return rows
 
 
-class Warming:
-    """A twin whose friction becomes 1 - FALL (1 - exp(-t / TAU_S)) of what it was; its own warmth is held.
+class WarmingTwin:
+    """A twin whose friction scale falls as 1 - FALL (1 - exp(-t / TAU_S)); the twin's own warming is switched off.
 
     Attributes:
-        rubbed: Nm of friction in each cycle, less what the control box of make 2 compensates of it.
-        scale: of each cycle.
+        friction: Nm in each cycle, minus the compensation of the elastic variant's control box.
+        scale: of friction in each cycle.
     """
 
-    def __init__(self, arm: HiddenArm, begins_s: float):
+    def __init__(self, arm: TwinBase, begins_s: float):
         self.arm, self.robot, self._begins = arm, arm.robot, begins_s
         self._elastic = isinstance(arm, ElasticTwin)
         e = elastic
         box = [e.C_NEG, e.C_POS, e.MU, e.VISCOUS, e.HELP, e.HELP_VISCOUS]
-        self._rows = box if self._elastic else [rigid.C_NEG, rigid.C_POS, rigid.MU, rigid.S2]
+        self._rows = box if self._elastic else [lugre.C_NEG, lugre.C_POS, lugre.MU, lugre.S2]
         self._cold = arm._hidden[self._rows]  # type: ignore[attr-defined]
-        self.rubbed: list[np.ndarray] = []
+        self.friction: list[np.ndarray] = []
         self.scale: list[float] = []
 
     def move_to(self, q: np.ndarray) -> ArmState:
@@ -210,7 +213,7 @@ class Warming:
         return self.arm.read()
 
     def command(self, tau: np.ndarray) -> None:
-        """Give a command with the friction of now."""
+        """Send a command with the friction of this cycle."""
         since = max(len(self.scale) * SIM_DT - self._begins, 0.0)
         self.scale.append(1.0 + FALL * np.expm1(-since / TAU_S))
         p, s = self.arm._hidden, self.arm._state  # type: ignore[attr-defined]
@@ -218,7 +221,7 @@ class Warming:
         if self._elastic:
             s[elastic.HEAT] = 0.0
         self.arm.command(tau)
-        self.rubbed.append(rubs(p, s) if self._elastic else s[rigid.FRICTION].copy())
+        self.friction.append(net_friction(p, s) if self._elastic else s[lugre.FRICTION].copy())
 
     def stop(self) -> None:
         """End the motion."""
@@ -226,97 +229,96 @@ class Warming:
 
 
 @njit
-def rubs(p, s):
-    """Return (n,) Nm of friction at the motors of make 2, less what its control box compensates."""
+def net_friction(p, s):
+    """Return friction (n,) Nm at the motors of an elastic twin, minus the compensation of its control box."""
     out = np.zeros(s.shape[1])
     for i in range(len(out)):
-        w, seen = s[elastic.W, i], s[elastic.DQ_SEEN, i]
+        w, dq = s[elastic.W, i], s[elastic.DQ_MEASURED, i]
         factor = elastic.warmth(p, s[elastic.HEAT, i], i) * elastic.ripple(p, s[elastic.THETA, i], i)
         out[i] = np.sign(w) * factor * elastic.level(p, w, s[elastic.S_AT, i], np.sign(w), i)
-        out[i] -= p[elastic.HELP, i] * np.tanh(seen / p[elastic.HELP_WIDTH, i]) + p[elastic.HELP_VISCOUS, i] * seen
+        out[i] -= p[elastic.HELP, i] * np.tanh(dq / p[elastic.HELP_WIDTH, i]) + p[elastic.HELP_VISCOUS, i] * dq
     return out
 
 
-def warmed(twin: HiddenArm, begins: float, k: int) -> list[tuple]:
-    """Return of each motion the recording, Nm of friction in each cycle, and the scale of it."""
-    arm, out = Warming(twin, begins), []
+def record_warming(twin: TwinBase, begins: float, k: int) -> list[tuple]:
+    """Return recording, friction, Nm, and friction scale per cycle of each motion."""
+    arm, out = WarmingTwin(twin, begins), []
     for i in range(COLD + WARMS):
         since = len(arm.scale)
-        heard = record(arm, motion(100 * k + i), laden=True)
-        out.append((heard, np.array(arm.rubbed[since:]), np.array(arm.scale[since:])))
+        recording = record(arm, motion(100 * k + i), loaded=True)
+        out.append((recording, np.array(arm.friction[since:]), np.array(arm.scale[since:])))
     return out
 
 
-def warming(of: Known, k: int) -> list[dict]:
-    """Return how friction that warms up is followed, a row per joint.
+def span_means(cycles: np.ndarray) -> np.ndarray:
+    """Return means weighted same as in a momentum residual: between triangles of two spans each."""
+    c = np.cumsum(cycles, axis=0)
+    c = c[: len(c) // SPAN * SPAN].reshape(-1, SPAN, *c.shape[1:])
+    rises = np.arange(1, SPAN + 1) / SPAN**2
+    triangles = np.tensordot(c[:-1], rises, (1, 0)) + np.tensordot(c[1:], 1 / SPAN - rises, (1, 0))
+    return np.diff(triangles, axis=0) / SPAN
 
-    The truth is the share of what is believed that fits the twin's own friction best while a joint slides, with a
-    constant: one number of the cold joint, times the scale that is imposed.
+
+def warming(of: IdentifiedTwin, k: int) -> list[dict]:
+    """Return how the estimator tracks warming friction, a row per joint.
+
+    The truth is the share of the model's friction, with a constant, that fits the twin's friction best while the
+    joint slides: one number of the cold joint, times the imposed scale.
     """
-    begins, ear = COLD * SECONDS, of.ear()
-    told, cold, scale, rub, slides = [], [], [], [], []
+    begins, estimator = COLD * SECONDS, of.estimator()
+    estimates, cold, scale, model, slides = [], [], [], [], []
+    for recording, friction, factors in of.kept(f"warming_{k}", lambda: record_warming(of.arm(300 + k), begins, k)):
+        rows: list[tuple] = []
 
-    def spans(cycles: np.ndarray) -> np.ndarray:
-        """Return means as of a balance: between triangles of two spans each."""
-        c = np.cumsum(cycles, axis=0)
-        whole = c[: len(c) // SPAN * SPAN].reshape(-1, SPAN, *c.shape[1:])
-        rises = np.arange(1, SPAN + 1) / SPAN**2
-        triangles = np.tensordot(whole[:-1], rises, (1, 0)) + np.tensordot(whole[1:], 1 / SPAN - rises, (1, 0))
-        return np.diff(triangles, axis=0) / SPAN
+        def report(now: Estimate, rows=rows) -> None:
+            residual = estimator.internals[2]
+            rows.append((now, residual.friction.copy(), residual.sliding > 0))
 
-    for heard, rubbed, factors in of.kept(f"warming_{k}", lambda: warmed(of.arm(300 + k), begins, k)):
-        mine: list[tuple] = []
-
-        def hears(now: Estimate, mine=mine) -> None:
-            b = ear.inside[2]
-            mine.append((now, b.rub.copy(), b.slides > 0))
-
-        listen(ROBOT, ear, heard, hears)
-        seen, factor = spans(rubbed), spans(factors)
-        m = min(len(mine), len(seen))
-        told += [now for now, _, _ in mine[:m]]
-        rub += [r for _, r, _ in mine[:m]]
-        slides += [s for _, _, s in mine[:m]]
-        cold += list(seen[:m] / factor[:m, None])
+        estimate_recording(ROBOT, estimator, recording, report)
+        true, factor = span_means(friction), span_means(factors)
+        m = min(len(rows), len(true))
+        estimates += [now for now, _, _ in rows[:m]]
+        model += [f for _, f, _ in rows[:m]]
+        slides += [s for _, _, s in rows[:m]]
+        cold += list(true[:m] / factor[:m, None])
         scale += list(factor[:m])
-    return followed(np.array(cold), np.array(rub), np.array(slides), np.array(scale), told, begins)
+    return score_warming(np.array(cold), np.array(model), np.array(slides), np.array(scale), estimates, begins)
 
 
-def followed(cold, rub, slides, scale, told: list[Estimate], begins: float) -> list[dict]:
-    """Return a row per joint: cold, rub, slides (M, n), Nm, Nm, whether; scale (M,) of friction at each moment."""
-    t = np.array([e.t for e in told])
-    says, half = np.array([e.friction for e in told]), np.array([e.friction_half for e in told])
-    moving = ~np.array([e.rests for e in told])
+def score_warming(cold, model, slides, scale, estimates: list[Estimate], begins: float) -> list[dict]:
+    """Return a row per joint: cold, model (M, n) Nm of friction; slides (M, n); scale (M,) of friction over time."""
+    t = np.array([e.t for e in estimates])
+    estimated, half = np.array([e.friction for e in estimates]), np.array([e.friction_half for e in estimates])
+    moving = ~np.array([e.rests for e in estimates])
     before, last = (t > begins - SECONDS) & (t <= begins), t > t[-1] - SECONDS
     later, rows = t > begins, []
     motions = np.minimum((t[later] - begins) // SECONDS, WARMS - 1).astype(int)
-    for j in range(rub.shape[1]):
+    for j in range(model.shape[1]):
         on = slides[:, j]
-        share = np.linalg.lstsq(np.column_stack([rub[on, j], np.ones(on.sum())]), cold[on, j], rcond=None)[0][0]
-        true, says_j = share * scale, says[:, j]
+        share = np.linalg.lstsq(np.column_stack([model[on, j], np.ones(on.sum())]), cold[on, j], rcond=None)[0][0]
+        true, x = share * scale, estimated[:, j]
         change = true[last].mean() - true[before].mean()
-        off = (says_j - says_j[before].mean()) - (true - true[before].mean())
-        means = np.bincount(motions, off[later]) / np.bincount(motions)
+        error = (x - x[before].mean()) - (true - true[before].mean())
+        means = np.bincount(motions, error[later]) / np.bincount(motions)
         far = np.flatnonzero(np.abs(means) > NEAR * abs(change))
-        near = int(far[-1]) + 1 if len(far) else 0  # motions after which all are near
-        fits = []
+        near = int(far[-1]) + 1 if len(far) else 0  # motions after which all errors are small
+        fits, rest = [], x[t > begins - SECONDS]
         for lag in LAGS_S:
             shape = 1.0 + FALL * np.expm1(-np.maximum(t - begins - lag, 0.0) / TAU_S)
             columns = np.column_stack([np.ones(len(t)), shape])[t > begins - SECONDS]
-            left = says_j[t > begins - SECONDS]
-            fits.append(np.sum((left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]) ** 2))
+            fits.append(np.sum((rest - columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]) ** 2))
         rows.append(
             {
                 "joint": j + 1,
                 "cold": share,
                 "change": change,
-                "error": abs(off[last].mean() / change),  # of the change
-                "rms": np.sqrt(np.mean((off[later] / change) ** 2)),
-                "absolute": abs((says_j - true)[last].mean() / change),
+                "error": abs(error[last].mean() / change),  # of the change
+                "rms": np.sqrt(np.mean((error[later] / change) ** 2)),
+                "absolute": abs((x - true)[last].mean() / change),
                 "behind_s": LAGS_S[int(np.argmin(fits))],
                 "near_after_s": near * SECONDS,
                 "never": near == len(means),
-                "covered": np.mean((np.abs(says_j - true) <= half[:, j])[moving]),
+                "covered": np.mean((np.abs(x - true) <= half[:, j])[moving]),
                 "half": half[last, j].mean(),
             }
         )

@@ -1,10 +1,10 @@
-"""The picture of the README: a simulated arm beside the twin, and the twin's torque against two models of it.
+"""Draw the picture of the README: a simulated arm beside the twin, and the twin's torque against two models of it.
 
-`python benchmarks/pictures.py` identifies arm=twin from 10 s of motion and lets algo=oracle, made from the result,
-reach the same goals in simulation and on the twin (3 minutes on two cores); or give both folders yourself:
+`python benchmarks/pictures.py` identifies arm=twin from 10 s of motion and lets algo=oracle reach the same goals in
+the identified simulation and on the twin (3 minutes on two cores). To draw existing run folders:
 `python benchmarks/pictures.py IDENTIFY_FOLDER TRANSFER_FOLDER`. Writes docs/overview.png.
 
-The arm is drawn by sphere tracing (Hart, The Visual Computer 12, 1996), which needs no graphics library.
+Sphere tracing (Hart, The Visual Computer 12, 1996) draws the arm without a graphics library.
 """
 
 import sys
@@ -12,31 +12,31 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from common import ROBOT, ROOT, side_by_side
+from common import ROBOT, ROOT, run_parallel
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from r2s.physics.robot import Robot
-from r2s.reporting.colours import KNOWN
-from r2s.reporting.log_rows import without_pauses
-from r2s.reporting.viewer import GOAL
+from r2s.reporting.figures.colours import KNOWN
+from r2s.reporting.figures.log_rows import without_pauses
+from r2s.reporting.viewer.arms import GOAL
 
 NAME = "overview"  # of the run folders
-EYE = np.array([1.0, -0.75, 0.42]) / np.linalg.norm([1.0, -0.75, 0.42])  # towards the eye, seen from the arm
+EYE = np.array([1.0, -0.75, 0.42]) / np.linalg.norm([1.0, -0.75, 0.42])  # direction from the arm to the eye
 RIGHT = np.cross([0, 0, 1.0], EYE) / np.linalg.norm(np.cross([0, 0, 1.0], EYE))
 UP = np.cross(EYE, RIGHT)
 LIGHT = np.array([0.5, -0.3, 1.0]) / np.linalg.norm([0.5, -0.3, 1.0])
-MARGIN = 0.13  # m about the links
+MARGIN = 0.13  # m around the links
 PIXELS_PER_M = 480
 FLOOR = np.array([0.955, 0.96, 0.97])
 POSES = {0.0: 0.2, 0.25: 0.3, 0.42: 0.45, 3.9: 1.0}  # s: opacity
-JOINTS = (0, 3)  # whose torque is shown, from 0
-SECONDS = 8.0  # of torque
+JOINTS = (0, 3)  # joints with a torque plot, from 0
+SECONDS = 8.0  # duration of the torque plots
 
 
 def distance(points: np.ndarray, shapes: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return (P,) m from points (P, 3) to the nearest of the shapes, and (P,) which one that is."""
+    """Return the distance (P,) m from points (P, 3) to the nearest shape, and its index (P,)."""
     nearest, which = np.full(len(points), np.inf), np.zeros(len(points), int)
     for k, (kind, size, position, rotation, _) in enumerate(shapes):
         x, y, z = ((points - position) @ rotation).T
@@ -51,7 +51,7 @@ def distance(points: np.ndarray, shapes: list) -> tuple[np.ndarray, np.ndarray]:
 
 
 def trace(start: np.ndarray, direction: np.ndarray, shapes: list, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return (P, 3) m where rays from start (P, 3) meet a shape, and (P,) whether they do within `far` m."""
+    """Return where rays from start (P, 3) m meet a shape, (P, 3) m, and whether they do within `far` m, (P,)."""
     way, alive = np.zeros(len(start)), np.ones(len(start), bool)
     for _ in range(60):
         d, _ = distance(start[alive] + way[alive, None] * direction, shapes)
@@ -74,7 +74,7 @@ def shapes_at(q: np.ndarray, tint: str, robot: Robot = ROBOT) -> list:
 
 
 def frame_of(poses: np.ndarray, robot: Robot = ROBOT) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top, m from the foot of the arm, of what shows poses (K, n) rad."""
+    """Return left, right, bottom and top, m from the base, of a frame around poses (K, n) rad."""
     at = np.array([position for q in poses for _, _, position, _, _ in shapes_at(q, "w", robot)])
     (left, bottom), (right, top) = (f(np.stack([at @ RIGHT, at @ UP], -1), axis=0) for f in (np.min, np.max))
     return left - MARGIN, right + MARGIN, bottom - MARGIN, top + MARGIN
@@ -83,7 +83,7 @@ def frame_of(poses: np.ndarray, robot: Robot = ROBOT) -> tuple[float, float, flo
 def picture(
     q: np.ndarray, tint: str, frame: tuple, robot: Robot = ROBOT, pixels: float = PIXELS_PER_M
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what is seen of one pose: (H, W, 3) colours, (H, W) whether it is the arm, (H, W) light on the floor."""
+    """Return an image of one pose: colours (H, W, 3), mask of the arm (H, W), light on the floor (H, W)."""
     shapes = shapes_at(q, tint, robot)
     left, right, bottom, top = frame
     x, y = (np.arange(a, b, 1 / pixels) for a, b in ((left, right), (bottom, top)))
@@ -110,24 +110,24 @@ def picture(
 
 
 def draw_arm(axis: Axes, episode: dict, label: str, colour: str) -> None:
-    """Draw an episode {t, q, ee, goal}: some of its poses, the way of the end effector and the goal."""
+    """Draw an episode {t, q, ee, goal}: some poses, the path of the end effector and the goal."""
     image, frame = None, frame_of(episode["q"][np.searchsorted(episode["t"], list(POSES))])
     for seconds, opacity in POSES.items():
-        seen, arm, light = picture(episode["q"][np.searchsorted(episode["t"], seconds)], colour, frame)
+        rendered, arm, light = picture(episode["q"][np.searchsorted(episode["t"], seconds)], colour, frame)
         image = np.tile(FLOOR, (*arm.shape, 1)) if image is None else image
         cover = np.where(arm, opacity, 0.0)[..., None]
         shadow = light[..., None] if opacity == 1 else 1.0
-        image = (1 - cover) * image * np.where(arm[..., None], 1.0, shadow) + cover * seen
+        image = (1 - cover) * image * np.where(arm[..., None], 1.0, shadow) + cover * rendered
     axis.imshow(image, extent=frame, interpolation="bilinear")
-    way, goal = (np.stack([p @ RIGHT, p @ UP], -1) for p in (episode["ee"], episode["goal"]))
-    axis.plot(*way.T, color=colour, linewidth=2.2)
+    path, goal = (np.stack([p @ RIGHT, p @ UP], -1) for p in (episode["ee"], episode["goal"]))
+    axis.plot(*path.T, color=colour, linewidth=2.2)
     axis.plot(*goal, "o", color=GOAL, markersize=13, alpha=0.55, markeredgecolor="none")
     axis.set_title(label, loc="left", fontsize=12)
     axis.set_axis_off()
 
 
 def draw_torque(axes: list[Axes], saved: dict) -> None:
-    """Draw {t, measured, nominal, identified} of some joints."""
+    """Draw the torques {t, measured, nominal, identified} of JOINTS."""
     clock, _ = without_pauses(saved["t"])
     rows = clock <= SECONDS
     for axis, j in zip(axes, JOINTS, strict=True):
@@ -143,12 +143,12 @@ def draw_torque(axes: list[Axes], saved: dict) -> None:
         axis.grid(alpha=0.3, linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].tick_params(labelbottom=False)
-    axes[-1].set_xlabel("time, s, motion that was not fitted")
+    axes[-1].set_xlabel("time, s, held-out motion")
     axes[-1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=3, frameon=False)
 
 
 def draw(identified: Path, transferred: Path, path: Path) -> None:
-    """Write the picture of both run folders."""
+    """Draw both run folders into one picture."""
     saved = dict(np.load(identified / "torque.npz"))
     both = {where: dict(np.load(transferred / f"episodes_{where}.npz")) for where in ("predicted", "twin")}
     k = int(np.argmax(both["twin"]["distance"][:, 0]))
@@ -158,7 +158,7 @@ def draw(identified: Path, transferred: Path, path: Path) -> None:
     )
     apart = both["twin"]["ee"][k] - both["predicted"]["ee"][k]
     path_mm = 1e3 * np.sqrt(np.mean(np.sum(apart**2, -1)))
-    titles = {"predicted": "in simulation, as identified", "twin": f"on the twin: {path_mm:.1f} mm from simulation"}
+    titles = {"predicted": "in the identified simulation", "twin": f"on the twin: {path_mm:.1f} mm from simulation"}
     for i, (where, e) in enumerate(both.items()):
         episode = {"t": e["t"]} | {name: e[name][k] for name in ("q", "ee", "goal")}
         draw_arm(figure.add_subplot(grid[:, i]), episode, titles[where], KNOWN["identified"])
@@ -167,14 +167,14 @@ def draw(identified: Path, transferred: Path, path: Path) -> None:
 
 
 def main() -> None:
-    """Draw the folders given, or make them first."""
+    """Draw the given run folders, or create them first."""
     if len(sys.argv) == 3:
         identified, transferred = map(Path, sys.argv[1:])
     else:
         identified, policy, transferred = (ROOT / "runs" / s / NAME for s in ("identify", "train", "transfer"))
-        side_by_side([["stage=identify", f"name={NAME}", "data.seconds=10"]])
-        side_by_side([["algo=oracle", f"name={NAME}", f"calibration={identified}", "evaluation.episodes=12"]])
-        side_by_side([["stage=transfer", f"name={NAME}", f"policy={policy}", "evaluation.episodes=12"]])
+        run_parallel([["stage=identify", f"name={NAME}", "data.seconds=10"]])
+        run_parallel([["algo=oracle", f"name={NAME}", f"calibration={identified}", "evaluation.episodes=12"]])
+        run_parallel([["stage=transfer", f"name={NAME}", f"policy={policy}", "evaluation.episodes=12"]])
     draw(identified, transferred, ROOT / "docs" / "overview.png")
 
 

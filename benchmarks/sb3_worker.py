@@ -1,7 +1,7 @@
-"""sb3-contrib's TQC, in an environment of its own: started by bench.py, one duel at a time.
+"""Time updates of sb3-contrib's TQC in its own environment; bench.py starts this script.
 
-Reads "THREADS UPDATES" from its input, does so many updates and answers with the seconds that they took. Networks,
-batch, quantiles and optimiser are those of bench.py's `learner`; so is what sb3's networks have not (LayerNorm): it
+Reads "THREADS UPDATES" from standard input, does that many updates and answers with their duration in s. Networks,
+batch, quantiles and optimiser equal those of bench.py's `learner`, except LayerNorm, absent in sb3's networks: it
 would only make sb3 slower.
 """
 
@@ -14,8 +14,8 @@ import torch
 from sb3_contrib import TQC
 
 
-class Nothing(gym.Env):
-    """Spaces of the task, no physics: only the learner is timed."""
+class NoPhysics(gym.Env):
+    """The spaces of the task without physics: only the learner is timed."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (47,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (7,), np.float32)
@@ -25,7 +25,7 @@ class Nothing(gym.Env):
         return np.random.randn(47).astype(np.float32), {}
 
     def step(self, action):
-        """Return another one."""
+        """Return a random transition."""
         return np.random.randn(47).astype(np.float32), float(np.random.randn()), False, False, {}
 
 
@@ -34,7 +34,7 @@ def main() -> None:
     torch.set_num_threads(1)
     policy = {"net_arch": [256, 256], "n_critics": 2, "n_quantiles": 25}
     settings = {"batch_size": 256, "gamma": 0.98, "tau": 0.005, "learning_rate": 5e-4, "learning_starts": 0}
-    algo = TQC("MlpPolicy", Nothing(), **settings, policy_kwargs=policy, top_quantiles_to_drop_per_net=2)
+    algo = TQC("MlpPolicy", NoPhysics(), **settings, policy_kwargs=policy, top_quantiles_to_drop_per_net=2)
     algo.learn(2000)  # fills the buffer
     print("ready", flush=True)
     for line in sys.stdin:

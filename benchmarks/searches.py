@@ -1,108 +1,102 @@
-"""ga, cmaes, least_squares and staged at equal wall-clock: error on motion not fitted against time, one figure.
+"""Compare ga, least_squares and staged at equal time: error on held-out motion over time, one figure.
 
 `python benchmarks/searches.py [SECONDS]` gives each search the recording of benchmarks/known_truth.py (seed 0) and
-the same time. Writes docs/searches.md and docs/searches.png.
+the same time. Writes searches.md and searches.png of benchmarks/results.
 """
 
 import sys
 import time
+from dataclasses import dataclass, field
 
 import matplotlib
 import numpy as np
-from common import MACHINE, OLD, ROBOT, ROOT, fourier, how, record, replace, searches
-from known_truth import NOISE, TERMS, TRUTH
+from common import OLD, RESULTS, ROBOT, identify_settings, markdown_rows, replace, searches, write_page
+from known_truth import TERMS, TRUTH, record_excitation
 
-from r2s.arm.simulated import SimulatedArm
 from r2s.identification.identify import CLEAR
-from r2s.identification.problem import Problem, searched
-from r2s.identification.replay_residual import ReplayResidual
-from r2s.identification.torque_residual import TorqueResidual
+from r2s.identification.problem import Problem
+from r2s.identification.residuals.replay_residual import ReplayResidual
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.residuals.windows import cut_windows
+from r2s.identification.terms import search_space
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SHOWN = 40  # moments of a search whose best candidate is judged
+SHOWN = 40  # points of each curve
 
 
-class Watched(Problem):
-    """A Problem that remembers when which candidate was the best yet."""
+@dataclass
+class Log:
+    """Times and values of each new best candidate; costs with different weights do not compare."""
 
-    def watch(self) -> None:
-        """Start the clock."""
-        self.began, self.best, self.trail = time.perf_counter(), {}, []
+    began: float = field(default_factory=time.perf_counter)
+    best: dict = field(default_factory=dict)  # least cost per residual
+    trail: list = field(default_factory=list)  # (s, u (P,))
+
+
+@dataclass(frozen=True, eq=False)
+class TimedProblem(Problem):
+    """A problem that logs the time of each new best candidate."""
+
+    log: Log = field(default_factory=Log)
 
     def _with_prior(self, data, u):
         rows = super()._with_prior(data, u)
-        cost, key = (rows**2).sum(1), id(data)
-        if cost.min() < self.best.get(key, np.inf):
-            self.best[key] = cost.min()
-            self.trail.append((time.perf_counter() - self.began, u[cost.argmin()].copy()))
+        cost = (rows**2).sum(1)
+        if cost.min() < self.log.best.get(data, np.inf):
+            self.log.best[data] = cost.min()
+            self.log.trail.append((time.perf_counter() - self.log.began, u[cost.argmin()].copy()))
         return rows
-
-    def adapt(self, u, fitted):
-        """Adapt, and judge anew: costs of other weights do not compare."""
-        super().adapt(u, fitted)
-        self.best = {}
 
 
 def main() -> None:
-    """Run every search, judge what it had found when, and draw."""
+    """Run every search, score its best candidates over time, and draw."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
-    motions = [
-        record(SimulatedArm(ROBOT, TRUTH, **NOISE, seed=0), fourier(ROBOT, duration=20.0, seed=s)) for s in (0, 1)
-    ]
-    s = how(terms=TERMS)
-    nominal = replace(OLD, breakaway=TRUTH.breakaway)  # edges come from ramps, for all searches alike
-    space = searched(ROBOT, nominal, s.bounds, TERMS, motions[0])
-    timing = {"window_s": s.window_s, "stride": s.stride, "slowest": CLEAR * OLD.dq_min}
-    judge = ReplayResidual(ROBOT, space, motions[1], window_s=0.2, stride=5, batch=SHOWN)
+    motions = [record_excitation(0, s) for s in (0, 1)]
+    settings = identify_settings(terms=TERMS)
+    nominal = replace(OLD, breakaway=TRUTH.breakaway)  # every search gets the breakaway torques of ramps
+    space = search_space(ROBOT, nominal, settings.bounds, TERMS, motions[0])
+    windows = cut_windows(motions[0], settings.window_s, slowest=CLEAR * OLD.dq_min)
+    held_out = ReplayResidual(space, motions[1], cut_windows(motions[1], 0.2), stride=5, batch=SHOWN)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return 1e3 * np.linalg.norm(held_out.errors(x).reshape(len(x), -1, ROBOT.n), axis=-1).mean(1)
+
     figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    lines = []
-    for name in ("ga", "cmaes", "least_squares", "staged"):
-        quick = TorqueResidual(ROBOT, space, motions[0])
-        data = ReplayResidual(ROBOT, space, motions[0], **timing, batch=72)
-        problem = Watched(data, quick, s.prior)
-        problem.watch()
-        u, count = problem.start, 0
-        # stops of their own (generations, convergence) are lifted: only the clock ends a search
+    rows: dict[str, dict[str, str]] = {}
+    for name in ("ga", "least_squares", "staged"):
+        torque_data = TorqueResidual(space, motions[0])
+        data = ReplayResidual(space, motions[0], windows, stride=settings.stride, batch=72)
+        problem = TimedProblem.of(data, torque_data, settings.prior)
+        log, u, count = problem.log, problem.start, 0
+        # only the clock ends a search: its own limits (generations, convergence) are lifted
         free = {"generations": 100_000, "minutes": seconds / 60, "max_evaluations": 12, "patience": 100_000}
-        plan = searches(name, **free) if name in ("ga", "cmaes") else searches(name)
-        while time.perf_counter() - problem.began < seconds and count < 8:
+        plan = searches(name, **free) if name == "ga" else searches(name)
+        while time.perf_counter() - log.began < seconds and count < 8:
             for search in plan if count == 0 else plan[-1:]:
                 u = search(problem, u, lambda row: None)
-                problem.adapt(u, fitted=True)
+                problem = problem.reweighted(u, fitted=True)
             count += 1
-        trail = [p for p in problem.trail if p[0] <= seconds]
+        trail = [p for p in log.trail if p[0] <= seconds]
         trail = [trail[i] for i in np.unique(np.linspace(0, len(trail) - 1, SHOWN).round().astype(int))]
         at = np.array([t for t, _ in trail])
-        candidates = space.from_unit(np.array([u for _, u in trail]))
-        error = 1e3 * np.linalg.norm(judge.error(candidates).reshape(len(at), -1, ROBOT.n), axis=-1).mean(1)
+        error = errors(space.from_unit(np.array([u for _, u in trail])))
         axis.step([*at, seconds], [*error, error[-1]], where="post", label=name)
-        share = [f"{error[at <= t][-1]:.2f}" if (at <= t).any() else "" for t in (5, 15, 30, seconds)]
-        lines.append(f"| {name} | " + " | ".join(share) + " |")
-        print(lines[-1], flush=True)
-    noise = (
-        1e3
-        * np.linalg.norm(
-            judge.error(replace(space, nominal=replace(TRUTH)).start[None]).reshape(1, -1, ROBOT.n), axis=-1
-        ).mean()
-    )
-    axis.axhline(noise, color="0.6", lw=1, label="the truth itself")
-    axis.set(xlabel="seconds", ylabel="error of eq. (8), mrad, motion not fitted", yscale="log")
+        moments = {f"{t:g} s": t for t in (5, 15, 30, seconds)}
+        rows[name] = {k: f"{error[at <= t][-1]:.2f}" if (at <= t).any() else "" for k, t in moments.items()}
+        print(name, rows[name], flush=True)
+    noise = errors(replace(space, nominal=TRUTH).start[None])[0]
+    axis.axhline(noise, color="0.6", lw=1, label="true parameters")
+    axis.set(xlabel="seconds", ylabel="error of eq. (8), mrad, held-out motion", yscale="log")
     axis.legend()
-    figure.savefig(ROOT / "docs" / "searches.png", dpi=130)
-    head = [
-        "# Searches at equal wall-clock",
-        "",
-        f"`python benchmarks/searches.py` on {MACHINE}: {seconds:g} s each on the recording of known_truth.py",
-        f"(seed 0; {len(space.start)} parameters). Error of eq. (8) in replays of 0.2 s of other motion, mrad; the",
-        f"truth itself has {noise:.2f} (start states are measured).",
-        "",
-        f"| search | after 5 s | 15 s | 30 s | {seconds:g} s |",
-        "|---|---|---|---|---|",
-    ]
-    (ROOT / "docs" / "searches.md").write_text("\n".join([*head, *lines, "", "![](searches.png)"]) + "\n")
-    print("written: docs/searches.md, docs/searches.png")
+    figure.savefig(RESULTS / "searches.png", dpi=130)
+    text = (
+        f"{seconds:g} s each on the recording of known_truth.py (seed 0, {len(space.start)} parameters). Error of "
+        f"eq. (8) in replays of 0.2 s of other motion, mrad; the truth leaves {noise:.2f}."
+    )
+    parts = [text, markdown_rows(rows, "search, after"), "![](searches.png)"]
+    write_page("searches", "Searches at equal time", "python benchmarks/searches.py", parts)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The true parameters of arms that another simulator moved, open loop: what the rule of stiction costs, by arm.
+"""Predict arms of another simulator from their true parameters, open loop, with each stiction model.
 
 usage: python benchmarks/stick_slip.py FOLDER, with a sub-folder for each arm: truth.json, train.npz, validation.npz.
-Prints the mean end-effector error after 0.5 s under both rules (`hold` of Dynamics), and what "net" costs in speed.
+Prints the mean end-effector error after 0.5 s per arm, and the cost of stiction_model="net" in speed.
 """
 
 import json
@@ -13,19 +13,19 @@ import numpy as np
 from bench import duel
 from common import NEW, ROBOT
 
-from r2s.identification.prediction import _open_loop_ee
-from r2s.physics.dynamics import HOLDS, Dynamics
+from r2s.identification.prediction import open_loop_error
+from r2s.physics.dynamics import STICTION_MODELS, Dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
 from r2s.physics.simulator import Simulator
 from r2s.recordings.readers import read
 
 HORIZON = "0.5"  # s
 NAMES = ("train", "validation")
-START = 2e-3  # rad/s: what a window's measured start velocity may be of a joint at rest
+START = 2e-3  # rad/s, largest measured start velocity of a joint that is at rest
 
 
 def true_dynamics(truth: dict) -> Dynamics:
-    """Return an arm's truth.json as far as the families express it: all but the damping of LuGre's bristles."""
+    """Return the dynamics of a truth.json; the families do not express the damping of LuGre bristles."""
     f = {name: np.array(values) for name, values in truth["friction"].items()}
     if "phi1" in f:
         family, phi = SIGMOID, np.stack([f["phi1"], f["phi2"], f["phi3"]], -1)
@@ -36,7 +36,7 @@ def true_dynamics(truth: dict) -> Dynamics:
             rises = [f[f"fs_{side}"] / f[f"fc_{side}"] - 1 for side in ("pos", "neg")]
             rise, other = _sides({"rise_pos": rises[0], "rise_neg": rises[1]}, "rise")
             family, columns = STRIBECK, [*columns, rise, f["vs"], other]
-        if "sigma0" in f:  # bristles: as far as they bend under the Coulomb level
+        if "sigma0" in f:  # presliding: deflection of the bristles at the Coulomb level
             family = BRISTLE
             columns.insert(5, level / f["sigma0"])
         phi = np.stack([*columns, own], -1)
@@ -49,20 +49,20 @@ def true_dynamics(truth: dict) -> Dynamics:
         inertia=np.array(truth["inertia"]),
         delay=truth["delay_s"],
         lag=truth["lag_s"],
-        hold="net",  # also where the truth's edges are of the command: its joints rest by what acts on them
+        stiction_model="net",  # also if the true breakaway applies to the command: joints rest by their net torque
     )
 
 
 def _sides(f: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of a value of both directions, and by what share of it they differ from it."""
+    """Return the mean over both directions, and the relative deviation from it."""
     mean = 0.5 * (f[f"{name}_pos"] + f[f"{name}_neg"])
     return mean, f[f"{name}_pos"] / mean - 1
 
 
 def speed(dynamics: Dynamics, tau: np.ndarray) -> tuple[float, float]:
-    """Return steps/s of hold="net" and of "command" under torques (m, S, n) Nm from home."""
+    """Return steps/s of stiction_model="net" and of "command" under torques (m, S, n) Nm from home."""
     arms, q0 = len(tau), np.tile(ROBOT.q_home, (len(tau), 1))
-    sims = [Simulator(ROBOT, replace(dynamics, hold=hold), arms, 1) for hold in ("net", "command")]
+    sims = [Simulator(ROBOT, replace(dynamics, stiction_model=model), arms, 1) for model in ("net", "command")]
 
     def run(sim: Simulator) -> None:
         sim.reset(q0, np.zeros_like(q0))
@@ -73,19 +73,19 @@ def speed(dynamics: Dynamics, tau: np.ndarray) -> tuple[float, float]:
 
 def main() -> None:
     """Print one line per arm, then the speeds."""
-    columns = [f"{name}, {hold}, mm" for name in NAMES for hold in HOLDS]
+    columns = [f"{name}, {model}, mm" for name in NAMES for model in STICTION_MODELS]
     print(f"{'arm':12}" + "".join(f"{column:>26}" for column in columns))
     for folder in sorted(Path(sys.argv[1]).iterdir()):
         truth = json.loads((folder / "truth.json").read_text()) if (folder / "truth.json").is_file() else {}
         if truth.get("family", "lugre") == "lugre":
-            continue  # no family here has the bristle damping of a LuGre arm
-        seen = {n: read(folder / f"{n}.npz", torque="commanded") for n in NAMES}
+            continue  # no family expresses bristle damping
         true = true_dynamics(truth)
         line = f"{folder.name:12}"
-        for recording in seen.values():
-            for hold in HOLDS:
-                one = replace(true, hold=hold, dq_min=NEW.dq_min if hold == "command" else START)
-                line += f"{_open_loop_ee(ROBOT, one, recording, 1)[HORIZON]:26.2f}"
+        for name in NAMES:
+            recording = read(folder / f"{name}.npz", torque="commanded")
+            for model in STICTION_MODELS:
+                dynamics = replace(true, stiction_model=model, dq_min=NEW.dq_min if model == "command" else START)
+                line += f"{open_loop_error(ROBOT, dynamics, recording, 1)[HORIZON]:26.2f}"
         print(line, flush=True)
     rng = np.random.default_rng(0)
     held = np.repeat(rng.uniform(-1, 1, (128, 1, 7)) * [1, 1, 1, 1, 0.5, 0.3, 0.3], 200, axis=1)

@@ -1,7 +1,7 @@
-"""What all trackers at once cost a training.
+"""Measure the cost of all trackers together in a training.
 
-`python benchmarks/trackers.py` counts processor time of this process and of those that the trackers start: while
-nothing is logged, and per row. A training logs a row every 1,000 updates, and those are what `UPDATES_PER_S` says.
+`python benchmarks/trackers.py` counts processor time of this process and of the trackers' processes: while nothing is
+logged, and per row. A training logs a row every 1,000 updates; `UPDATES_PER_S` converts.
 `python benchmarks/trackers.py --minutes 3 --pairs 4` trains with and without them at the same time, on a core each,
 and compares the rates; servers stay on the core of their training.
 """
@@ -20,12 +20,12 @@ import psutil
 from common import MACHINE, ROOT
 from hydra import compose, initialize_config_dir
 
-from r2s.reporting.trackers.behind import Trackers
+from r2s.reporting.trackers.async_tracker import Trackers
 from r2s.stages.build import open_run
 
-UPDATES_PER_S = 300.0  # more than docs/speed.md has for TQC on two threads: the worse case
+UPDATES_PER_S = 300.0  # more than benchmarks/results/speed.md has for TQC on two threads: the worse case
 ALL = "tracker=[csv,tensorboard,mlflow,wandb,trackio]"
-# sets the core, and what is started later keeps to it; then runs run.py in this very process
+# pins this process to a core, which its children inherit, then runs run.py in the same process
 PINNED = """
 import os, runpy, sys
 os.sched_setaffinity(0, {int(sys.argv[1])})
@@ -37,22 +37,22 @@ ROWS, QUIET_S, PACE_S = 200, 20.0, 0.1
 
 
 def processor_s() -> float:
-    """Return the seconds of processor time of this process and of its children."""
+    """Return the processor time of this process and of its children, s."""
     me = psutil.Process()
     times = [p.cpu_times() for p in (me, *me.children(recursive=True))]
     return sum(t.user + t.system for t in times)
 
 
-def counted(root: Path) -> None:
-    """Print processor time while nothing is logged, and per row of a training's metrics."""
+def count(root: Path) -> None:
+    """Print processor time without logging, and per row of a training's metrics."""
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("config", [ALL, f"root={root}", "name=cost"])
     with open_run(cfg, []) as run:
-        assert isinstance(run.watcher, Trackers)
+        assert isinstance(run.tracker, Trackers)
         row = dict.fromkeys([f"loss_{k}" for k in range(12)], 0.5)
         ready = Semaphore(0)
-        run.watcher._send(lambda tracker: ready.release())  # after the stores are open and the servers started
-        for _ in run.watcher._behind:
+        run.tracker._send(lambda tracker: ready.release())  # when stores and servers are ready
+        for _ in run.tracker._trackers:
             ready.acquire(timeout=60.0)
         began = processor_s()
         time.sleep(QUIET_S)
@@ -68,22 +68,22 @@ def counted(root: Path) -> None:
     print(f"at {UPDATES_PER_S:.0f} updates/s: {100 * share:.2f} % of one core")
 
 
-def trained(root: Path, minutes: float, pairs: int) -> None:
+def train(root: Path, minutes: float, pairs: int) -> None:
     """Print env_steps of trainings with all trackers over those without: both at once, a core each, then swapped.
 
-    What the machine does beside them falls on both. What one core is slower than the other falls on each in turn: a
-    pair is two of these runs, and its ratio their geometric mean.
+    Other load on the machine affects both. Swapping cancels a difference between cores: the ratio of a pair is the
+    geometric mean of both runs.
     """
     cores = sorted(os.sched_getaffinity(0))[:2]
     if len(cores) < 2:
-        sys.exit("error: trainings with and without trackers need a core each; this process may use one")
+        sys.exit("error: expected two cores, one for each training; this process may use one")
     losses = []
     for k in range(pairs):
         ratio = 1.0
-        for turn in (0, 1):
+        for swap in (0, 1):
             at_once = {}
-            for name, core in zip(("without", "with"), cores[:: 1 - 2 * turn], strict=True):
-                typed = [f"root={root}", f"name={name}_{k}_{turn}", f"budget.minutes={minutes}", f"seed={k}"]
+            for name, core in zip(("without", "with"), cores[:: 1 - 2 * swap], strict=True):
+                typed = [f"root={root}", f"name={name}_{k}_{swap}", f"budget.minutes={minutes}", f"seed={k}"]
                 typed += ["threads=1", *([ALL] if name == "with" else [])]
                 at_once[name] = subprocess.Popen(
                     [sys.executable, "-c", PINNED, str(core), str(ROOT / "run.py"), *typed], cwd=ROOT
@@ -91,7 +91,7 @@ def trained(root: Path, minutes: float, pairs: int) -> None:
             if any([training.wait() for training in at_once.values()]):
                 sys.exit("error: a training failed")
             steps = {
-                name: pd.read_csv(root / "train" / f"{name}_{k}_{turn}" / "evaluations.csv")["env_steps"].iloc[-1]
+                name: pd.read_csv(root / "train" / f"{name}_{k}_{swap}" / "evaluations.csv")["env_steps"].iloc[-1]
                 for name in at_once
             }
             ratio *= (steps["with"] / steps["without"]) ** 0.5
@@ -102,16 +102,16 @@ def trained(root: Path, minutes: float, pairs: int) -> None:
 
 
 def main() -> None:
-    """Count, or train with and without."""
+    """Count processor time, or train with and without trackers."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=0.0, help="of each training; 0: processor time is counted")
+    parser.add_argument("--minutes", type=float, default=0.0, help="of each training; 0 counts processor time")
     parser.add_argument("--pairs", type=int, default=4)
     typed = parser.parse_args()
     with TemporaryDirectory() as folder:
         if typed.minutes:
-            trained(Path(folder), typed.minutes, typed.pairs)
+            train(Path(folder), typed.minutes, typed.pairs)
         else:
-            counted(Path(folder))
+            count(Path(folder))
 
 
 if __name__ == "__main__":

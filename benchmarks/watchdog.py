@@ -1,10 +1,8 @@
-"""Why an arm's cycle has a process of its own: how late 1 kHz is in a thread and in a process beside a busy policy.
+"""Measure the lateness of a 1 kHz cycle in a thread and in a process beside a busy policy.
 
-    python benchmarks/watchdog.py
-
-Prints a table of docs/safety.md. The cycle asks the clock and sleeps until its next millisecond; late is what it woke
-up after that. It does no work, so an arm's own cycle is later rather than earlier. The lateness of a process is the
-machine's; that of a thread is what Python's lock adds.
+`python benchmarks/watchdog.py` prints the table of benchmarks/results/watchdog.md. The cycle sleeps until its next
+millisecond; the delay of its wake-up is its lateness. It does no work, so the cycle of an arm is rather later. The
+lateness in a process comes from the machine; in a thread, Python's interpreter lock adds to it.
 """
 
 import multiprocessing
@@ -17,7 +15,7 @@ SECONDS = 3.0
 
 
 def cycle(end: float, out) -> None:
-    """Wake up every millisecond until `end`; put how late, s, into out."""
+    """Wake up every millisecond until `end`; append the lateness, s, to out or send it."""
     due, late = time.perf_counter(), []
     while due < end:
         due = max(due, time.perf_counter() - 1e-3) + 1e-3
@@ -27,18 +25,18 @@ def cycle(end: float, out) -> None:
 
 
 def rest(end: float) -> None:
-    """Do nothing."""
+    """Sleep."""
     time.sleep(max(0.0, end - time.perf_counter()))
 
 
 def spin(end: float) -> None:
-    """Be busy in Python, which hands over its lock every 5 ms."""
+    """Compute in Python, which releases the lock every 5 ms."""
     while time.perf_counter() < end:
         pass
 
 
 def compiled(end: float) -> None:
-    """Be busy in one call of C that keeps Python's lock, for about 0.3 s at a time."""
+    """Compute in C calls of about 0.3 s that hold the lock."""
     size = 2**18
     while time.perf_counter() < end:
         began = time.perf_counter()
