@@ -1,7 +1,7 @@
 """`hydra/launcher=ray`: the jobs of a sweep as Ray tasks, on this machine or on a cluster.
 
-Hydra finds launchers in this namespace. Ray begins a job again where its worker or its node died; only a job with
-only_missing=true may be, for it goes on in its run folder, where any other would be done twice.
+Hydra finds launchers in this namespace. If a worker or node dies, Ray restarts jobs with skip_completed=true, which
+continue in their run folder; other jobs would run twice.
 """
 
 import os
@@ -22,11 +22,9 @@ class RayLauncher(Launcher):
     """One task per job.
 
     Args:
-        address: of a cluster's head, "auto" for the one that this machine is in; None: Ray is started here, for this
-            sweep.
-        num_cpus: processors that a job takes, and its threads.
-        num_gpus: graphics processors, or a share of one.
-        retries: how often a job whose worker or node died is begun again.
+        address: of a cluster's head, "auto" for the cluster of this machine; None: start Ray for this sweep.
+        num_cpus, num_gpus: per job; shares of a GPU are possible.
+        retries: restarts of a job whose worker or node died.
     """
 
     def __init__(self, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0, retries: int = 3):
@@ -34,11 +32,11 @@ class RayLauncher(Launcher):
         self.each = {"num_cpus": num_cpus, "num_gpus": num_gpus}
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Take what Hydra gives a launcher."""
+        """Store the arguments of Hydra."""
         self.context, self.task, self.config = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the jobs; return what came of each, in their order.
+        """Run the jobs; return their results in order.
 
         Raises:
             UserError: Ray is not installed, or there is no cluster at the address.
@@ -46,7 +44,7 @@ class RayLauncher(Launcher):
         from r2s.errors import UserError
 
         if self.address is None and "ray" not in sys.modules:
-            # Ray listens at all addresses of the machine: nobody gets in without this word
+            # Ray accepts connections on all addresses of the machine; this token protects it
             os.environ.setdefault("RAY_AUTH_MODE", "token")
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         try:
@@ -57,7 +55,7 @@ class RayLauncher(Launcher):
 
         own = not ray.is_initialized()
         paths = [str(Path(__file__).parent.parent), os.getcwd(), os.environ.get("PYTHONPATH", "")]
-        os.environ["PYTHONPATH"] = os.pathsep.join(p for p in paths if p)  # of workers that are started here
+        os.environ["PYTHONPATH"] = os.pathsep.join(p for p in paths if p)  # of the workers on this machine
         try:
             if own:
                 ray.init(self.address, include_dashboard=False, logging_level="ERROR")
@@ -67,7 +65,7 @@ class RayLauncher(Launcher):
             shared = ray.put((self.context, self.config, self.task, Singleton.get_state(), os.getcwd()))
             tasks = []
             for k, overrides in enumerate(job_overrides):
-                again = self.retries if self._only_missing(overrides) else 0
+                again = self.retries if self._resumable(overrides) else 0
                 task = ray.remote(execute).options(max_retries=again, **self.each)
                 tasks.append(task.remote(initial_job_idx + k, list(overrides), shared))
             return [_result(task, overrides) for task, overrides in zip(tasks, job_overrides, strict=True)]
@@ -75,18 +73,18 @@ class RayLauncher(Launcher):
             if own:
                 ray.shutdown()
 
-    def _only_missing(self, overrides: Sequence[str]) -> bool:
-        return bool(self.context.config_loader.load_sweep_config(self.config, list(overrides)).only_missing)
+    def _resumable(self, overrides: Sequence[str]) -> bool:
+        return bool(self.context.config_loader.load_sweep_config(self.config, list(overrides)).skip_completed)
 
 
 def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, str]:
-    """Run one job in a worker; return what came of it and what it noted for the end of the sweep."""
+    """Run one job in a worker; return its result and its errors, a line each."""
     from hydra.core.hydra_config import HydraConfig
     from hydra.core.singleton import Singleton
     from hydra.core.utils import run_job, setup_globals
 
     context, config, task, state, at = shared
-    if Path(at).is_dir():  # where relative paths, such as root=runs, were meant
+    if Path(at).is_dir():  # the working folder of relative paths such as root=runs
         os.chdir(at)
     sys.path.append(at)
     setup_globals()
@@ -96,7 +94,7 @@ def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, 
         sweep.hydra.job.id, sweep.hydra.job.num = f"{sweep.hydra.job.name}_{number}", number
     HydraConfig.instance().set_config(sweep)
     with TemporaryDirectory() as folder:
-        failed = Path(folder) / "failed.txt"  # the sweep's own is on another machine, perhaps
+        failed = Path(folder) / "failed.txt"  # the file of the sweep may be on another machine
         os.environ["R2S_FAILED"] = str(failed)
         done = run_job(
             hydra_context=context,
@@ -109,12 +107,12 @@ def execute(number: int, overrides: list[str], shared: Any) -> tuple[JobReturn, 
 
 
 def _result(task: Any, overrides: Sequence[str]) -> JobReturn:
-    """Wait for a job; one that is lost with its worker is noted as failed, and leaves the others alone."""
+    """Wait for a job; a job that is lost with its worker counts as failed and does not stop the others."""
     import ray
 
     try:
         done, noted = ray.get(task)
-    except ray.exceptions.RayTaskError:  # the job's own exception: a fault of the program, with its trace
+    except ray.exceptions.RayTaskError:  # an exception of the job itself
         raise
     except ray.exceptions.RayError as error:
         words = " ".join(str(error).split())[:300]

@@ -1,7 +1,7 @@
-"""`r2s list`, `r2s look` and `r2s export`: commands that read run folders. They compose no config and open no run
-folder.
-"""
+"""`r2s list`, `r2s look` and `r2s export`: commands that read run folders; they compose no config."""
 
+import os
+import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ PORT = 9090
 
 
 class Parser(ArgumentParser):
-    """A parser that says a mistake as the rest of the command line does."""
+    """A parser whose errors are UserErrors."""
 
     def error(self, message: str) -> NoReturn:
         """Raise UserError."""
@@ -21,29 +21,24 @@ class Parser(ArgumentParser):
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Do what was typed.
-
-    Args:
-        words: the command and its arguments.
+    """Run a command, given as words with its arguments.
 
     Raises:
-        UserError: it cannot be done.
+        UserError: a wrong argument or run folder.
     """
     parser = Parser(prog="r2s")
     commands = parser.add_subparsers(dest="command", required=True)
-    listing = commands.add_parser("list", help="the runs there are: status, what came of them, age")
-    listing.add_argument("--root", default="runs", help="where run folders live")
+    listing = commands.add_parser("list", help="table of runs: status, result, age")
+    listing.add_argument("--root", default="runs", help="folder of all runs")
     listing.add_argument("--stage", help="only runs of this stage")
-    listing.add_argument("--failed", action="store_true", help="only what failed or was killed")
-    looking = commands.add_parser("look", help="the viewer on one run, or on several side by side")
+    listing.add_argument("--failed", action="store_true", help="only failed and killed runs")
+    looking = commands.add_parser("look", help="viewer on one run, or on several side by side")
     looking.add_argument("run", nargs="+", type=Path, metavar="RUN", help="a run folder")
     looking.add_argument("--web", action="store_true", help="serve the viewer to a browser on this computer")
-    looking.add_argument(
-        "--port", type=int, default=PORT, help=f"of --web, {PORT} unless told; the next one is used too"
-    )
-    exporting = commands.add_parser("export", help="a policy that travels: a bundle that runs without r2s")
-    exporting.add_argument("run", type=Path, metavar="RUN", help="the run folder of a finished training")
-    exporting.add_argument("--to", type=Path, help="the new folder, also to=FOLDER; RUN/bundle unless told")
+    looking.add_argument("--port", type=int, default=PORT, help=f"of --web, default {PORT}; also uses the next one")
+    exporting = commands.add_parser("export", help="bundle of a policy, which runs without r2s")
+    exporting.add_argument("run", type=Path, metavar="RUN", help="run folder of a finished training")
+    exporting.add_argument("--to", type=Path, help="new folder, also to=FOLDER; default RUN/bundle")
     typed, unknown = parser.parse_known_args([f"--{w}" if w.startswith("to=") else w for w in words])
     if unknown:
         own = commands.choices[typed.command].format_usage().replace("[", " ").replace("]", " ").split()
@@ -73,10 +68,10 @@ def list_runs(typed: Namespace) -> None:
 
 
 def look(typed: Namespace) -> None:
-    """Open the viewer; without a screen say so and write PNGs."""
-    from r2s.reporting.look import has_screen, open_native, show_in_browser, side_by_side
+    """Open the viewer; without a screen print the paths of the figures."""
+    from r2s.reporting.viewer.look import has_screen, open_native, show_in_browser, side_by_side
 
-    folders = [whole_run(run) for run in typed.run]
+    folders = [viewable(run) for run in typed.run]
     robot = robot_of(folders)
     recording, pictures = folders[0] / "recording.rrd", sorted((folders[0] / "figures").glob("*.png"))
     if len(folders) > 1:
@@ -91,7 +86,7 @@ def look(typed: Namespace) -> None:
     elif has_screen():
         open_native([recording])
     else:
-        print(f"no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); --web serves {recording} to a browser")
+        print(f"no screen (neither DISPLAY nor WAYLAND_DISPLAY is set); --web serves {recording} to a browser")
         for path in pictures:
             print(f"  {path}")
 
@@ -103,40 +98,31 @@ def export(typed: Namespace) -> None:
     from r2s.stages.build import CONF, is_learner, make_dynamics, make_robot, make_task, plain
     from r2s.stages.transfer import trained_config
 
+    sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
     source, trained = trained_config(Namespace(policy=typed.run), "export")
     if not is_learner(trained):
-        raise UserError(f"export: {source} is of algo={trained.algo.name}, which is no network that could travel")
+        raise UserError(f"export: algo={trained.algo.name} has no network to export ({source})")
     robot = make_robot(trained)
     center = make_dynamics(trained, robot)
     task = make_task(trained, robot, center)
     policy, to = load_policy(source, robot, task), typed.to or source / "bundle"
-    if policy.told:
-        raise UserError(f"export: the policy of {source} is told of its arm by an adapter, which no bundle has")
     places = [path.stem for group in ("simulator", "arm") for path in (CONF / group).glob("*.yaml")]
     write_bundle(to, source, robot, task, center, policy, plain(trained), places)
     print(f"written: {to}")
 
 
-def whole_run(folder: Path) -> Path:
-    """Return a run folder that has something to look at.
-
-    Raises:
-        UserError: it has not.
-    """
+def viewable(folder: Path) -> Path:
+    """Return a run folder with a recording; raise UserError if it has none."""
     if (folder / "recording.rrd").is_file():
         return folder
     if (folder / "meta.json").is_file():
-        raise UserError(f"look: {folder} has no recording.rrd; it was stopped before its end")
+        raise UserError(f"look: {folder} has no recording.rrd; the run did not reach its end")
     names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
     raise UserError(f"look: '{folder}' is no run folder{nearest(folder.name, names)}")
 
 
 def robot_of(folders: Sequence[Path]):
-    """Return the robot of all these runs.
-
-    Raises:
-        UserError: they have different ones.
-    """
+    """Return the robot of the runs; raise UserError if they have different ones."""
     from omegaconf import OmegaConf
 
     from r2s.stages.build import make_robot
@@ -144,5 +130,5 @@ def robot_of(folders: Sequence[Path]):
     configs = [OmegaConf.load(folder / "config.yaml") for folder in folders]
     for folder, cfg in zip(folders, configs, strict=True):
         if cfg.robot != configs[0].robot:
-            raise UserError(f"look: {folder} is of another robot than {folders[0]}; look at them one by one")
+            raise UserError(f"look: {folder} has another robot than {folders[0]}; view them one by one")
     return make_robot(configs[0])

@@ -1,9 +1,9 @@
-"""`njit` and `cfunc` of numba, with a rule for when what they keep between processes is compiled again.
+"""numba's `njit` and `cfunc` with a compilation cache that follows changes across modules.
 
-numba keeps a compiled function beside its source and compiles it again when that file has changed. A function holds
-the code of those that it calls, though, and those lie in other files: the driver's cycle (arm/driver.py) would go on
-with the limits (physics/limits.py) of yesterday. Here all compiled code of the function's room and of
-`physics` counts as its source, so any change there compiles both again. Compiled code calls no other room's.
+numba caches a compiled function beside its source and recompiles it when that file changes. But the cached code also
+contains the functions that it calls, and those may lie in other files: after a change in physics/safety_filter.py,
+numba would run arm/driver.py with the old filter. So here the source of a compiled function is all compiled code of
+its room and of `physics`. Compiled code must not call functions of any other room.
 """
 
 import hashlib
@@ -19,17 +19,21 @@ PACKAGE = Path(__file__).parent
 
 @cache
 def _sources(room: Path) -> bytes:
-    """Return a hash of the compiled modules that a function in folder `room` can be made of."""
-    rooms = (room, PACKAGE / "physics") if PACKAGE in room.parents else (room,)
+    """Return a hash of the compiled modules that a function in folder `room` may contain."""
+    if PACKAGE in room.parents:  # a sub-room counts as part of its room
+        names = room.relative_to(PACKAGE).parts[0], "physics"
+        paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
+    else:
+        paths = set(room.glob("*.py"))
     found = hashlib.sha256()
-    for path in sorted({path for r in rooms for path in r.glob("*.py")}):
+    for path in sorted(paths):
         if b"r2s.compiled" in (text := path.read_bytes()):
             found.update(path.name.encode() + text)
     return found.digest()
 
 
 class _Sources:
-    """The part of a numba cache locator that says of which source a compiled function is."""
+    """A numba cache locator's source stamp, extended by the hash of `_sources`."""
 
     _py_file: str
 
@@ -38,16 +42,16 @@ class _Sources:
 
 
 class Provided(_Sources, UserProvidedCacheLocator):
-    """In the folder that NUMBA_CACHE_DIR names."""
+    """Cache in the folder NUMBA_CACHE_DIR."""
 
 
 class Beside(_Sources, InTreeCacheLocator):
-    """In `__pycache__` beside the source."""
+    """Cache in `__pycache__` beside the source."""
 
 
-class Kept(_Sources, UserWideCacheLocator):
-    """In the user's cache folder, where the source's own cannot be written."""
+class UserWide(_Sources, UserWideCacheLocator):
+    """Cache in the user's cache folder, for a read-only installation."""
 
 
-_own = ",".join(f"{__name__}.{kind.__name__}" for kind in (Provided, Beside, Kept))
+_own = ",".join(f"{__name__}.{kind.__name__}" for kind in (Provided, Beside, UserWide))
 config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""How a run ends that cannot go on: a user's mistake is one line and exit status 2, a stopped arm one and 3."""
+"""Exceptions that end a run with one line of text: exit status 2 for a user's mistake, 3 for a stopped arm."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -6,34 +6,34 @@ from numbers import Integral, Real
 
 
 class UserError(ValueError):
-    """Says what was wrong, the value seen, what is allowed and the nearest match, in one line."""
+    """A wrong input: one line with the option or file, the expected value, the value found and the nearest match."""
 
 
-class Stopped(Exception):  # noqa: N818 (an arm that stops is not a bug)
-    """An arm was stopped, and nobody said that it may move again: the run keeps what it has, and ends as stopped."""
+class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
+    """The arm stopped and the operator did not resume: the run keeps its results and ends as stopped."""
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" for the closest of `allowed`, or "" where nothing is close."""
+    """Return "; did you mean 'x'?" for the closest of the allowed names, or "" if none is close."""
     match = get_close_matches(name, [str(a) for a in allowed], n=1, cutoff=0.5)
     return f"; did you mean '{match[0]}'?" if match else ""
 
 
 def choices(allowed: Iterable[str]) -> str:
-    """Return the allowed names as "a, b, c" for an error message."""
+    """Return the allowed names as "a, b, c"."""
     return ", ".join(str(a) for a in allowed)
 
 
 def check_number(name: str, value: object, interval: str, whole: bool = False) -> None:
-    """Check one setting.
+    """Check that a setting is a number in an interval.
 
     Args:
         name, value: of the setting.
-        interval: where it may lie, written as in "(0, 1]".
-        whole: it must be an integer.
+        interval: the allowed range, such as "(0, 1]".
+        whole: require an integer.
 
     Raises:
-        UserError: it is no such number.
+        UserError: the value is not such a number.
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):
@@ -41,4 +41,4 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
         if (low < x or (x == low and interval[0] == "[")) and (x < high or (x == high and interval[-1] == "]")):
             return
     kind = "whole number" if whole else "number"
-    raise UserError(f"{name}: {value!r} is not allowed; a {kind} in {interval} is")
+    raise UserError(f"{name}: expected a {kind} in {interval}, got {value!r}")

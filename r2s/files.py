@@ -1,4 +1,4 @@
-"""Files that are there only once they are whole, and those that come with r2s."""
+"""Atomic file writes, and paths of the files that come with the package."""
 
 import os
 import zipfile
@@ -8,28 +8,28 @@ from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
 
-# what reading an array file raises that is cut off, altered, or another thing
+# Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated, altered or foreign array file.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
-    SyntaxError, TokenError,  # of an array's header, which NumPy reads as Python's words
+    SyntaxError, TokenError,  # NumPy parses an array's header as a Python literal
 )  # fmt: skip
-OWN = "r2s:"  # a path that begins so is one of the package's own files, wherever that is installed
+OWN = "r2s:"  # prefix of paths inside the package
 
 
 def located(path: str | os.PathLike) -> Path:
-    """Return where a file is: `r2s:models/panda.xml` in the package, everything else as it is."""
+    """Return the path of a file; `r2s:models/panda.xml` is a file of the package."""
     name = os.fspath(path)
     return Path(__file__).parent / name.removeprefix(OWN) if name.startswith(OWN) else Path(name)
 
 
 @contextmanager
-def whole(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a path beside `path` to write to; it takes the name `path` when the block has ended well.
+def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path and rename it to `path` at the end of the block.
 
-    A block that fails, or a process that is killed in it, leaves what was at `path` as it was.
+    If the block raises or the process is killed, the file at `path` keeps its old content.
     """
     path = Path(path)
-    part = path.with_name(f"{path.stem}.part{path.suffix}")  # the suffix stays: some libraries go by it
+    part = path.with_name(f"{path.stem}.part{path.suffix}")  # some libraries choose the format by the suffix
     try:
         yield part
         os.replace(part, path)

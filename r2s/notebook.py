@@ -1,4 +1,4 @@
-"""For notebooks: run a command of r2s, and look at what it left, in the cell below."""
+"""For notebooks: run a command of r2s and show its figures."""
 
 import os
 import re
@@ -10,14 +10,14 @@ from pathlib import Path
 
 from r2s.errors import UserError
 
-PLAIN = "R2S_FIGURES"  # in the environment: figures also where the viewer could be shown
+FIGURES_ONLY = "R2S_FIGURES"  # environment variable: show figures instead of the viewer
 
 
 def r2s(*words: str) -> Path:
     """Run `r2s WORDS`, print its table, and return its run folder.
 
     Raises:
-        UserError: what it says itself.
+        UserError: the command fails; with its error.
     """
     command = [sys.executable, "-m", "r2s", *words]
     env = os.environ | {
@@ -28,22 +28,22 @@ def r2s(*words: str) -> Path:
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise UserError(lines[-1].removeprefix("error: ") if lines else f"exit status {done.returncode}")
-    out = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # bold and dim, which some pages show as they are
+    out = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # escape sequences of bold and dim, which some pages print
     print("\n".join(line.rstrip() for line in out.splitlines()))
     return Path(re.findall(r"^written: (\S+)", out, flags=re.M)[-1])
 
 
 def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520) -> None:
-    """Show a run in the rerun viewer within the notebook; without `rerun-notebook` show its figures.
+    """Show a run in the rerun viewer in the notebook; without the package rerun-notebook show its figures.
 
     Args:
-        folder: of the run. figures: names of those that are shown, such as "torque"; none: all.
-        width, height: of the viewer, or of a figure at most, in pixels.
+        folder: of the run. figures: names such as "torque"; none: all.
+        width, height: pixels, of the viewer or at most of a figure.
     """
     from IPython.display import Image, display
 
     folder = Path(folder)
-    if find_spec("rerun_notebook") and not os.environ.get(PLAIN):
+    if find_spec("rerun_notebook") and not os.environ.get(FIGURES_ONLY):
         import rerun as rr
 
         stream = rr.RecordingStream(f"r2s notebook {folder.name}")
@@ -58,7 +58,7 @@ def look(folder: str | Path, *figures: str, width: int = 900, height: int = 520)
 
 
 def _small(path: Path, width: int) -> bytes:
-    """Return a figure as PNG of so many pixels and few colours: a notebook keeps what it shows."""
+    """Return a figure as a PNG of this width with 64 colors: notebooks store what they show."""
     from PIL import Image
 
     with Image.open(path) as picture:

@@ -1,4 +1,4 @@
-"""How far long work is, how long it took and how long it still takes."""
+"""Progress of long computations: share done, elapsed time and time left."""
 
 import atexit
 import time
@@ -10,31 +10,31 @@ from rich.table import Column
 
 
 class Progress:
-    """On a terminal a bar in one line; elsewhere a plain line every `every_s` seconds."""
+    """A progress bar on a terminal; elsewhere a line of text every `every_s` seconds."""
 
     def __init__(self, label: str, every_s: float = 10.0):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
         if self._console.is_terminal:
-            text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=True, ratio=1))
-            times = TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left")
             columns = (
                 TextColumn("{task.description}", markup=False),
                 BarColumn(20),
                 TaskProgressColumn(),
-                *times,
-                text,
+                TimeElapsedColumn(),
+                TimeRemainingColumn(compact=True),
+                TextColumn("left"),
+                TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
             )
-            # drawn by calls alone: a question to the operator stands while nothing moves
-            quiet = {"auto_refresh": False, "redirect_stdout": False, "transient": True}
-            self._bar = Bar(*columns, console=self._console, expand=True, **quiet)  # type: ignore[arg-type]
+            # Without automatic refresh the bar does not overwrite a prompt to the operator.
+            options = {"auto_refresh": False, "redirect_stdout": False, "transient": True}
+            self._bar = Bar(*columns, console=self._console, expand=True, **options)  # type: ignore[arg-type]
             self._task = self._bar.add_task(label, total=1.0, text="")
             self._bar.start()
-            atexit.register(self._bar.stop)  # work that fails leaves its error and the cursor
+            atexit.register(self._bar.stop)  # restores the cursor after an exception
 
     def __call__(self, share: float, text: str = "") -> None:
-        """Show that `share` (0 to 1) of the work is done, with a rate or result in `text`."""
+        """Show that `share` (0 to 1) of the work is done, followed by `text`."""
         now = time.perf_counter()
         if now - self._shown < (0.2 if self._bar else self._every):
             return
@@ -44,16 +44,16 @@ class Progress:
         else:
             elapsed = now - self._began
             left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
-            self._say(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}")
+            self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:
-        """End with what came of it."""
+        """Print the elapsed time and the result in `text`."""
         if self._bar:
             self._bar.stop()
             atexit.unregister(self._bar.stop)
-        self._say(f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}")
+        self._print(f"{self._label} done in {clock(time.perf_counter() - self._began)}  {text}")
 
-    def _say(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         self._console.print(line.rstrip())
 
 

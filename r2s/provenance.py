@@ -1,4 +1,4 @@
-"""Where a result comes from: commit, versions, machine, and digests of files."""
+"""Provenance of a result: git commit, package versions, machine and file digests."""
 
 import hashlib
 import os
@@ -8,45 +8,35 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = (
-    "mujoco",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "hydra-core",
-    "pymoo",
-    "dartpy",
-    "numba",
-    "numpy",
-    "scipy",
-)
+# The packages that numerical results depend on.
+PACKAGES = ("mujoco", "torch", "torchrl", "tensordict", "hydra-core", "pymoo", "dartpy", "numba", "numpy", "scipy")
 
 
 def sha256(path: str | Path) -> str:
-    """Return the hex digest of a file."""
+    """Return the SHA-256 digest of a file in hex."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def git() -> dict[str, Any]:
-    """Return the commit of the checkout, and whether it has changes; None where there is none."""
+    """Return the commit of the checkout and whether it has changes; None if r2s runs outside its checkout."""
     root = Path(__file__).parent.parent
-    if not (root / ".git").exists():  # installed, perhaps within somebody else's repository
+    if not (root / ".git").exists():  # an installed r2s may lie inside another project's repository
         return {"commit": None, "dirty": None}
 
-    def ask(*words: str) -> str | None:
+    def run(*arguments: str) -> str | None:
         try:
-            done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=10)
+            done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    changes = ask("status", "--porcelain")
-    return {"commit": ask("rev-parse", "HEAD"), "dirty": None if changes is None else bool(changes)}
+    changes = run("status", "--porcelain")
+    return {"commit": run("rev-parse", "HEAD"), "dirty": None if changes is None else bool(changes)}
 
 
 def packages() -> dict[str, str | None]:
-    """Return the versions of the packages that results depend on, and of Python."""
+    """Return the versions of PACKAGES and of Python; None for a package that is not installed."""
 
     def version_of(package: str) -> str | None:
         try:
@@ -58,12 +48,12 @@ def packages() -> dict[str, str | None]:
 
 
 def machine() -> dict[str, Any]:
-    """Return processor, cores and system of this computer."""
+    """Return processor, number of cores and operating system."""
     return {"cpu": cpu(), "cores": os.cpu_count(), "system": platform.platform(terse=True)}
 
 
 def cpu() -> str:
-    """Return what the processor calls itself."""
+    """Return the processor's model name."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

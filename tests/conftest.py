@@ -30,6 +30,9 @@ def conf(path: str) -> dict:
     """Read one file of conf/ as plain YAML: the arguments of what its `_target_` names, for the Panda."""
     document = yaml.safe_load((ROOT / "conf" / f"{path}.yaml").read_text())
     group = path.split("/")[0]
+    if group == "algo":
+        bases = [conf(f"algo/{name}") for name in document.get("defaults", [])]
+        document = {k: v for one in (*bases, document) for k, v in one.items()}
     if group == "task":
         panda = yaml.safe_load((ROOT / "conf/robot/panda.yaml").read_text())
         document = OmegaConf.to_container(OmegaConf.create({"robot": panda, "task": document}), resolve=True)["task"]

@@ -170,7 +170,7 @@ def test_a_delayed_environment_is_the_same_one_later(panda, still):
             state["action"] = torch.from_numpy(action)
             state = env.step(state)["next"].exclude("reward")
             assert not env.arms.sim.limited.any()
-            rows.append(np.concatenate([env.arms.sim.q, env.arms.sim.dq, env.arms.actuation.last], 1))
+            rows.append(np.concatenate([env.arms.sim.q, env.arms.sim.dq, env.arms.sim.effort], 1))
         return np.array(rows)
 
     prompt, late = states(still), states(replace(still, delay=task.substeps * SIM_DT))

@@ -1,4 +1,4 @@
-"""Identification at work: balance and estimate are exact, intervals widen at rest, sudden changes are seen."""
+"""Estimates of a working arm: residual and estimate are exact, intervals widen at rest, payload changes are found."""
 
 from dataclasses import replace
 from functools import cache
@@ -8,26 +8,33 @@ import pandas as pd
 import pytest
 from conftest import conf
 
-from r2s.adaptation.balance import SPAN, Balance
-from r2s.adaptation.believed import believed
-from r2s.adaptation.estimator import Estimator, body
-from r2s.adaptation.kalman import BODY, TAME, Filter, update
-from r2s.adaptation.listen import at_rate, learn, listen, table
-from r2s.adaptation.momentum import WIDE, momentum
-from r2s.adaptation.noise import balances, learnt, noise_of
-from r2s.adaptation.refinement import Beyond, beyond, corrected, refined
+from r2s.adaptation.arm_model import make_arm_model
+from r2s.adaptation.estimator import Estimator, nearest_body
+from r2s.adaptation.kalman import Filter, update
+from r2s.adaptation.model_correction import (
+    ModelCorrection,
+    apply_correction,
+    corrected_residuals,
+    fit_model_correction,
+)
+from r2s.adaptation.momentum import BODY, MOMENTUM_WORK, MomentumTerms, momentum
+from r2s.adaptation.momentum_residual import MomentumResidual
+from r2s.adaptation.noise_model import default_noise, fit_noise, momentum_residuals
+from r2s.adaptation.offline_estimation import at_rate, estimate_recording, fit_correction, table
+from r2s.adaptation.payload_jump import MEAN
+from r2s.adaptation.tuning import HUBER, SPAN
 from r2s.errors import UserError
 from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.newton_euler import MASS, WORK, equations, links_of
-from r2s.physics.payload import carrying, loaded, moment, payload_of
+from r2s.physics.payload import dynamics_with_payload, mass_and_moment, payload_of, with_payload
 from r2s.physics.rigid_body import LinkInertia
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-THING = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
+PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
 DELAY = 3e-3
 
 
@@ -38,73 +45,76 @@ def robot():
 
 @cache
 def truth():
-    """Return friction without a dead zone, which no model hides anything behind, and a delay."""
+    """Return dynamics with friction, a delay, and no stiction that could hide a torque."""
     found = nominal_dynamics(robot(), **conf("friction/paper"))
     return replace(found, delay=DELAY, breakaway=np.zeros((7, 2)), offset=np.zeros(7))
 
 
 @cache
 def recording(on=None, off=None, seconds=3.0, noise=0.0):
-    """Return what an arm of known truth does under swinging torques and a spring to home; payload from on to off."""
+    """Return the motion of a known arm under a spring to a swinging goal; with the payload from `on` to `off`."""
     rng = np.random.default_rng(1)
-    sims = {False: truth(), True: loaded(robot(), truth(), THING)}
+    sims = {False: truth(), True: dynamics_with_payload(robot(), truth(), PAYLOAD)}
     sim, motors = Simulator(robot(), sims[False], 1, 1), Motors(1, 7, DELAY)
     sim.reset(robot().q_home[None], np.zeros((1, 7)))
     spring = np.array([60, 120, 60, 60, 10, 10, 5.0])
     phase, rate = rng.uniform(0, 6, 7), rng.uniform(3, 6, 7)
-    rows, holds = [], False
+    rows, carries = [], False
     for k in range(round(seconds / SIM_DT)):
         t = k * SIM_DT
         now = on is not None and on <= t < (np.inf if off is None else off)
-        if now != holds:
+        if now != carries:
             sim.set_dynamics(sims[now])
-            holds = now
+            carries = now
         q, dq = sim.q[0].copy(), sim.dq[0].copy()
         goal = robot().q_home + 0.5 * np.sin(rate * t + phase) * min(1.0, t)
         tau = spring * (goal - q) - 0.15 * spring * dq
-        seen = dq + noise * rng.normal(size=7)
-        rows.append((q, seen, tau))
+        rows.append((q, dq + noise * rng.normal(size=7), tau))
         sim.rollout(motors(tau[None, None]), record=())
     q, dq, tau = (np.array(x) for x in zip(*rows, strict=True))
     return Recording(t=SIM_DT * np.arange(len(q)), q=q, dq=dq, tau=tau, torque="commanded")
 
 
-def standard(thing):
-    return LinkInertia(thing.mass, thing.centre, thing.inertia).standard()
+def standard(payload):
+    """Return its ten inertial parameters."""
+    return LinkInertia(payload.mass, payload.centre, payload.inertia).standard()
 
 
-def held(arm, q):
+def terms_of(arm, q, dq):
+    """Return the `MomentumTerms` of an arm."""
+    terms = MomentumTerms.empty(7)
+    momentum(arm, q, dq, terms, np.empty((7, MOMENTUM_WORK)))
+    return terms
+
+
+def holding_torque(arm, q):
     """Return (7,) Nm that hold an arm with the payload at q."""
-    out = [np.empty(7) for _ in range(4)] + [np.empty((7, BODY)) for _ in range(2)]
-    momentum(arm.links, arm.moments, arm.hand, arm.gravity, arm.armature, q, 0 * q, np.empty((7, WIDE)), *out)
-    return -out[-1] @ standard(THING)
+    return -terms_of(arm, q, 0 * q).payload_torque @ standard(PAYLOAD)
 
 
-def listener(arm, free):
-    """Return the estimator of an arm with what these balances without a payload say."""
-    more, noise = learnt(robot(), arm, None, free, free)
-    return Estimator(refined(arm, more), noise)
+def estimator_of(arm, free):
+    """Return the estimator of an arm, corrected by residuals without a payload."""
+    correction, noise = fit_noise(robot(), arm, None, free, free)
+    return Estimator(apply_correction(arm, correction), noise)
 
 
-def quiet():
-    """Return the noise of a model that is nearly right."""
-    arm = believed(robot(), truth())._replace(edge=np.array([1.0, 1, 1, 1, 0.5, 0.5, 0.5]))
-    none = noise_of(arm)
+def accurate():
+    """Return a nearly exact model and its noise."""
+    arm = make_arm_model(robot(), truth())._replace(breakaway=np.array([1.0, 1, 1, 1, 0.5, 0.5, 0.5]))
+    default, zero = default_noise(arm), np.zeros(7)
     small = {name: 0.01 * arm.level for name in ("white", "model")}
-    zero = np.zeros(7)
-    prior = none.prior.copy()
+    small |= {"momentum_share": zero + 1e-3, "reversal": zero + 0.01, "payload_friction": 1e-3, "payload_drift": 0.0}
+    prior = default.prior.copy()
     prior[BODY:] *= 0.1
-    return arm, none._replace(
-        **small, moving=zero + 1e-3, turning=zero + 0.01, loaded=1e-3, creeping=0.0, prior=prior
-    )
+    return arm, default._replace(**small, prior=prior)
 
 
 def test_momentum_is_mass_times_speed_and_linear_in_the_payload():
-    """It is p = M dq; push = C^T dq = dM/dt dq - C dq; the payload's columns add what the arm with it has more."""
+    """Momentum p = M dq, C^T dq = dM/dt dq - C dq; the payload's columns are the difference to the loaded arm."""
     r, rng = robot(), np.random.default_rng(0)
-    arm = believed(r, truth())
+    arm = make_arm_model(r, truth())._replace(armature=np.zeros(7))
     alone = links_of(r, r.mass, r.com, r.inertia)
-    full = links_of(r, *carrying(r, THING, (r.mass, r.com, r.inertia)))
+    full = links_of(r, *with_payload(r, PAYLOAD, (r.mass, r.com, r.inertia)))
     q, dq = r.q_home + 0.3 * rng.normal(size=7), rng.normal(size=7)
 
     def of(links, q):
@@ -114,92 +124,89 @@ def test_momentum_is_mass_times_speed_and_linear_in_the_payload():
         equations(links, r.gravity, q, 0 * dq, np.empty((7, 7)), still, np.empty((7, WORK)))
         return mass, bias - still, still
 
-    def moved(links):
-        out = [np.empty(7) for _ in range(4)] + [np.empty((7, BODY)) for _ in range(2)]
-        momentum(links, arm.moments, arm.hand, arm.gravity, np.zeros(7), q, dq, np.empty((7, WIDE)), *out)
-        return out
-
-    p, push, pull, weight, payload_p, payload_push = moved(alone)
-    p_full, push_full, pull_full, _, _, _ = moved(full)
+    without, loaded_arm = (terms_of(arm._replace(links=links), q, dq) for links in (alone, full))
     mass, coriolis, still = of(full, q)
     step = 1e-6
     rate = (of(full, q + step * dq)[0] - of(full, q - step * dq)[0]) / (2 * step)
-    np.testing.assert_allclose(p_full, mass @ dq, atol=1e-12)
-    np.testing.assert_allclose(push_full, rate @ dq - coriolis, atol=1e-7)  # of the difference: step^2
-    np.testing.assert_allclose(pull, 0.0, atol=1e-12)
-    np.testing.assert_allclose(weight + pull_full, still, atol=1e-12)
-    np.testing.assert_allclose(p + payload_p @ standard(THING), p_full, atol=1e-12)
-    np.testing.assert_allclose(push - pull + payload_push @ standard(THING), push_full - pull_full, atol=1e-12)
+    np.testing.assert_allclose(loaded_arm.p, mass @ dq, atol=1e-12)
+    np.testing.assert_allclose(
+        loaded_arm.coriolis, rate @ dq - coriolis, atol=1e-7
+    )  # error of the difference: step^2
+    np.testing.assert_allclose(without.uncompensated, 0.0, atol=1e-12)
+    np.testing.assert_allclose(without.compensated + loaded_arm.uncompensated, still, atol=1e-12)
+    np.testing.assert_allclose(without.p + without.payload_p @ standard(PAYLOAD), loaded_arm.p, atol=1e-12)
+    added, torque = without.payload_torque @ standard(PAYLOAD), loaded_arm.coriolis - loaded_arm.uncompensated
+    np.testing.assert_allclose(without.coriolis - without.uncompensated + added, torque, atol=1e-12)
 
 
 def test_the_estimate_from_data_of_known_truth_is_exact():
-    """A step of h s is wrong by half a step, h / 2 of each joint's torque rate; no estimate is off by more."""
-    arm, noise = quiet()
+    """A time step of h s causes errors of h / 2 times each joint's torque rate; no estimate is off by correction."""
+    arm, noise = accurate()
     data = recording(on=0.0)
     own = 0.5 * np.sqrt(np.mean(np.diff(data.tau, axis=0) ** 2, axis=0))  # Nm
-    rows = balances(arm, data)
-    slid = np.array([b.slides > 0 for b in rows])
-    error = np.array([b.y - b.payload @ standard(THING) for b in rows])
+    rows = momentum_residuals(arm, data)
+    slid = np.array([b.sliding > 0 for b in rows])
+    error = np.array([b.y - b.payload @ standard(PAYLOAD) for b in rows])
     assert (np.sqrt((slid * error**2).sum(0) / slid.sum(0)) < 2 * own).all()  # the payload's rate is not in tau's
     estimator = Estimator(arm, noise._replace(white=3 * own, model=own))
-    last = listen(robot(), estimator, data)[-1]
+    last = estimate_recording(robot(), estimator, data)[-1]
     assert abs(last.mass - 1.0) < own[1] / (9.81 * 0.4)  # kg, at 0.4 m from joint 2
-    np.testing.assert_allclose(last.centre, THING.centre, atol=own[5] / 9.81 + 1e-3)
+    np.testing.assert_allclose(last.centre, PAYLOAD.centre, atol=own[5] / 9.81 + 1e-3)
     assert (np.abs(last.friction - 1.0) < last.friction_half).all()
     assert last.friction_half.max() < 0.05
     assert estimator.changes == []
 
 
-def test_no_payload_is_no_alarm_and_no_mass():
-    arm, noise = quiet()
+def test_no_payload_gives_no_alarm_and_no_mass():
+    arm, noise = accurate()
     estimator = Estimator(arm, noise)
-    known = listen(robot(), estimator, recording())
+    estimates = estimate_recording(robot(), estimator, recording())
     assert estimator.changes == []
-    assert known[-1].mass < 4e-3
-    assert np.isnan(known[-1].centre).all()
+    assert estimates[-1].mass < 4e-3
+    assert np.isnan(estimates[-1].centre).all()
 
 
-def test_a_payload_put_on_or_taken_off_is_seen_within_a_fifth_of_a_second():
-    """With the noise of real speeds, and what that motion without a payload says of the noise."""
-    arm = believed(robot(), truth())
-    free = balances(arm, recording(noise=2e-3))
-    estimator = listener(arm, free)
-    known = listen(robot(), estimator, recording(on=1.0, off=2.0, noise=2e-3))
+def test_an_attached_or_removed_payload_is_detected_within_a_fifth_of_a_second():
+    """With the noise of real speeds, and a noise model fitted to motion without a payload."""
+    arm = make_arm_model(robot(), truth())
+    free = momentum_residuals(arm, recording(noise=2e-3))
+    estimator = estimator_of(arm, free)
+    estimates = estimate_recording(robot(), estimator, recording(on=1.0, off=2.0, noise=2e-3))
     assert len(estimator.changes) == 2
     for at, event in zip(estimator.changes, (1.0, 2.0), strict=True):
         assert event <= at <= event + 0.2
-    before = known[round(1.9 / (SPAN * SIM_DT))]
+    before = estimates[round(1.9 / (SPAN * SIM_DT))]
     assert abs(before.mass - 1.0) < before.mass_half < 0.1
-    assert abs(known[-1].mass) < known[-1].mass_half + 1e-9
+    assert abs(estimates[-1].mass) < estimates[-1].mass_half + 1e-9
 
 
 @pytest.mark.parametrize("on", [None, 0.0])
-def test_what_was_put_on_during_a_rest_is_told_as_soon_as_the_arm_moves(on):
-    """A rest lets the estimate go, so no sudden change has to explain it; without a payload nothing is told."""
-    arm = believed(robot(), truth())
-    free = balances(arm, recording(noise=2e-3))
-    estimator = listener(arm, free)
-    listen(robot(), estimator, recording(noise=2e-3))
+def test_a_payload_attached_at_rest_is_detected_as_soon_as_the_arm_moves(on):
+    """The variance grows at rest, so the change needs no jump; without a payload there is no alarm."""
+    arm = make_arm_model(robot(), truth())
+    free = momentum_residuals(arm, recording(noise=2e-3))
+    estimator = estimator_of(arm, free)
+    estimate_recording(robot(), estimator, recording(noise=2e-3))
     estimator.begin()
     for _ in range(600):
         estimator(robot().q_home, np.zeros(7), np.zeros(7))
     assert estimator.now.rests
     since = estimator.now.t
-    listen(robot(), estimator, recording(on=on, noise=2e-3))
+    estimate_recording(robot(), estimator, recording(on=on, noise=2e-3))
     assert len(estimator.changes) == (on is not None)
     assert all(since < at < since + 0.2 for at in estimator.changes)
 
 
-def test_a_gear_that_swings_is_no_torque():
-    """Speeds that swing at 55 Hz, as motors do behind elastic gears, leave what three means of T s leave of it.
+def test_a_vibrating_gear_is_no_torque():
+    """A vibration of the speeds at 55 Hz, as of motors behind elastic gears, passes three means over T s.
 
-    Between two moments T apart a swing of v rad/s changes momentum by up to 2 M v, so a torque of 2 M v / T comes and
-    goes. Means over T are sinc(f T) of a swing of f; three of them leave pi f T sinc(f T)^3 = 0.0025 of that. What
-    friction makes of the swing is not in it: that is of the order of its slope, 1 Nm s/rad, times v.
+    Between two moments T apart a vibration of v rad/s changes the momentum by up to 2 M v, a torque of 2 M v / T. A
+    mean over T leaves sinc(f T) of a vibration at f; three leave pi f T sinc(f T)^3 = 0.0025. Friction adds its
+    slope, about 1 Nm s/rad, times v.
     """
-    arm, data, v = believed(robot(), truth()), recording(), 0.03
+    arm, data, v = make_arm_model(robot(), truth()), recording(), 0.03
     swings = replace(data, dq=data.dq + v * np.sin(2 * np.pi * 55 * data.t)[:, None] * np.eye(7)[0])
-    plain, swung = (np.array([b.y[0] for b in balances(arm, d)]) for d in (data, swings))
+    plain, swung = (np.array([b.y[0] for b in momentum_residuals(arm, d)]) for d in (data, swings))
     mass, bias = np.empty((7, 7)), np.empty(7)
     own = links_of(robot(), robot().mass, robot().com, robot().inertia)
     equations(own, np.zeros(3), robot().q_home, np.zeros(7), mass, bias, np.empty((7, WORK)))
@@ -209,7 +216,7 @@ def test_a_gear_that_swings_is_no_torque():
 
 @cache
 def other(seed):
-    """Return an arm that is not quite as it is believed to be, and its motion."""
+    """Return the motion of an arm with other links, cables and load-dependent friction than its model."""
     n = 7
     found = replace(truth(), load=np.full(n, 0.01), drag=np.tile([0.1, -0.05], (n, 1)))
     found = replace(found, mass=1.01 * found.mass, com=found.com + 1e-3)
@@ -228,93 +235,100 @@ def other(seed):
     return Recording(t=SIM_DT * np.arange(len(q)), q=q, dq=dq, tau=tau, torque="commanded")
 
 
-def lacks(arm, rows):
-    """Return (7,) Nm, root mean square of what balances lack beside a share of friction and a constant."""
+def unexplained(arm, rows):
+    """Return (7,) Nm, root mean square of residuals beside a share of friction and a constant."""
     out = []
     for j in range(7):
-        own = np.array([[b.rub[j], 1.0, b.y[j]] for b in rows if b.slides[j] > 0])
+        own = np.array([[b.friction[j], 1.0, b.y[j]] for b in rows if b.sliding[j] > 0])
         found = np.linalg.lstsq(own[:, :2], own[:, 2], rcond=None)[0]
         out.append(np.sqrt(np.mean((own[:, 2] - own[:, :2] @ found) ** 2)))
     return np.array(out)
 
 
-def test_motion_without_a_payload_tells_what_the_identification_left():
-    """Friction that goes with the load, cables and other links are found: other motion lacks a fraction of it.
+def test_motion_without_a_payload_corrects_the_model():
+    """It finds load-dependent friction, cables and other links: residuals of other motion shrink to a fraction.
 
-    With what the truth is nothing lacks but what a step of h s is wrong by and the noise of the speeds.
+    With the true model only the error of the time step and the noise of the speeds remain.
     """
-    arm = believed(robot(), truth())
+    arm = make_arm_model(robot(), truth())
     found = replace(truth(), load=np.full(7, 0.01), drag=np.tile([0.1, -0.05], (7, 1)))
     found = replace(found, mass=1.01 * found.mass, com=found.com + 1e-3)
-    more = beyond(robot(), arm, balances(arm, other(1)))
-    before, after = lacks(arm, balances(arm, other(2))), lacks(arm, balances(refined(arm, more), other(2)))
-    floor = lacks(arm, balances(believed(robot(), found), other(2)))
+    correction = fit_model_correction(robot(), arm, momentum_residuals(arm, other(1)))
+    before, after = (
+        unexplained(arm, momentum_residuals(arm, other(2))),
+        unexplained(arm, momentum_residuals(apply_correction(arm, correction), other(2))),
+    )
+    floor = unexplained(arm, momentum_residuals(make_arm_model(robot(), found), other(2)))
     assert ((after**2 - floor**2) < 0.25**2 * (before**2 - floor**2)).all()
 
 
-def test_what_gears_give_is_told_from_motion_of_the_motors():
-    """Links behind springs of K Nm/rad go as motors do, less tau / K: motors that are as far ahead tell 1 / K.
+def test_motor_motion_gives_the_compliance_of_gears():
+    """Links behind springs of K Nm/rad follow their motors less tau / K; motors so far ahead give 1 / K.
 
-    The prior, of the size of 1 / K, holds it back by up to a quarter.
+    The prior, of the size of 1 / K, shrinks the result by up to a quarter.
     """
-    arm, data, K = believed(robot(), truth()), other(1), 1e4
+    arm, data, K = make_arm_model(robot(), truth()), other(1), 1e4
     late = round(DELAY / SIM_DT)
     felt = np.concatenate([np.zeros((late, 7)), data.tau[:-late]])
-    felt = np.apply_along_axis(np.convolve, 0, felt, np.full(5, 0.2), "same")  # without what noise does to commands
+    felt = np.apply_along_axis(np.convolve, 0, felt, np.full(5, 0.2), "same")  # removes the noise of the commands
     ahead = replace(data, q=data.q + felt / K, dq=data.dq + np.gradient(felt, SIM_DT, axis=0) / K)
-    gives = [beyond(robot(), arm, balances(arm, d)).gives for d in (data, ahead)]
-    np.testing.assert_allclose((gives[1] - gives[0])[:4], 1 / K, rtol=0.25)  # the wrist's links weigh too little
+    found = [fit_model_correction(robot(), arm, momentum_residuals(arm, d)).compliance for d in (data, ahead)]
+    np.testing.assert_allclose((found[1] - found[0])[:4], 1 / K, rtol=0.25)  # the wrist's links are too light
 
 
-def test_corrected_balances_are_those_of_the_refined_arm():
-    """What is worked out from means over 60 ms is what cycles give, to a twentieth of the correction."""
-    arm, data = believed(robot(), truth()), other(1)
-    rows = balances(arm, data)
-    more = beyond(robot(), arm, rows)
-    more = more._replace(inertia=np.zeros((7, 7)), late=np.zeros((7, 7)))
-    quick, exact = corrected(robot(), arm, more, rows), balances(refined(arm, more), data)
-    slides = np.array([b.slides > 0 for b in rows])
-    for name in ("y", "rub"):
-        plain, means, cycles = (np.array([getattr(b, name) for b in x])[slides] for x in (rows, quick, exact))
+def test_corrected_residuals_are_those_of_the_corrected_arm():
+    """Corrections of means over 60 ms equal a run through all cycles, to a twentieth of the correction."""
+    arm, data = make_arm_model(robot(), truth()), other(1)
+    rows = momentum_residuals(arm, data)
+    correction = fit_model_correction(robot(), arm, rows)
+    correction = correction._replace(inertia=np.zeros((7, 7)), latency=np.zeros((7, 7)))
+    quick = corrected_residuals(robot(), arm, correction, rows)
+    exact = momentum_residuals(apply_correction(arm, correction), data)
+    sliding = np.array([b.sliding > 0 for b in rows])
+    for name in ("y", "friction"):
+        plain, means, cycles = (np.array([getattr(b, name) for b in x])[sliding] for x in (rows, quick, exact))
         assert np.sqrt(np.mean((means - cycles) ** 2)) < 0.05 * np.sqrt(np.mean((plain - cycles) ** 2))
     none = arm.links.copy()
     none[4, MASS] = 0.0
-    for part in refined(arm._replace(links=none), beyond(robot(), arm._replace(links=none), rows)):
+    for part in apply_correction(
+        arm._replace(links=none), fit_model_correction(robot(), arm._replace(links=none), rows)
+    ):
         assert np.isfinite(part).all()
-    nothing = refined(arm, Beyond.none(7))
+    nothing = apply_correction(arm, ModelCorrection.none(7))
     for one, two in zip(arm, nothing, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-15)
 
 
 @pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 1.5), (3.0, 6.0, 12.0)])
-def test_what_surprises_for_long_is_taken_for_noise(times, low, high):
-    """Of white noise that is `times` as large as is known, the filter believes its square, give or take a third.
+def test_persistent_innovations_become_noise(times, low, high):
+    """White noise `times` as large as expected scales the variance by its square, give or take a third.
 
-    One joint's wavers by a fifth of it, for 25 spans or so: the mean of 7 joints and 1000 spans by a hundredth.
+    One joint's scale varies by a fifth over about 25 spans: the mean of 7 joints and 1000 spans by a hundredth.
     """
-    noise, rng = noise_of(believed(robot(), truth())), np.random.default_rng(0)
-    noise = noise._replace(prior=np.full_like(noise.prior, 1e-6), warming=0.0, drifting=np.zeros(7), creeping=0.0)
-    noise = noise._replace(model=np.zeros(7), turning=np.zeros(7), moving=np.zeros(7))
-    filter, b, rough = Filter.fresh(noise), Balance.empty(7), []
+    noise, rng = default_noise(make_arm_model(robot(), truth())), np.random.default_rng(0)
+    constant = {"friction_drift": 0.0, "offset_drift": np.zeros(7), "payload_drift": 0.0}
+    none = dict.fromkeys(("model", "reversal", "momentum_share"), np.zeros(7))
+    noise = noise._replace(prior=np.full_like(noise.prior, 1e-6), **constant, **none)
+    filter, b, scales = Filter.fresh(noise), MomentumResidual.empty(7), []
     for _ in range(1200):
         b.y[:] = times * noise.white * rng.standard_normal(7)
         update(filter, noise, b)
-        rough.append(filter.rough.copy())
-    assert low <= np.mean(rough[200:]) <= high
-    assert np.min(rough) >= 1.0
+        scales.append(filter.noise_scale.copy())
+    assert low <= np.mean(scales[200:]) <= high
+    assert np.min(scales) >= 1.0
     still = Filter.fresh(noise)
-    update(still, noise._replace(learning=0.0), b)
-    assert (still.rough == 1.0).all()
+    update(still, noise._replace(adaptation=0.0), b)
+    assert (still.noise_scale == 1.0).all()
 
 
-def test_what_is_far_off_moves_the_estimate_as_what_is_a_little_off():
-    """In proportion up to TAME standard deviations, beyond them no more; odds of a jump are at most z TAME / 2.
+def test_an_outlier_moves_the_estimate_no_more_than_huber_standard_deviations():
+    """In proportion up to HUBER standard deviations, and no more beyond; log odds of a jump are at most z HUBER / 2.
 
-    A scalar off by z of its S standard deviations gives at most z^2 / 2 of log likelihood, and S is z / TAME times as
-    large where that is above 1.
+    A scalar off by z standard deviations adds at most z^2 / 2 to the log likelihood, and its variance S grows by
+    z / HUBER if that is above 1.
     """
-    arm, noise = quiet()
-    rows = balances(arm, recording())
+    arm, noise = accurate()
+    rows = momentum_residuals(arm, recording())
 
     def after(z):
         filter = Filter.fresh(noise)
@@ -322,51 +336,51 @@ def test_what_is_far_off_moves_the_estimate_as_what_is_a_little_off():
             update(filter, noise, b)
         trial = Filter(*(a.copy() for a in filter))
         update(trial, noise, rows[60])
-        before, v, S = filter.x.copy(), trial.seen[0, 6], trial.seen[1, 6]
+        before, (v, S) = filter.x.copy(), trial.innovations[:, 6]
         b = rows[60]._replace(y=rows[60].y.copy())
         b.y[6] += z * np.sqrt(S) - v
         update(filter, noise, b)
-        others = np.sum(filter.seen[0, :6] ** 2 / filter.seen[1, :6])
-        return filter.x - before, filter.odds[0], others
+        others = np.sum(filter.innovations[0, :6] ** 2 / filter.innovations[1, :6])
+        return filter.x - before, filter.log_odds[MEAN], others
 
-    plain, near, far, farther = (after(z) for z in (0.0, 0.5 * TAME, 4 * TAME, 40 * TAME))
+    plain, near, far, farther = (after(z) for z in (0.0, 0.5 * HUBER, 4 * HUBER, 40 * HUBER))
     assert np.abs(far[0] - farther[0]).max() < 1e-9
     assert np.allclose(far[0] - plain[0], 2 * (near[0] - plain[0]), rtol=0.0, atol=1e-9)
-    assert farther[1] < 40 * TAME * TAME / 2 + farther[2]
+    assert farther[1] < 40 * HUBER * HUBER / 2 + farther[2]
 
 
 def test_an_interval_is_wide_at_rest_and_narrow_in_motion():
-    """At rest breakaway b at the lever r hides b / (r g): no interval is below the best joint's."""
-    arm, noise = quiet()
+    """At rest, breakaway b at the lever r hides b / (r g): no interval is smaller than the best joint's."""
+    arm, noise = accurate()
     estimator, data = Estimator(arm, noise), recording(on=0.0)
-    moving = listen(robot(), estimator, data)[-1]
-    for _ in range(1500):  # held where it is, against the payload's weight
-        estimator(data.q[-1], np.zeros(7), held(arm, data.q[-1]))
+    moving = estimate_recording(robot(), estimator, data)[-1]
+    for _ in range(1500):  # held against the payload's weight
+        estimator(data.q[-1], np.zeros(7), holding_torque(arm, data.q[-1]))
     resting = estimator.now
     assert resting.rests
     assert not moving.rests
     lever = 0.55  # m of joint 2, and of joint 4 to the hand at home
-    hidden = min(arm.edge[1], arm.edge[3]) / (lever * 9.81)
+    hidden = min(arm.breakaway[1], arm.breakaway[3]) / (lever * 9.81)
     assert moving.mass_half < 0.25 * hidden < 0.5 * hidden < resting.mass_half
     assert abs(resting.mass - 1.0) < resting.mass_half
 
 
-def test_what_an_arm_was_told_of_its_load_says_nothing_of_its_noise():
-    """The recordings of an identification are of an arm that was told of nothing."""
+def test_a_declared_payload_changes_no_noise():
+    """The recordings of an identification come from an arm without a declared payload."""
     free = recording(noise=2e-3)
-    plain, told = (
-        learn(robot(), replace(truth(), told=load), None, (free, free))
-        for load in (np.zeros(4), moment(robot(), THING))
+    plain, declared = (
+        fit_correction(robot(), replace(truth(), declared_payload=load), None, (free, free))
+        for load in (np.zeros(4), mass_and_moment(robot(), PAYLOAD))
     )
-    for one, other in zip((*plain[0], *plain[1]), (*told[0], *told[1]), strict=True):
+    for one, other in zip((*plain[0], *plain[1]), (*declared[0], *declared[1]), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_is_told_is_a_body_that_exists():
-    """Whatever the filter believes, the pseudo-inertia of what is told is not negative."""
+def test_the_reported_payload_is_a_physical_body():
+    """For any filter state, the pseudo-inertia of the report is not negative."""
     rng = np.random.default_rng(0)
     for _ in range(50):
-        mass, centre, tensor = body(rng.normal(size=10) * [1, *[0.1] * 3, *[0.01] * 6])
+        mass, centre, tensor = nearest_body(rng.normal(size=10) * [1, *[0.1] * 3, *[0.01] * 6])
         assert mass >= 0
         if mass > 0:
             square = (centre @ centre) * np.eye(3) - np.outer(centre, centre)
@@ -375,60 +389,67 @@ def test_what_is_told_is_a_body_that_exists():
             about = tensor + mass * square
             j = np.block([[0.5 * np.trace(about) * np.eye(3) - about, mass * centre[:, None]], [mass * centre, mass]])
             assert np.linalg.eigvalsh(j).min() > -1e-9
-    thing = standard(THING)
-    np.testing.assert_allclose(body(thing)[2], THING.inertia, atol=1e-12)
-    assert np.linalg.eigvalsh(pseudo_inertia(THING.mass, THING.centre, THING.inertia)).min() > 0
+    np.testing.assert_allclose(nearest_body(standard(PAYLOAD))[2], PAYLOAD.inertia, atol=1e-12)
+    assert np.linalg.eigvalsh(pseudo_inertia(PAYLOAD.mass, PAYLOAD.centre, PAYLOAD.inertia)).min() > 0
 
 
 def test_the_same_data_give_the_same_estimate():
-    arm, noise = quiet()
-    first, second = (table(listen(robot(), Estimator(arm, noise), recording(on=0.0))) for _ in range(2))
+    arm, noise = accurate()
+    first, second = (table(estimate_recording(robot(), Estimator(arm, noise), recording(on=0.0))) for _ in range(2))
     assert first.equals(second)
 
 
-def test_what_cannot_be_listened_to_is_said():
+def test_an_unsuitable_recording_gets_one_line():
     data = recording()
-    with pytest.raises(UserError, match="'measured' is not allowed here; commanded is"):
+    with pytest.raises(UserError, match="expected commanded, got measured"):
         at_rate(robot(), replace(data, torque="measured"))
     slow = Recording(t=data.t[::10], q=data.q[::10], dq=data.dq[::10], tau=data.tau[::10], torque="commanded")
-    with pytest.raises(UserError, match="100 Hz is too slow"):
+    with pytest.raises(UserError, match="expected at least 200 Hz, got 100 Hz"):
         at_rate(robot(), slow)
-    with pytest.raises(UserError, match="6 joints"):
+    with pytest.raises(UserError, match="expected 7 joints of panda, got 6"):
         at_rate(
             robot(), Recording(t=data.t, q=data.q[:, :6], dq=data.dq[:, :6], tau=data.tau[:, :6], torque="commanded")
         )
-    arm, noise = quiet()
+    arm, noise = accurate()
     estimator = Estimator(arm, noise)
-    with pytest.raises(UserError, match="7 joints"):
+    with pytest.raises(UserError, match=r"expected q, dq and tau of 7 joints, got \(6,\)"):
         estimator(np.zeros(6), np.zeros(6), np.zeros(6))
     assert not estimator(np.full(7, np.nan), np.zeros(7), np.zeros(7))
 
 
 @pytest.mark.slow
-def test_the_stage_listens_to_a_recording(tmp_path, capsys):
-    """stage=watch data=recording: lines, watch.csv, figures and a summary that holds the truth; mistakes are said."""
+def test_the_stage_estimates_from_a_recording(tmp_path, capsys):
+    """stage=estimate data=recording writes lines, estimate.csv, figures and a summary; mistakes get one line."""
     from hydra import compose, initialize_config_dir
 
     from r2s.stages.build import CONF
-    from r2s.stages.watch import watch
+    from r2s.stages.estimate import estimate
 
-    recording(on=1.0, off=2.0, noise=2e-3).save(tmp_path / "heard.npz")
-    words = ["stage=watch", "data=recording", f"data.path={tmp_path / 'heard.npz'}", f"root={tmp_path}", "name=w"]
+    recording(on=1.0, off=2.0, noise=2e-3).save(tmp_path / "work.npz")
+    words = ["stage=estimate", "data=recording", f"data.path={tmp_path / 'work.npz'}", f"root={tmp_path}", "name=w"]
 
-    def config(*more):
+    def config(*others):
         with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-            return compose("config", [*words, *more])
+            return compose("config", [*words, *others])
 
-    with pytest.raises(UserError, match=r"data\.torque: measured is not allowed for stage=watch"):
-        watch(config("data.torque=measured"), [])
-    with pytest.raises(UserError, match=r"no such file: .*heart.npz; did you mean 'heard.npz'"):
-        watch(config("data.torque=commanded", f"data.path={tmp_path / 'heart.npz'}"), [])
-    assert not (tmp_path / "watch").exists()
-    watch(config("data.torque=commanded"), [])
-    folder, said = tmp_path / "watch" / "w", capsys.readouterr().out
-    assert "kg" in said
-    assert all((folder / name).is_file() for name in ("watch.csv", "recording.rrd", "figures/payload.png"))
-    rows = pd.read_csv(folder / "watch.csv")
+    with pytest.raises(UserError, match=r"data\.torque: expected commanded for stage=estimate, got measured"):
+        estimate(config("data.torque=measured"), [])
+    with pytest.raises(UserError, match=r"no such file: .*wrk.npz; did you mean 'work.npz'"):
+        estimate(config("data.torque=commanded", f"data.path={tmp_path / 'wrk.npz'}"), [])
+    assert not (tmp_path / "estimate").exists()
+    estimate(config("data.torque=commanded"), [])
+    folder = tmp_path / "estimate" / "w"
+    assert "kg" in capsys.readouterr().out
+    assert all((folder / name).is_file() for name in ("estimate.csv", "recording.rrd", "figures/payload.png"))
+    rows = pd.read_csv(folder / "estimate.csv")
     before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
-    # without calibration= no delay is known: 3 ms of it are an acceleration's torque amiss
+    # without calibration= no delay is known: 3 ms of it cause torque errors in every acceleration
     assert abs(before["mass_kg"] - 1.0) < 2 * before["mass_kg_half"]
+
+
+@pytest.mark.slow
+def test_the_old_name_of_the_stage_gives_the_new_one():
+    from r2s.override_checks import check_overrides
+
+    with pytest.raises(UserError, match=r"^stage=watch is now stage=estimate$"):
+        check_overrides(["stage=watch"], None)

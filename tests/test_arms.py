@@ -1,5 +1,5 @@
-"""Arms that are not a Panda: on a wall, of one joint, without end stops, of links that lie in their own frame, and
-those that come with r2s, one with recordings of a physical arm.
+"""Arms other than the Panda: wall-mounted, one joint, no end stops, inertial frames equal to body frames, and those
+shipped with r2s, one with recordings of a physical arm.
 """
 
 import json
@@ -15,19 +15,19 @@ import pytest
 import yaml
 from conftest import ROOT, conf
 
-from r2s.arm.twin import Twin
+from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.engines.dart import DartEngine
 from r2s.excitation.fourier import fourier
-from r2s.excitation.safety import check_limits, gravity_torque
+from r2s.excitation.motion_checks import check_limits, gravity_torque
 from r2s.files import located
 from r2s.identification.checks import check_motion, check_recording
 from r2s.identification.parameters import parameter_space
-from r2s.identification.torque_residual import TorqueResidual
+from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.learning.env import TaskEnv
 from r2s.physics.description import write_mjcf
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.limits import limits
 from r2s.physics.robot import load_robot
+from r2s.physics.safety_filter import filter_limits
 from r2s.physics.simulator import Simulator, single_arm
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
@@ -48,7 +48,7 @@ ONE = """
   </worldbody>
 </mujoco>
 """
-# Every inertial frame is its body's own, or a geom's; a site sits in one; the first and the last joint never stop.
+# Inertial frames equal to body frames or from a geom; a site on a body; endless first and last joints.
 PLAIN = """
 <mujoco model="plain">
   <compiler angle="radian"/>
@@ -70,7 +70,7 @@ PLAIN = """
 
 @pytest.fixture
 def write(tmp_path):
-    """Return text -> the arm that a file with it holds."""
+    """Return a function: MJCF text -> robot."""
 
     def writer(text, **change):
         path = tmp_path / "arm.xml"
@@ -81,7 +81,7 @@ def write(tmp_path):
 
 
 def shipped(name):
-    """Return an arm of conf/robot, what a yaml takes from another one included."""
+    """Return an arm of conf/robot, including the defaults of its yaml."""
     document = conf(f"robot/{name}")
     if name == "fr3":
         document = conf("robot/panda") | document
@@ -91,8 +91,8 @@ def shipped(name):
 # --- gravity
 
 
-def test_gravity_is_the_files(write, tmp_path):
-    """A file says how its base is mounted: both engines and what we write follow; a typed gravity goes over it."""
+def test_gravity_comes_from_the_mjcf(write, tmp_path):
+    """Both engines and written MJCF use the file's gravity; an explicit gravity overrides it."""
     leaning = [3.0, -4.0, 8.0]
     robot = write(PLAIN.replace("<default>", '<option gravity="3 -4 8"/><default>'))
     assert robot.gravity.tolist() == leaning
@@ -100,7 +100,7 @@ def test_gravity_is_the_files(write, tmp_path):
     q = np.random.default_rng(0).uniform(-1, 1, (5, robot.n))
     data = mujoco.MjData(robot.model(gravity=True))
     for posture, torque in zip(q, gravity_torque(robot, q), strict=True):
-        # the slope of the potential energy, from heights against this gravity
+        # gradient of the potential energy, by central differences
         energy = []
         for step in 1e-6 * np.concatenate([np.eye(robot.n), -np.eye(robot.n)]):
             data.qpos[:] = posture + step
@@ -114,7 +114,7 @@ def test_gravity_is_the_files(write, tmp_path):
 
 
 def test_a_wall_mounted_arm_is_identified_with_its_own_gravity(write):
-    """Link-side torque of such an arm leaves no residual; taken for an upright one it is off by what links weigh."""
+    """The torque residual vanishes with the right gravity, and contains the links' weight with the wrong one."""
     upright = write(PLAIN)
     wall = replace(upright, gravity=np.array([9.81, 0.0, 0.0]))
     motion = fourier(wall, duration=3.0, seed=0, effort=0)
@@ -129,8 +129,8 @@ def test_a_wall_mounted_arm_is_identified_with_its_own_gravity(write):
     for robot in (wall, upright):
         nominal = nominal_dynamics(robot, **FRICTIONLESS)
         space = parameter_space(robot, nominal, {"offset": [-2.0, 2.0]})
-        off.append(np.abs(TorqueResidual(robot, space, recording, cutoff_hz=50.0).off(nominal)).max())
-    assert off[0] < 0.01 * np.abs(tau).max()  # of the filters alone
+        off.append(np.abs(TorqueResidual(space, recording, cutoff_hz=50.0).error(nominal)).max())
+    assert off[0] < 0.01 * np.abs(tau).max()  # error of the filters
     assert off[1] > 0.5 * np.abs(tau).max()
 
 
@@ -138,14 +138,14 @@ def test_a_wall_mounted_arm_is_identified_with_its_own_gravity(write):
 
 
 @pytest.mark.parametrize("text", [ONE, PLAIN], ids=["one joint", "own frames"])
-def test_links_in_their_own_frame_may_become_others(text, write):
-    """Each of two simulations has the masses, centres and tensors that it is given, by M and by its hand's place."""
+def test_links_with_own_inertial_frames_can_be_replaced(text, write):
+    """Each of two simulations has the given masses, centres and tensors, checked by M and the hand's position."""
     robot, rng = write(text), np.random.default_rng(1)
     n = robot.n
     d = nominal_dynamics(robot, **FRICTIONLESS)
     second = 0.5 * np.trace(robot.inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - robot.inertia
     bent = np.eye(3) + np.stack([np.zeros((n, 3, 3)), rng.uniform(-0.3, 0.3, (n, 3, 3))])
-    second = bent @ second @ bent.transpose(0, 1, 3, 2)  # of a body that is bent so: it stays one
+    second = bent @ second @ bent.transpose(0, 1, 3, 2)  # a linearly deformed body: its tensor stays physical
     tensor = np.trace(second, axis1=2, axis2=3)[..., None, None] * np.eye(3) - second
     com = robot.com + np.stack([np.zeros((n, 3)), rng.uniform(-0.05, 0.05, (n, 3))])
     d = replace(d, mass=robot.mass * np.array([[1.0], [1.2]]), com=com, inertia=tensor)
@@ -153,7 +153,7 @@ def test_links_in_their_own_frame_may_become_others(text, write):
     M = sim.batch.bind("M")
     sim.reset(q, np.zeros((2, n)))
     for k in range(2):
-        # the same links as points: a body's M is that of six masses along its principal axes, summed by Jacobians
+        # M from point masses: six masses along each body's principal axes, summed by Jacobians
         model = robot.model(gravity=False)
         data, full, jacobian = mujoco.MjData(model), np.zeros((n, n)), np.empty((3, n))
         data.qpos[:] = q[k]
@@ -175,8 +175,8 @@ def test_links_in_their_own_frame_may_become_others(text, write):
         assert one.body_mass[one.jnt_bodyid].tolist() == d.mass[k].tolist()
 
 
-def test_a_joint_without_end_has_no_limit_anywhere(write):
-    """Neither range nor soft limit; angles are taken from a turn about home; its recording may be turns away."""
+def test_an_endless_joint_has_no_limits(write):
+    """Without range and soft limit, excitations stay within half a revolution of home; recordings need not."""
     robot = write(PLAIN, q_home=[2.0, 0.0, 1.0])
     assert robot.q_min.tolist() == [-np.inf, -2.0, -np.inf]
     assert robot.model(gravity=False).jnt_limited.tolist() == [False, True, False]
@@ -190,11 +190,11 @@ def test_a_joint_without_end_has_no_limit_anywhere(write):
     state["action"] = env.action_spec.rand()
     assert np.isfinite(env.step(state)["next"]["observation"].numpy()).all()
     sim = Simulator(robot, nominal_dynamics(robot, **FRICTIONLESS), 1, 1)
-    sim.drive(limits(robot, robot.tau_max))
+    sim.drive(filter_limits(robot, robot.tau_max))
     sim.reset(np.array([[100.0, 0.0, -100.0]]), np.zeros((1, 3)))
     sim.rollout(np.zeros((1, 50, 3)))
     np.testing.assert_allclose(sim.q, [[100.0, 0.0, -100.0]], atol=1e-12)
-    twin = Twin(robot, 0)
+    twin = RigidTwin(robot, 0)
     twin.move_to(np.array([20.0, 0.0, 1.0]))
     twin.command(np.zeros(3))
     away = np.array([40.0, 0.0, -40.0])
@@ -202,8 +202,8 @@ def test_a_joint_without_end_has_no_limit_anywhere(write):
     check_motion(robot, turns)
 
 
-def test_goals_lie_where_the_arm_reaches(write):
-    """Without a region of its own, every arm has goals: of one joint all as far from it as the hand is."""
+def test_goals_lie_within_reach(write):
+    """Without a configured region every arm has goals; with one joint they lie on the hand's circle."""
     one = write(ONE)
     goals = ReachTask(reach=None).goals(one, np.random.default_rng(0), 20)
     np.testing.assert_allclose(np.linalg.norm(goals - [0, 0, 0.5], axis=1), 0.4, atol=1e-9)
@@ -212,12 +212,12 @@ def test_goals_lie_where_the_arm_reaches(write):
     assert 0.1 < low < high < 0.6 + 1e-6
 
 
-# --- what comes with r2s
+# --- shipped arms
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_an_arm_of_ours_is_ready_for_every_stage(name):
-    """Home is inside the limits and not singular, its hand above the table; there are goals, and safe excitations."""
+def test_a_shipped_arm_is_ready_for_every_stage(name):
+    """Home is inside the limits, not singular and above the table; goals and safe excitations exist."""
     robot = shipped(name)
     document = yaml.safe_load((ROOT / "conf" / "robot" / f"{name}.yaml").read_text())
     low, high = robot.q_range
@@ -234,7 +234,7 @@ def test_an_arm_of_ours_is_ready_for_every_stage(name):
         low, high = document["reach"]
         goals = ReachTask(reach=(low, high)).goals(robot, np.random.default_rng(0), 30)
         assert len(goals) == 30
-        # an action of 1 at the least lifts what friction of a twin holds, where a joint moves the hand
+        # an action of 1 overcomes a twin's friction in every joint that moves the hand
         moves = levers(robot) > 0.12
         assert moves.sum() >= 3
         assert np.all((np.array(document["torque_fraction"]) * robot.tau_max)[moves] > 0.6)
@@ -244,7 +244,7 @@ def test_an_arm_of_ours_is_ready_for_every_stage(name):
 
 
 def levers(robot):
-    """Return (n,) m/rad, how far each joint moves the hand: RMS over random postures."""
+    """Return each joint's lever arm (n,) m/rad: RMS over random postures."""
     model, rng = robot.model(gravity=False), np.random.default_rng(0)
     data, jacobian, total = mujoco.MjData(model), np.empty((3, robot.n)), np.zeros(robot.n)
     for _ in range(200):
@@ -255,13 +255,13 @@ def levers(robot):
     return np.sqrt(total)
 
 
-def test_what_is_shipped_is_found_from_anywhere():
+def test_shipped_files_are_found_from_anywhere():
     assert located("r2s:models/ur10e.xml") == ROOT / "r2s" / "models" / "ur10e.xml"
     assert located("models/ur10e.xml") == Path("models/ur10e.xml")
 
 
-def test_the_shipped_recordings_are_of_the_shipped_arm():
-    """Two motions at 1 kHz with both torques; what the sensors of joints 2 and 4 say is mostly weight."""
+def test_the_shipped_recordings_fit_the_shipped_arm():
+    """Two motions at 1 kHz with both torques; joints 2 and 4 measure mostly gravity."""
     robot, data = shipped("kinova_gen3"), conf("data/kinova_gen3")
     for key in ("path", "validation"):
         recording = read(located(data[key]), torque=data["torque"], n_joints=7)
@@ -272,13 +272,13 @@ def test_the_shipped_recordings_are_of_the_shipped_arm():
             assert set(file.files) == {"t", "q", "dq", "tau_J", "tau_motor"}
             np.testing.assert_array_equal(recording.tau, file["tau_J"])
         explained = gravity_torque(robot, recording.q[::20])[:, [1, 3]]
-        seen = recording.tau[::20, [1, 3]]
-        assert np.corrcoef(explained.T, seen.T)[[0, 1], [2, 3]].min() > 0.9
+        measured = recording.tau[::20, [1, 3]]
+        assert np.corrcoef(explained.T, measured.T)[[0, 1], [2, 3]].min() > 0.9
 
 
-def run(words, folder):
-    """Return what `python run.py WORDS` prints in a folder of its own."""
-    command = [sys.executable, str(ROOT / "run.py"), *words, f"root={folder}"]
+def run(overrides, folder):
+    """Return the output of `python run.py OVERRIDES` with its own root folder."""
+    command = [sys.executable, str(ROOT / "run.py"), *overrides, f"root={folder}"]
     done = subprocess.run(command, cwd=ROOT, env=os.environ | {"COLUMNS": "110"}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -286,7 +286,7 @@ def run(words, folder):
 
 @pytest.mark.slow
 def test_the_real_kinova_is_predicted_better_than_by_its_description(tmp_path):
-    """The README's command: motion that was not fitted, joint by joint no worse, in the mean by a third at least."""
+    """The README's command: on validation data no joint is worse, and the mean is better by a third."""
     run(["stage=identify", "data=kinova_gen3", "name=real"], tmp_path)
     folder = tmp_path / "identify" / "real"
     validation = json.loads((folder / "summary.json").read_text())["validation"]
@@ -299,13 +299,13 @@ def test_the_real_kinova_is_predicted_better_than_by_its_description(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*SHIPPED, "one joint"])
 def test_the_pipeline_ends_for_every_arm(name, tmp_path):
-    """Identified, trained twice and transferred to a twin of its own, with nothing typed but its name."""
-    words = [f"robot={name}"]
+    """Identification, two trainings and transfer to a twin, with only the arm's name given."""
+    overrides = [f"robot={name}"]
     if name == "one joint":
         (tmp_path / "one.xml").write_text(ONE)
-        words = ["robot=other", f"robot.mjcf={tmp_path / 'one.xml'}"]
-    words += ["stage=pipeline", "pipeline.train_minutes=null", "name=arm", "+experiment=toy"]
-    out = run(words, tmp_path / "runs")
+        overrides = ["robot=other", f"robot.mjcf={tmp_path / 'one.xml'}"]
+    overrides += ["stage=pipeline", "pipeline.train_minutes=null", "name=arm", "+experiment=toy"]
+    out = run(overrides, tmp_path / "runs")
     assert all(
         f"{model} model, {where}" in out for model in ("identified", "nominal") for where in ("mujoco", "twin")
     )

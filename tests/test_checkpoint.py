@@ -1,4 +1,4 @@
-"""A training that stopped goes on where it was; a number that is not finite stops it, and can be had again."""
+"""A stopped training continues; a value that is not finite stops it, and a dump reproduces it."""
 
 import time
 
@@ -12,14 +12,13 @@ from test_cli import r2s, server, started, succeed  # noqa: F401
 from r2s.errors import UserError
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
-from r2s.learning.randomization import Around
+from r2s.learning.randomization import UniformRandomization
 from r2s.learning.tqc import TQC
 from r2s.learning.train import Budget, Loop, replay_dump, train
-from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
+from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
 from r2s.tasks.reach import ReachTask
-from r2s.tasks.rewards import Curriculum
 
 QUICK = [
     "root=runs",
@@ -44,14 +43,14 @@ def panda():
 
 def dynamics_of(panda, family="sigmoid"):
     dynamics = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-    return of_family(dynamics, family)
+    return with_family(dynamics, family)
 
 
 def make_env(panda, family="sigmoid", seed=0):
     """Return an environment of 4 arms whose friction, delay, lag and noise are drawn anew at every reset."""
 
     def drawn(rng: np.random.Generator, m: int) -> Dynamics:
-        d = Around(panda, dynamics_of(panda, family), **conf("dr/paper"))(rng, m)
+        d = UniformRandomization(panda, dynamics_of(panda, family), **conf("dr/paper"))(rng, m)
         timing = {"delay": rng.uniform(1e-3, 5e-3, m), "lag": rng.uniform(0, 2e-3, m)}
         return Dynamics(**{**vars(d), **timing})
 
@@ -63,7 +62,7 @@ def make_env(panda, family="sigmoid", seed=0):
 def make_algo(env):
     torch.manual_seed(0)
     mean, std = (torch.from_numpy(s) for s in env.task.observation_scale(env.robot))
-    return TQC((mean, std), torch.from_numpy(env.task.torque(env.robot)), hidden=(16, 16))
+    return TQC((mean, std), torch.from_numpy(env.task.torque_limit(env.robot)), hidden=(16, 16))
 
 
 @pytest.mark.parametrize("family", ["sigmoid", "bristle"])
@@ -120,7 +119,6 @@ def train_until_it_breaks(env, algo, dump):
             env,
             algo,
             make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
-            Curriculum(**conf("reward/paper")),
             Loop(batch_size=16, learning_starts=80),
             Budget(None, 4000),
             dump=dump,
@@ -129,7 +127,7 @@ def train_until_it_breaks(env, algo, dump):
 
 
 def break_goal(env, step):
-    """Return the environment, which loses a goal in its step number `step`."""
+    """Return the environment with a NaN goal from its step number `step` on."""
     inner, count = env._step, 0
 
     def broken(state):
@@ -148,21 +146,21 @@ def never(policy):
 
 
 def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
-    """NaN in the physics: the line names what, which arm and when, and the dump leads to it again."""
+    """NaN in the physics: the message names value, arm and time, and the dump reproduces it."""
     env = break_goal(make_env(panda), 250)
     algo = make_algo(env)
-    said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
-    assert "observation of arm 2 is nan" in said
-    assert "after 996 env steps" in said
+    message = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
+    assert "observation of arm 2 is nan" in message
+    assert "after 996 env steps" in message
     left = 250 - 200  # steps since the state that the dump begins with
     with pytest.raises(FloatingPointError) as caught:
         replay_dump(tmp_path / "dump.pt", break_goal(make_env(panda, seed=3), left), algo, never)
-    assert said.startswith(str(caught.value))
+    assert message.startswith(str(caught.value))
     assert len(torch.load(tmp_path / "dump.pt", weights_only=True)["actions"]) == left
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
-    """A network that leaves the numbers: the line says which update, and the dump leads to it again."""
+    """A NaN in a network: the message names the update, and the dump reproduces it."""
     env = make_env(panda)
     algo = make_algo(env)
     inner = algo.update
@@ -173,8 +171,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
         return inner(batch)
 
     algo.update = broken  # type: ignore[method-assign]
-    said = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
-    assert said.startswith("the loss of update 41 is nan, after ")
+    message = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
+    assert message.startswith("the loss of update 41 is nan, after ")
     with pytest.raises(FloatingPointError, match=r"^the loss of update 41 is nan$"):
         replay_dump(tmp_path / "dump.pt", make_env(panda), make_algo(env), never)
     with pytest.raises(UserError, match="is no dump"):
@@ -182,7 +180,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
 
 
 def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
-    """The line says when, and the dump leads to it again."""
+    """The message names the time, and the dump reproduces it."""
     env = make_env(panda)
     algo = make_algo(env)
 
@@ -194,7 +192,6 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
             env,
             algo,
             evaluate,
-            Curriculum(**conf("reward/paper")),
             Loop(batch_size=16, learning_starts=4000),
             Budget(None, 4000),
             dump=tmp_path / "dump.pt",

@@ -1,4 +1,4 @@
-"""What can be said of several trainings, against hand calculations and known distributions."""
+"""The comparison of trainings, against hand calculations and known distributions."""
 
 import contextlib
 import json
@@ -6,6 +6,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,20 +17,23 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 
 from r2s.errors import UserError
-from r2s.reporting.colours import KNOWN, OTHERS, colours
-from r2s.reporting.comparison import (
+from r2s.reporting.comparison.grouping import LONGEST, group
+from r2s.reporting.comparison.page import comparison_page
+from r2s.reporting.comparison.scores import (
     band,
     improvement_matrix,
     improvement_table,
     sensitivity_table,
     summary_table,
 )
-from r2s.reporting.grouping import LONGEST, group
-from r2s.reporting.statistics import improvement, interquartile_mean, interval
+from r2s.reporting.comparison.statistics import improvement, interquartile_mean, interval
+from r2s.reporting.comparison.trainings import by_reason, comparable, read_trainings
+from r2s.reporting.figures.colours import KNOWN, OTHERS, colours
 from r2s.reporting.tables import scores_rows
-from r2s.reporting.trainings import comparable, in_words, read_trainings
-from r2s.runs import Run
+from r2s.runs import Job, Run
 from r2s.stages.build import CONF
+from r2s.tasks.measures import Measure, MeasureTable, write_measures
+from r2s.tasks.reach import REACH
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,7 +64,7 @@ def write_run(folder, *overrides, score=-90.0, status="done", env_steps=600_000,
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two settings of tqc, one of td3, three seeds each, and what must not count."""
+    """Two settings of tqc, one of td3, three seeds each, and folders that must not count."""
     root = tmp_path_factory.mktemp("few")
     for seed in range(3):
         write_run(root / f"a{seed}", f"seed={seed}", "algo.lr=1e-3", score=-80.0 - seed)
@@ -148,8 +152,8 @@ def test_settings_that_an_experiment_changed_name_a_group(tmp_path):
     assert list(group(read_trainings(sorted(tmp_path.iterdir()))[0]).members) == ["tqc, lr=0.001", "tqc, lr=0.0001"]
 
 
-def test_runs_that_cannot_be_compared_are_set_apart_and_why_is_said(user_folder):
-    """Of several sets the largest is taken; what is no finished training is named as well."""
+def test_runs_that_are_not_comparable_are_listed_with_a_reason(user_folder):
+    """The largest set is compared; the reasons of all other folders are listed."""
     trained, others = read_trainings(sorted(user_folder.iterdir()))
     runs, apart = comparable(trained)
     assert len(runs) == 15
@@ -185,12 +189,37 @@ def test_a_training_whose_arms_were_stopped_is_compared(tmp_path):
     assert table.loc["distance_median_m", "high"] == np.inf
     assert table.loc["return_paper", "iqm"] == -90.0
     assert np.isfinite(table.drop("distance_median_m")[["iqm", "low", "high"]].astype(float)).all(axis=None)
-    cell = scores_rows(summary_table({"all": trained})).loc["all", "median\ndistance, mm"]
+    cell = scores_rows(REACH, summary_table({"all": trained})).loc["all", "median\ndistance, mm"]
     assert cell.endswith(", -]")
 
 
+def test_trainings_of_a_task_from_outside_r2s_are_compared_by_its_measures(tmp_path, panda):
+    """Tables, figures and the best group follow measures.json; a lower force error is better."""
+    force = Measure("force_N", "force", "force error", "N", 1, 2, lower_is_better=True)
+    table = MeasureTable((force, Measure("held", "held", "time in contact", "%", 100, 0)), ("held", "force_N"))
+    for k, lr in enumerate((1e-3, 1e-4)):
+        folder = tmp_path / f"lr{k}"
+        write_run(folder, f"algo.lr={lr}")
+        write_measures(folder, table)
+        curve = pd.read_csv(folder / "evaluations.csv")[["env_steps", "updates", "wall_clock_s"]]
+        curve.assign(force_N=[3.0, 2.0, 1.0 + k], held=0.9).to_csv(folder / "evaluations.csv", index=False)
+        last = {"env_steps": 600_000, "updates": 10, "wall_clock_s": 15.0, "force_N": 1.0 + k, "held": 0.9}
+        (folder / "summary.json").write_text(json.dumps({"last": last}))
+    trained, others = read_trainings(sorted(tmp_path.iterdir()))
+    assert not others
+    (tmp_path / "out" / "figures").mkdir(parents=True)
+    run = SimpleNamespace(folder=tmp_path / "out", figure=lambda name: tmp_path / "out" / "figures" / f"{name}.png")
+    tables = comparison_page(run, panda, group(trained), {}, {})
+    shown = scores_rows(table, tables["scores"])
+    assert list(shown.columns) == ["seeds", "held, %", "force, N"]
+    assert shown["force, N"].to_list() == ["1.00", "2.00"]
+    better = tables["improvement"].set_index(["better", "measure"])["probability"]
+    assert better["tqc, lr=0.001", "force_N"] == 1.0
+    assert "force error, last evaluation" in (run.folder / "report.md").read_text()
+
+
 def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
-    """Table, key, what was set apart and left out; the legend leaves the figures room."""
+    """Table, key, and the runs that were not compared; the legend leaves the figures room."""
     command = [sys.executable, "run.py", "stage=compare", f"runs={user_folder}/*", f"root={tmp_path}", "name=all"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
@@ -200,9 +229,9 @@ def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
     text = " ".join(done.stdout.split())
     for expected in (
         "tqc #1 = tqc, minutes=3.0, calibration=2026-01-01_12-00-00",
-        "set apart, not comparable with these: toy, toy2 (+experiment=toy)",
-        "set apart, not comparable with these: long (another budget: 60 min, not 3)",
-        "left out, no finished trainings: cut, edited (unreadable); died (failed); found (stage=identify); "
+        "not comparable with these: toy, toy2 (+experiment=toy)",
+        "not comparable with these: long (another budget: 60 min, not 3)",
+        "no finished trainings: cut, edited (unreadable); died (failed); found (stage=identify); "
         "going (unfinished); notes, readme.txt (no run folder)",
     ):
         assert expected in text
@@ -233,9 +262,9 @@ def test_twelve_colours_differ_and_are_seen_on_white_and_black():
 def test_nothing_finished_is_one_line(tmp_path):
     """Folders without a finished training are a user's mistake."""
     write_run(tmp_path / "died", status="failed")
-    with pytest.raises(UserError, match=r"^runs: no finished run.*seen: died \(failed\)$"):
+    with pytest.raises(UserError, match=r"^runs: expected finished runs.*got died \(failed\)$"):
         read_trainings([tmp_path / "died"])
-    assert in_words({f"{k}": "failed" for k in range(9)}) == ["0, 1, 2, 3 and 5 more (failed)"]
+    assert by_reason({f"{k}": "failed" for k in range(9)}) == ["0, 1, 2, 3 and 5 more (failed)"]
 
 
 def test_the_interquartile_mean_leaves_a_quarter_out_on_each_side():
@@ -265,7 +294,7 @@ def test_the_probability_of_improvement():
     assert improvement(x[0] + 1.0, x[1]) == pytest.approx(0.760, abs=0.02)  # Phi(1 / sqrt 2)
 
 
-def test_tables_say_what_was_put_in(grouped):
+def test_tables_hold_the_scores(grouped):
     """Scores, their intervals within the seeds' range, who is better, and who depends on its settings."""
     table = summary_table(grouped).set_index(["group", "measure"])
     row = table.loc[("tqc, lr=1e-3", "return_paper")]
@@ -297,11 +326,10 @@ def test_a_band_is_over_what_all_seeds_have(grouped):
     assert high[-1] == pytest.approx(-80.0)
 
 
-def test_a_run_says_how_it_ended(tmp_path):
-    """Done, stopped by a person's Ctrl-C, or failed: what the comparison then says of it."""
-    how = {"overrides": [], "config": "", "seed": 0, "threads": 1}
+def test_meta_json_has_the_end_of_a_run(tmp_path):
+    """meta.json has done, stopped (Ctrl-C) or failed, which the comparison reports."""
     for name, error in (("whole", None), ("stopped", KeyboardInterrupt()), ("broken", ValueError("why"))):
-        with contextlib.suppress(KeyboardInterrupt, ValueError), Run(tmp_path, "train", name, **how):
+        with contextlib.suppress(KeyboardInterrupt, ValueError), Run(tmp_path, Job("train", name, "", [], 0, 1)):
             if error:
                 raise error
     files = [tmp_path / "train" / name / "meta.json" for name in ("whole", "stopped", "broken")]

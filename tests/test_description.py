@@ -1,4 +1,4 @@
-"""One description, three formats: an identified arm is the same in MJCF, URDF and SDF, whoever reads them."""
+"""Robot descriptions: an identified arm is the same in MJCF, URDF and SDF, for every reader."""
 
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -18,7 +18,7 @@ from r2s.physics.simulator import single_arm
 
 
 def identified(robot):
-    """Return dynamics whose links are all a little other than the file's."""
+    """Return dynamics with slightly different links than the file's."""
     rng = np.random.default_rng(3)
     n = robot.n
     friction = conf("friction/paper") if n == 7 else {"family": "sigmoid", **UNIFORM}
@@ -159,7 +159,7 @@ def test_the_line_meets_the_friction():
         np.testing.assert_allclose(coulomb + viscous * share * robot.dq_max, level, rtol=1e-9)
 
 
-def test_an_armature_is_said(tmp_path):
+def test_armature_in_sdf_is_an_error(tmp_path):
     path = tmp_path / "odd.xml"
     path.write_text(ODD_ARM)
     robot = load_robot(str(path))

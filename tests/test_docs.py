@@ -7,8 +7,8 @@ import pytest
 from test_rooms import ROOMS
 
 ROOT = Path(__file__).parent.parent
-README, ARCHITECTURE = ROOT / "README.md", ROOT / "docs" / "architecture.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+README, ARCHITECTURE = ROOT / "README.md", ROOT / "docs" / "explanation" / "architecture.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 FILE = re.compile(r"\b(?:r2s|conf|docs|tests|benchmarks|notebooks)/[\w/]*\w+\.(?:py|yaml|md|png|svg|ipynb)\b")
 MOST_README_LINES = 60  # a screen, beside its picture
 
@@ -20,7 +20,7 @@ def table(page: Path, heading: str) -> list[list[str]]:
     return [[cell.strip().strip("`") for cell in row] for row in rows[2:]]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_links_and_pictures_are_there(page):
     """A link that is not to the web leads to a file of the repository, relative to its page."""
     links = {link.split("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text())}
@@ -28,7 +28,7 @@ def test_links_and_pictures_are_there(page):
     assert not missing, f"{page.name} links to what is not there: {missing}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_files_that_are_named_are_there(page):
     """r2s/arm/driver.py, conf/dr/paper.yaml ... in a text are files of the repository."""
     missing = {name for name in FILE.findall(page.read_text()) if not (ROOT / name).is_file()}
@@ -45,7 +45,7 @@ def test_every_room_is_in_the_drawing_and_nothing_else():
 
 
 def test_the_table_of_rooms_is_the_order_that_imports_obey():
-    """docs/architecture.md lists the rooms of tests/test_rooms.py, in their order."""
+    """docs/explanation/architecture.md lists the rooms of tests/test_rooms.py, in their order."""
     listed = [row[0] for row in table(ARCHITECTURE, "The rooms")]
     assert listed == [name for name in ROOMS if name != "__main__"]
 

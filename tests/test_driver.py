@@ -10,26 +10,26 @@ from conftest import conf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2s.arm.deploy import DrivenArm
-from r2s.arm.driver import DEADLINE_S, Driver, Drivers
-from r2s.arm.fci import FR3_Q_MAX, FR3_Q_MIN, fr3_velocity_bounds
-from r2s.arm.fr3 import within_fr3
+from r2s.arm.clients import fr3_limits
+from r2s.arm.clients.fr3 import within_fr3
+from r2s.arm.driver import DEADLINE_S, Driver, DriverBatch
 from r2s.arm.interface import ArmState, Reflexes
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.actuation import Actuation, Motors
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.limits import Q_ALLOWED
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, load_robot
+from r2s.physics.safety_filter import Q_MARGIN
 from r2s.physics.simulator import Simulator
-from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import rollout
 
 PANDA = load_robot(**conf("robot/panda"))
 TASK = ReachTask(**{k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/reach").items()})
-TORQUE = TASK.torque(PANDA)
+TORQUE = TASK.torque_limit(PANDA)
 FOLLOWS = np.array(conf("task/track")["torque_fraction"]) * PANDA.tau_max  # of a timed path: more of the wrist
 LEVEL = nominal_dynamics(PANDA, **conf("friction/paper")).level
 KINDS = ("nan", "inf", "huge", "flip", "silence", "full", "noise", "wrong shape of time", "held noise")
@@ -71,12 +71,12 @@ def targets(kinds, k, rng, held):
 class FR3Reflexes(Reflexes):
     """As those of the emulator: an FR3 allows less speed near position limits."""
 
-    def inside(self, q, dq):
+    def within_limits(self, q, dq):
         """Return (m,), whether an FR3 would go on."""
-        low, high = fr3_velocity_bounds(q)
+        low, high = fr3_limits.velocity_bounds(q)
         over = np.maximum(low - dq, dq - high)
-        at = np.maximum(FR3_Q_MIN - q, q - FR3_Q_MAX)
-        return super().inside(q, dq) & (at <= 0).all(-1) & (over <= 0).all(-1)
+        at = np.maximum(fr3_limits.Q_MIN - q, q - fr3_limits.Q_MAX)
+        return super().within_limits(q, dq) & (at <= 0).all(-1) & (over <= 0).all(-1)
 
 
 def hostile(cycles, seed, robot=PANDA, check=None, m=125):
@@ -88,7 +88,7 @@ def hostile(cycles, seed, robot=PANDA, check=None, m=125):
     rng, check = np.random.default_rng(seed), check or Reflexes(PANDA)
     dynamics = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     sim, motors = Simulator(PANDA, dynamics, m, 1), Motors(m, 7, 4e-3, 1e-3)
-    drivers = Drivers(robot, TORQUE, m, friction=LEVEL, cutoff_hz=TASK.cutoff_hz)
+    drivers = DriverBatch(robot, TORQUE, m, friction=LEVEL, cutoff_hz=TASK.cutoff_hz)
     reflexes, stops, count = [], [], 0
 
     def sensed():
@@ -105,10 +105,10 @@ def hostile(cycles, seed, robot=PANDA, check=None, m=125):
                 break
             count += int(runs.sum())
             last, tau = tau, drivers(q, dq, tau, targets(kinds, k, rng, held))
-            assert check.takes(tau, last)[runs].all()  # torque range and rate
+            assert check.accepts(tau, last)[runs].all()  # torque range and rate
             sim.rollout(motors(tau[:, None]), record=())
             q, dq = sensed()
-            fired = runs & ~(check.inside(sim.q, sim.dq) & check.inside(q, dq))
+            fired = runs & ~(check.within_limits(sim.q, sim.dq) & check.within_limits(q, dq))
             reflexes += [f"{KINDS[kinds[i]]}: {sim.q[i]} {sim.dq[i]}" for i in np.flatnonzero(fired)]
             done = runs & ~fired & drivers.done
             stops += [f"{KINDS[kinds[i]]}: {drivers.stopping[i]}" for i in np.flatnonzero(done)]
@@ -140,7 +140,7 @@ def test_a_stop_does_not_throw_a_stretched_elbow():
     """
     dynamics = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
     sim, motors = Simulator(PANDA, dynamics, 1, 1), Motors(1, 7, 4e-3, 1e-3)
-    driver = Drivers(within_fr3(PANDA), TORQUE, 1, friction=LEVEL, cutoff_hz=TASK.cutoff_hz)
+    driver = DriverBatch(within_fr3(PANDA), TORQUE, 1, friction=LEVEL, cutoff_hz=TASK.cutoff_hz)
     dq = np.array([1.38, 0.52, 1.21, 0.72, 0.06, -0.07, 0.29])
     sim.reset(np.array([[-0.62, 1.51, -1.5, -0.55, 2.82, 2.26, -0.76]]), dq[None])
     tau, fastest = np.array([[1.3, -3.2, -0.2, 0.4, 0.2, 0.3, 0.1]]), np.zeros(7)
@@ -148,7 +148,7 @@ def test_a_stop_does_not_throw_a_stretched_elbow():
         tau = driver(sim.q.copy(), sim.dq.copy(), tau, np.full((1, 7), np.nan))
         sim.rollout(motors(tau[:, None]), record=())
         fastest = np.maximum(fastest, np.abs(sim.dq[0]))
-        assert FR3Reflexes(PANDA).inside(sim.q, sim.dq).all()
+        assert FR3Reflexes(PANDA).within_limits(sim.q, sim.dq).all()
     assert driver.done.all()
     assert fastest[3] < 1.1 * dq[3]
 
@@ -234,7 +234,7 @@ def test_torque_fades_in():
 def test_limits_push_back_and_stop():
     """Past the margin of a position limit the law pushes back; near the limit, or near top speed, the motion ends."""
     q = PANDA.q_home.copy()
-    q[1] = PANDA.q_max[1] - 0.6 * Q_ALLOWED
+    q[1] = PANDA.q_max[1] - 0.6 * Q_MARGIN
     driver, tau = Driver(PANDA, TORQUE, LEVEL), np.zeros(7)
     for _ in range(200):
         tau = driver(state_of(q, np.zeros(7), tau), 0.5 * TORQUE)
@@ -257,7 +257,7 @@ def test_timing_counts_every_cycle():
     arm = SimulatedArm(PANDA, dynamics, position_noise=0.0, velocity_noise=0.0)
     starts, goals = fixed_episodes(PANDA, task, 2)
     policy = make_policy(PANDA, task, (8,))
-    driven = DrivenArm(arm, task, LEVEL)
+    driven = PolicyRunner(arm, task, LEVEL)
     episodes, timing = rollout(policy, driven, task, starts, goals), driven.timing
     assert driven.stops == []
     assert episodes.q.shape == (2, 10, 7)
@@ -269,7 +269,7 @@ def test_a_slow_policy_is_not_taken_for_a_silent_one():
     """At 10 Hz a target holds for 100 ms: no stop."""
     task = replace(TASK, ctrl_hz=10, episode_s=1.0)
     arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0)
-    driven = DrivenArm(arm, task, LEVEL)
+    driven = PolicyRunner(arm, task, LEVEL)
     rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 1))
     assert driven.stops == []
 
@@ -283,7 +283,7 @@ def test_a_stop_that_has_just_begun_counts():
 
     task = replace(TASK, episode_s=0.08)  # the watchdog acts after 50 ms, the arm would rest later
     arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0.1)
-    driven = DrivenArm(arm, task, LEVEL)
+    driven = PolicyRunner(arm, task, LEVEL)
     episodes = rollout(Silent(), driven, task, *fixed_episodes(PANDA, task, 1))
     stops = driven.stops
     assert [str(stop) for stop in stops] == ["episode 1, 0.08 s: no finite action for 50 ms"]

@@ -1,4 +1,4 @@
-"""The second make of twin: dry friction that rests exactly, elastic gears that swing, a clock that is not one."""
+"""The elastic variant of twin: exact static friction, oscillating elastic gears, a clock with jitter."""
 
 import json
 import subprocess
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2s.arm import elastic_joints as ej
-from r2s.arm.elastic_twin import ElasticTwin
 from r2s.arm.interface import Arm
-from r2s.arm.twin import Twin
-from r2s.arm.twins import twin
+from r2s.arm.twins import elastic_joints as ej
+from r2s.arm.twins.elastic_twin import ElasticTwin
+from r2s.arm.twins.make_twin import make_twin
+from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import load_robot
@@ -34,7 +34,7 @@ def panda():
 
 
 def sway(arm, cycles):
-    """Push every joint about for some cycles; return what was read, (cycles, 4, n)."""
+    """Command a sine wave on every joint; return the states, (cycles, 4, n)."""
     arm.move_to(arm.robot.q_home)
     rows = []
     for k in range(cycles):
@@ -45,20 +45,20 @@ def sway(arm, cycles):
 
 
 def silent(arm):
-    """Return the arm with sensors that are only quantised."""
+    """Return the arm with quantised sensors without noise."""
     arm._hidden[ej.NOISE_Q : ej.NOISE_TAU + 1] = 0
     return arm
 
 
 def friction_free(arm):
-    """Return (n,) Nm, the torque on the motors but their friction."""
+    """Return the torque on the motors without friction, (n,) Nm."""
     p, s = arm._hidden, arm._state
     gear = p[ej.STIFF] * (s[ej.THETA] - s[ej.LINK_Q]) + p[ej.GEAR] * (s[ej.W] - s[ej.LINK_V])
     return s[ej.MOTOR] + p[ej.OFFSET] - gear
 
 
 def edges(arm, side):
-    """Return (n,) Nm that holds the motors where they are against motion to this side."""
+    """Return the motors' breakaway torque against motion to this side, (n,) Nm."""
     p, s = arm._hidden, arm._state
     gear = p[ej.STIFF] * (s[ej.THETA] - s[ej.LINK_Q])
     edge = [ej.level(p, 0.0, gear[i], side, i) for i in range(arm.robot.n)]
@@ -66,20 +66,20 @@ def edges(arm, side):
     return np.array(edge) * factor
 
 
-def test_same_seed_is_bit_identical_and_another_is_another_robot():
-    arm: Arm = twin(panda(), make=2, seed=3)
+def test_equal_seeds_are_bit_identical_and_other_seeds_differ():
+    arm: Arm = make_twin(panda(), variant="elastic", seed=3)
     first, again, other = (sway(a, 300) for a in (arm, ElasticTwin(panda(), 3), ElasticTwin(panda(), 4)))
     assert np.array_equal(first, again)
     assert np.abs(first[-1, 0] - other[-1, 0]).max() > 1e-3
     assert np.array_equal(ElasticTwin(panda(), 3, noise=1)._hidden, arm._hidden)
     assert not np.array_equal(sway(ElasticTwin(panda(), 3, noise=1), 3), first[:3])
-    assert isinstance(twin(panda()), Twin)
-    with pytest.raises(UserError, match=r"arm.make: 3 is not allowed; there are 1 and 2"):
-        twin(panda(), make=3)
+    assert isinstance(make_twin(panda()), RigidTwin)
+    with pytest.raises(UserError, match=r"arm\.variant: 'plastic'; allowed: rigid, elastic"):
+        make_twin(panda(), variant="plastic")
 
 
 def test_steps_are_fine_enough():
-    """A third of a second of open loop, stick and slip in it, ends where steps a quarter as long bring it."""
+    """0.35 s of open loop with stick and slip end as with steps a quarter as long."""
     ends = []
     for steps in (1, 4):
         arm = ElasticTwin(panda(), 0)
@@ -91,8 +91,8 @@ def test_steps_are_fine_enough():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_friction_takes_energy_whatever_the_arm_compensates(seed):
-    """At any speed, warm and where ripples are lowest, more is left than the control box adds; so arms settle."""
+def test_friction_stays_dissipative_under_compensation(seed):
+    """At any speed, warm and at the lowest ripple, friction exceeds the control box's compensation."""
     p = ElasticTwin(panda(), seed)._hidden
     for i in range(7):
         for speed in np.geomspace(1e-4, panda().dq_max[i], 40):
@@ -103,10 +103,10 @@ def test_friction_takes_energy_whatever_the_arm_compensates(seed):
 
 
 @pytest.mark.parametrize(("seed", "warm"), [(0, 0.0), (1, 2.0)])
-def test_a_motor_rests_exactly_until_its_edge(seed, warm):
-    """Each joint's torque is ramped both ways; it moves in the cycle in which the net torque passes the edge."""
+def test_a_motor_rests_exactly_until_breakaway(seed, warm):
+    """A joint moves in the cycle in which the ramped net torque exceeds breakaway, both ways."""
     arm, n = silent(ElasticTwin(panda(), seed)), 7
-    arm._lost = -1.0
+    arm._loss = -1.0
     for j in range(n):
         for side in (-1.0, 1.0):
             arm._state[ej.HEAT] = warm
@@ -119,7 +119,7 @@ def test_a_motor_rests_exactly_until_its_edge(seed, warm):
                 tau[j] += side * 0.03 * (j < 4) + side * 0.006
                 arm.command(tau)
                 assert len(free) < 1000
-            within = 0.03 * (j < 4) + 0.006 + 0.01 * edge  # of a cycle, and of what the others' links shake
+            within = 0.03 * (j < 4) + 0.006 + 0.01 * edge  # one cycle's step, and the other links' vibration
             assert abs(free[-1] - edge) < within
 
 
@@ -129,11 +129,11 @@ def test_friction_warms_up_with_motion_and_cools_at_rest():
     assert np.all((p[ej.COOLING] >= 60) & (p[ej.COOLING] <= 180))
     assert np.all((p[ej.FALL] >= 0.1) & (p[ej.FALL] <= 0.3))
     cold = edges(arm, 1.0)
-    p[ej.COOLING] = 0.1  # s, for a test
+    p[ej.COOLING] = 0.1  # s
     sway(arm, 300)
     heat = s[ej.HEAT].copy()
     assert heat[:4].min() > 0.01
-    arm.move_to(panda().q_home)  # takes no time
+    arm.move_to(panda().q_home)  # without time passing
     assert np.array_equal(s[ej.HEAT], heat)
     np.testing.assert_allclose(edges(arm, 1.0) / cold, 1 - p[ej.FALL] * (1 - np.exp(-heat / 0.6)), rtol=0.02)
     for _ in range(100):
@@ -143,8 +143,8 @@ def test_friction_warms_up_with_motion_and_cools_at_rest():
     np.testing.assert_allclose(s[ej.HEAT][still], heat[still] * np.exp(-1), rtol=0.02)
 
 
-def test_gears_swing_with_their_natural_frequency_and_are_damped():
-    """The motors rest in their friction: a plucked link swings at sqrt(K / M), and what is left fades."""
+def test_gears_oscillate_at_their_natural_frequency():
+    """With resting motors a displaced link oscillates at sqrt(K / M) with the gears' damping."""
     arm = silent(ElasticTwin(panda(), 2))
     p, s = arm._hidden, arm._state
     arm.move_to(panda().q_home)
@@ -156,24 +156,24 @@ def test_gears_swing_with_their_natural_frequency_and_are_damped():
     s[ej.LINK_Q] += 1e-5 * shape / np.abs(shape).max()
     for _ in range(400):
         arm.command(np.zeros(7))
-        along.append((s[ej.LINK_Q] - rest) @ mass @ shape)  # the other modes are orthogonal so
+        along.append((s[ej.LINK_Q] - rest) @ mass @ shape)  # orthogonal to the other modes
     assert np.all(s[ej.W] == 0.0)
     along = np.array(along)
     crossed = np.flatnonzero((along[:-1] < 0) & (along[1:] >= 0))
     crossed = crossed - along[crossed] / (along[crossed + 1] - along[crossed])
     assert 8 < hz < 40
     assert np.isclose(1e3 / np.diff(crossed).mean(), hz, rtol=0.01)
-    fade = 0.5 * (p[ej.GEAR] * shape**2).sum() / (shape @ mass @ shape)  # 1/s, of a mode that is damped little
+    fade = 0.5 * (p[ej.GEAR] * shape**2).sum() / (shape @ mass @ shape)  # 1/s, of a weakly damped mode
     first, last = along[30:100].argmax() + 30, along[300:].argmax() + 300
     assert np.isclose(np.log(along[first] / along[last]), fade * (last - first) * 1e-3, rtol=0.1)
 
 
-def test_each_joint_answers_after_a_delay_of_its_own():
-    """Motors feel a step of the command when their joint's delay is over, at most the jitter later."""
+def test_each_joint_has_its_own_delay():
+    """Motor torque follows a command step after the joint's delay, at most the jitter later."""
     idle, pushed = ElasticTwin(panda(), 0), ElasticTwin(panda(), 0)
     begun = np.full(7, -1)
     for arm in (idle, pushed):
-        arm._lost = -1.0
+        arm._loss = -1.0
         arm.move_to(panda().q_home)
     for k in range(10):
         idle.command(np.zeros(7))
@@ -187,9 +187,9 @@ def test_each_joint_answers_after_a_delay_of_its_own():
 
 
 def test_the_clock_jitters_and_loses_packets():
-    """Sensors look at another time before the end of each cycle, commands are late or lost, and t tells nothing."""
+    """Sensor times vary, commands are late or lost, and t does not show it."""
     arm = silent(ElasticTwin(panda(), 1))
-    arm._lost = 0.05
+    arm._loss = 0.05
     arm.move_to(panda().q_home)
     kept, ages = 0, []
     for k in range(600):
@@ -204,15 +204,15 @@ def test_the_clock_jitters_and_loses_packets():
         if abs(w) > 0.3:
             ages.append((arm._state[ej.THETA, 0] - state.q[0]) / w)
     assert 15 <= kept <= 48  # 30 expected, within 3 deviations of a Bernoulli's
-    seen = 2e-5 / 0.3  # s, of quantisation
-    assert -seen < min(ages) < 2e-4
-    assert 0.5e-3 * arm._jitter < max(ages) < 1e-3 * arm._jitter + seen
+    resolution = 2e-5 / 0.3  # s, of quantisation
+    assert -resolution < min(ages) < 2e-4
+    assert 0.5e-3 * arm._jitter < max(ages) < 1e-3 * arm._jitter + resolution
 
 
 def test_the_hand_sags_and_a_payload_pulls_it_down():
-    """At rest motors are where was asked for, and links lower by what they carry over the gears' stiffness."""
+    """At rest the motors are at the target and the links lower, by their load over the gears' stiffness."""
     robot = panda()
-    arm, loaded = ElasticTwin(robot, 0, 0.0, 1e4), ElasticTwin(robot, 0, 1.0, 1e4)
+    arm, loaded = (ElasticTwin(robot, 0, payload=kg, stiffness=1e4) for kg in (0.0, 1.0))
     assert np.array_equal(arm._hidden[ej.STIFF], robot.tau_max * 1e4 / 87)
     begin = arm.move_to(robot.q_home)
     np.testing.assert_allclose(begin.q, robot.q_home, atol=1e-4)
@@ -228,18 +228,24 @@ def test_the_hand_sags_and_a_payload_pulls_it_down():
     assert after < before - 0.01
 
 
-def test_what_is_too_stiff_is_said():
-    with pytest.raises(UserError, match=r"arm.stiffness: gears of 1e\+12 Nm/rad swing at .* Hz on this arm"):
-        ElasticTwin(panda(), 0, 0.0, 1e12)
-    with pytest.raises(UserError, match=r"arm.payload: -1 is not allowed"):
-        ElasticTwin(panda(), 0, -1)
+def test_too_stiff_gears_are_refused():
+    with pytest.raises(UserError, match=r"arm.stiffness: gears of 1e\+12 Nm/rad oscillate at .* Hz on this arm"):
+        ElasticTwin(panda(), 0, stiffness=1e12)
+    with pytest.raises(UserError, match=r"arm.payload: expected .*, got -1"):
+        ElasticTwin(panda(), 0, payload=-1)
 
 
 @pytest.mark.slow
 def test_the_pipeline_runs_on_it(tmp_path):
-    """Recorded, identified, trained in, transferred to and reported; a toy learns nothing."""
-    words = ["stage=pipeline", "+experiment=toy", "pipeline.train_minutes=null", "arm.make=2", f"root={tmp_path}"]
-    done = subprocess.run([sys.executable, "run.py", *words], cwd=ROOT, capture_output=True, text=True)
+    """Recording, identification, training, transfer and report; the toy budget learns nothing."""
+    overrides = [
+        "stage=pipeline",
+        "+experiment=toy",
+        "pipeline.train_minutes=null",
+        "arm.variant=elastic",
+        f"root={tmp_path}",
+    ]
+    done = subprocess.run([sys.executable, "run.py", *overrides], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     summary = json.loads(next(tmp_path.glob("transfer/*/summary.json")).read_text())
     assert summary["twin"]["success_5cm"] >= 0.0

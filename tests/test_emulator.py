@@ -1,6 +1,6 @@
-"""The clients that drive hardware, against our own FCI server; and what that server promises by itself.
+"""The hardware clients against the emulated FCI server, and the server by itself.
 
-The clients are the real packages (panda-python, pylibfranka): a test of one that is not installed is skipped.
+The clients use the real packages (panda-python, pylibfranka); tests of a missing package are skipped.
 """
 
 import os
@@ -23,24 +23,26 @@ import pytest
 import torch
 from conftest import ROOT, conf
 
-from r2s.arm import fci, franka
-from r2s.arm.deploy import DrivenArm
+from r2s.arm.clients import fci, fr3_limits, libfranka
+from r2s.arm.clients.fr3 import FR3
+from r2s.arm.clients.franka import TORQUE_SHARE
+from r2s.arm.clients.libfranka import CAUTIOUS, CollisionThresholds
+from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.control import Control, Fault
-from r2s.arm.emulator.process import Emulator, _yaml, main
-from r2s.arm.emulator.server import listen
-from r2s.arm.fr3 import FR3
-from r2s.arm.franka import CAUTIOUS, TORQUE_SHARE, Collision
+from r2s.arm.emulator.process import Emulator, _read_robot, main
+from r2s.arm.emulator.robot_model import urdf
+from r2s.arm.emulator.server import open_port
 from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
-from r2s.arm.panda import Panda
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
-from r2s.arm.twin import Twin
+from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT, load_robot
-from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import rollout
 
 CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3, 10)}
 CYCLES = 300
@@ -58,7 +60,7 @@ FAULTS = (  # in the order of motions
 
 
 class Bare:
-    """The smallest `Arm`: the nominal model in MuJoCo, which starts in no time."""
+    """A minimal `Arm`: the nominal model in MuJoCo, which starts at once."""
 
     # ruff: noqa: D102
 
@@ -95,10 +97,10 @@ def panda():
 
 @pytest.fixture(scope="module")
 def servers(panda):
-    """Two equal twins behind each client's version, all started at once: {client: (address, address)}."""
+    """Two servers with equal twins per FCI version, started in parallel: {client: (address, address)}."""
     with ExitStack() as stack, ThreadPoolExecutor() as pool:
         emulators = {
-            (name, i): Emulator(partial(Twin, panda, SEED), version=version)
+            (name, i): Emulator(partial(RigidTwin, panda, SEED), version=version)
             for name, (package, _, version) in CLIENTS.items()
             for i in range(2 if find_spec(package.split(".")[0]) else 0)
         }
@@ -108,14 +110,14 @@ def servers(panda):
 
 @pytest.fixture(params=CLIENTS)
 def client(request):
-    """Each client that is installed: its name, its arm and its version."""
+    """Each installed client: name, class and FCI version."""
     package, arm, version = CLIENTS[request.param]
     pytest.importorskip(package)
     return request.param, arm, version
 
 
 def drive(arm, cycles, share=0.02, pause=lambda k: None):
-    """Command a slow wave, a share of tau_max; return t, q, dq, tau_J and tau_J_d after each cycle, (cycles, 29)."""
+    """Command a slow sine, a share of tau_max; return t, q, dq, tau_J, tau_J_d of each cycle, (cycles, 29)."""
     rows = []
     for k in range(cycles):
         pause(k)
@@ -125,44 +127,44 @@ def drive(arm, cycles, share=0.02, pause=lambda k: None):
     return np.array(rows)
 
 
-def test_a_motion_is_bit_identical_and_the_arms_own(client, servers, panda):
-    """0.3 s in lock-step twice, once with a client that dawdles, and a third time without any wire."""
+def test_a_motion_is_bit_identical_with_and_without_a_client(client, servers, panda):
+    """0.3 s in lock-step: twice with a client, one of them slow, and once without."""
     name, make, version = client
     motions = []
-    for address, dawdle in zip(servers[name], (0.0, 0.03), strict=True):
+    for address, pause_s in zip(servers[name], (0.0, 0.03), strict=True):
         arm = make(panda, address)
-        arm.move_to(panda.q_home)  # it is there
-        motions.append(drive(arm, CYCLES, pause=lambda k, s=dawdle: time.sleep(s) if k % 50 == 0 else None))
+        arm.move_to(panda.q_home)  # already there
+        motions.append(drive(arm, CYCLES, pause=lambda k, s=pause_s: time.sleep(s) if k % 50 == 0 else None))
         arm.stop()
         arm.close()
     assert np.array_equal(*motions)
-    twin = Twin(panda, SEED)
+    twin = RigidTwin(panda, SEED)
     twin.move_to(panda.q_home)
     direct = drive(twin, CYCLES)
-    if version == 10:  # its states have single precision
+    if version == 10:  # single precision
         direct[:, 1:] = direct[:, 1:].astype(np.float32)
     assert np.array_equal(motions[0], direct)
 
 
 @pytest.fixture
 def faulty(client, panda):
-    """The address of a server of its own, on which things go wrong."""
-    with Emulator(partial(Twin, panda, SEED), version=client[2], faults=FAULTS) as address:
+    """Address of a server with injected faults."""
+    with Emulator(partial(RigidTwin, panda, SEED), version=client[2], faults=FAULTS) as address:
         yield address
 
 
-def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
-    """A few lost packets are borne; each fault ends the motion with libfranka's reason, and can be cleared."""
+def test_every_fault_stops_with_libfrankas_reason(client, faulty, panda):
+    """A few lost packets have no effect; each fault ends the motion with libfranka's reason and can be cleared."""
     _, make, _ = client
-    asked = []
-    arm = make(panda, faulty, operator=lambda reason: asked.append(reason) is None)
+    questions = []
+    arm = make(panda, faulty, operator=lambda reason: questions.append(reason) is None)
     here = arm.read().q
     arm.move_to(here)
-    seen = drive(arm, 60)
-    steps = np.diff(seen[:, 0])
+    rows = drive(arm, 60)
+    steps = np.diff(rows[:, 0])
     assert np.flatnonzero(steps > 1.5 * SIM_DT).tolist() == [18]  # row 18 has the state of cycle 19
     assert steps[18] == pytest.approx(7 * SIM_DT)  # six states were lost
-    held = (seen[1:, 22:] == seen[:-1, 22:]).all(axis=1)
+    held = (rows[1:, 22:] == rows[:-1, 22:]).all(axis=1)
     assert np.flatnonzero(held).tolist() == [4, 5, 6, 7, 8, 9]  # six answers came too late
     reasons = [
         "communication_constraints_violation", "communication_constraints_violation",
@@ -176,12 +178,12 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
         with pytest.raises(ArmStopped, match=f"the arm is stopped: .*{reason}"):
             arm.command(np.zeros(7))
     arm.move_to(arm.read().q)
-    assert [r for r in reasons if not any(r in line for line in asked)] == []
+    assert [r for r in reasons if not any(r in line for line in questions)] == []
     with pytest.raises(ArmStopped, match=r"User Stop|user stop|emergency"):
         drive(arm, 60)
     with pytest.raises(ArmStopped, match="user stopped"):
         arm.move_to(here)
-    assert len(asked) == len(reasons) + 1
+    assert len(questions) == len(reasons) + 1
     arm.close()
 
 
@@ -195,16 +197,16 @@ def test_every_fault_is_a_stop_with_a_name(client, faulty, panda):
     ],
     ids=lambda x: x.kind if isinstance(x, Fault) else "",
 )
-def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
-    """The episode ends with libfranka's reason and keeps what it saw; the next one, when it is cleared, runs."""
+def test_a_fault_in_an_episode_is_logged(fault, reason, client, panda):
+    """The episode ends with libfranka's reason and a log; after clearing, the next one runs."""
     _, make, version = client
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
-    with Emulator(partial(Twin, panda, SEED), version=version, faults=[fault]) as address:
+    with Emulator(partial(RigidTwin, panda, SEED), version=version, faults=[fault]) as address:
         arm = make(panda, address, operator=lambda reason: True)
         starts = np.stack([panda.q_home, panda.q_home])
         goals = fixed_episodes(panda, task, 2)[1]
-        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
+        driven = PolicyRunner(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
         stops = driven.stops
         arm.close()
@@ -217,15 +219,15 @@ def test_a_fault_in_a_deployed_episode_is_kept(fault, reason, client, panda):
     assert np.isfinite(episodes.q).all()
 
 
-def test_a_stop_button_ends_a_deployment(client, panda):
-    """A reflex can be cleared, a pressed button cannot: the episode ends, and no other one begins."""
+def test_a_pressed_stop_button_ends_the_run(client, panda):
+    """A pressed button cannot be cleared: the episode ends, and no other one begins."""
     _, make, version = client
     task = ReachTask(episode_s=0.2)
     torch.manual_seed(0)
-    with Emulator(partial(Twin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
+    with Emulator(partial(RigidTwin, panda, SEED), version=version, faults=[Fault("estop", 40)]) as address:
         arm = make(panda, address, operator=lambda reason: True)
         starts, goals = np.stack([panda.q_home, panda.q_home]), fixed_episodes(panda, task, 2)[1]
-        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
+        driven = PolicyRunner(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, starts, goals)
         stops = driven.stops
         arm.close()
@@ -235,8 +237,8 @@ def test_a_stop_button_ends_a_deployment(client, panda):
     assert np.isinf(episodes.distance[:, -1]).all()
 
 
-def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
-    """Without consent `move_to` refuses; what the arm would not take is refused before it is sent."""
+def test_only_an_operator_clears_a_reflex(client, panda):
+    """Without consent `move_to` refuses; a command beyond the limits is not sent."""
     _, make, version = client
     with Emulator(partial(Bare, panda), version=version, faults=[Fault("joint_limit", 3)]) as address:
         arm = make(panda, address)
@@ -254,73 +256,72 @@ def test_a_reflex_is_cleared_by_an_operator_only(client, panda):
             drive(arm, 2, BARE)
             with pytest.raises(ArmStopped, match=reason):
                 arm.command(bad)
-        assert np.abs(arm.read().dq).max() < 0.05  # it was brought to rest
+        assert np.abs(arm.read().dq).max() < 0.05  # at rest
         with pytest.raises(ArmStopped, match="joint 2: position 3"):
             arm.move_to(np.array([0, 3, 0, -2, 0, 1, 0]))
         arm.close()
 
 
-@pytest.mark.slow  # without a wire: test_driven.py
-def test_pressed_and_released_counts_as_pressed(client, panda):
-    """An idle arm whose button was released does not move before the operator agreed; then it does."""
+@pytest.mark.slow  # without a wire: test_command_loop.py
+def test_a_released_stop_button_still_needs_consent(client, panda):
+    """After the button's release the arm moves only with the operator's consent."""
     _, make, version = client
     with Emulator(partial(Bare, panda), version=version, faults=[Fault("press", 10, cycles=40)]) as address:
-        answers, asked = iter((False, True)), []
-        arm = make(panda, address, operator=lambda reason: asked.append(reason) or next(answers))
+        answers, questions = iter((False, True)), []
+        arm = make(panda, address, operator=lambda reason: questions.append(reason) or next(answers))
         arm.move_to(panda.q_home)
         with pytest.raises(ArmStopped, match=r"User Stop|user stop|emergency"):
             drive(arm, 60, BARE)
         time.sleep(0.3)  # an idle emulator passes 20 ms of the arm in as many of the clock
-        assert int(arm._client.idle().robot_mode) == fci.IDLE  # it would move
+        assert int(arm._client.idle().robot_mode) == fci.IDLE  # ready to move
         with pytest.raises(NotCleared, match="no operator agreed"):
             arm.move_to(panda.q_home)
         arm.move_to(panda.q_home)
         drive(arm, 20, BARE)
-        assert len(asked) == 2
+        assert len(questions) == 2
         arm.close()
 
 
-def held(robot):
-    """Return an arm of known truth whose links can be held."""
+def holdable(robot):
+    """Return a simulated arm, which supports the fault 'hold'."""
     return SimulatedArm(robot, nominal_dynamics(robot, **conf("friction/paper")), position_noise=0, velocity_noise=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cautious", [True, False])
-def test_who_holds_a_link_on_the_way(cautious, client, panda):
-    """The arm stops itself at its threshold; without thresholds the way is given up, and presses no harder than its
-    share of the torque on the way.
-    """
+def test_a_held_link_meets_a_bounded_force(cautious, client, panda):
+    """The arm stops itself at its threshold; with high thresholds `move_to` gives up within its torque share."""
     _, make, version = client
-    collision = Collision([5.0] * 7, CAUTIOUS.force) if cautious else Collision([1e3] * 7, [1e3] * 6)
-    with Emulator(partial(held, panda), version=version, faults=[Fault("hold", 300, cycles=10_000)]) as address:
-        arm = make(panda, address, operator=lambda reason: False, collision=collision)
-        told, send = [], arm._client.exchange
-        arm._client.exchange = lambda tau: told.append(tau) or send(tau)
-        reason = "joint_reflex" if cautious else r"joint 1 is 0.10\d rad off its way"
+    torque, force = ([5.0] * 7, CAUTIOUS.force) if cautious else ([1e3] * 7, [1e3] * 6)
+    with Emulator(partial(holdable, panda), version=version, faults=[Fault("hold", 300, cycles=10_000)]) as address:
+        arm = make(panda, address, operator=lambda _: False, collision_torque=torque, collision_force=force)
+        sent, send = [], arm._client.exchange
+        arm._client.exchange = lambda tau: sent.append(tau) or send(tau)
+        reason = "joint_reflex" if cautious else r"joint 1 is 0.10\d rad off its path"
         with pytest.raises(ArmStopped, match=reason):
             arm.move_to(arm.read().q + np.array([0.5, 0, 0, 0, 0, 0, 0]))
-        assert np.abs(told).max(0)[0] <= (5.0 + 2.5 if cautious else TORQUE_SHARE * 87) + 1e-6  # friction, and 15 Hz
+        most = 5.0 + 2.5 if cautious else TORQUE_SHARE * 87  # the threshold, plus friction and the filter's lag
+        assert np.abs(sent).max(0)[0] <= most + 1e-6
         with pytest.raises(NotCleared, match="no operator agreed"):
             arm.move_to(arm.read().q)
         arm.close()
 
 
-def test_what_cannot_be_held(panda):
-    """A fault that the arm behind the emulator cannot have is one line."""
-    with pytest.raises(UserError, match="fault 'hold': Bare has nothing that could push it"):
+def test_wrong_faults_and_thresholds_are_refused(panda):
+    """Each error is one line."""
+    with pytest.raises(UserError, match="fault 'hold': Bare has no attribute 'external'"):
         Control(Bare(panda), 5, [Fault("hold", 3)])
-    with pytest.raises(UserError, match="collision_torque: 3 numbers, allowed are 7"):
-        Collision([1.0] * 3, CAUTIOUS.force)
-    with pytest.raises(UserError, match=r"collision_force: 0.0 is not allowed"):
-        Collision(CAUTIOUS.torque, [0.0] * 6)
+    with pytest.raises(UserError, match="collision_torque: expected 7 numbers, got 3"):
+        CollisionThresholds([1.0] * 3, CAUTIOUS.force)
+    with pytest.raises(UserError, match=r"collision_force: expected .*, got 0.0"):
+        CollisionThresholds(CAUTIOUS.torque, [0.0] * 6)
 
 
-@pytest.mark.slow  # on a loaded machine the clients give up, and say so
+@pytest.mark.slow  # a loaded machine makes the clients time out
 def test_real_time_does_not_wait(client, panda):
-    """At 1 kHz a client that stalls loses its motion; a machine that stalls a little does not."""
+    """At 1 kHz a stalling client loses its motion; a short stall of the computer does not matter."""
     _, make, version = client
-    with Emulator(partial(Bare, panda), version=version, realtime=True, patience=400) as address:
+    with Emulator(partial(Bare, panda), version=version, realtime=True, max_missed=400) as address:
         arm = make(panda, address, operator=lambda reason: True)
         arm.move_to(panda.q_home)
         drive(arm, 200, BARE)
@@ -334,16 +335,16 @@ def test_real_time_does_not_wait(client, panda):
         arm.close()
 
 
-@pytest.mark.slow  # in real time: on a machine with nothing else to do
+@pytest.mark.slow  # in real time it needs an idle machine
 @pytest.mark.parametrize("realtime", [False, True])
 def test_twenty_episodes_complete(realtime, client, panda):
-    """With the collision reflex at its cautious thresholds and nobody who would let the arm go on after a stop."""
+    """With cautious collision thresholds and an operator who never consents."""
     _, make, version = client
     task = ReachTask(episode_s=1.0)
     torch.manual_seed(0)
-    with Emulator(partial(Twin, panda, SEED), version=version, realtime=realtime) as address:
+    with Emulator(partial(RigidTwin, panda, SEED), version=version, realtime=realtime) as address:
         arm = make(panda, address, operator=lambda reason: False)
-        driven = DrivenArm(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
+        driven = PolicyRunner(arm, task, nominal_dynamics(arm.robot, **conf("friction/paper")).level)
         episodes = rollout(make_policy(panda, task, (8,)), driven, task, *fixed_episodes(panda, task, 20))
         arm.close()
     assert [str(stop) for stop in driven.stops] == []
@@ -351,26 +352,26 @@ def test_twenty_episodes_complete(realtime, client, panda):
     assert np.isfinite(episodes.distance).all()
 
 
-def test_the_other_robot_and_nobody(client, servers, panda):
-    """A wrong version, and an address where nothing answers, give one line with libfranka's reason."""
+def test_wrong_versions_and_addresses_are_one_line(client, servers, panda):
+    """A wrong version or an address without server gives one line with libfranka's reason."""
     name, make, version = client
     other = 15 - version
     for address in servers["fr3" if name == "panda" else "panda"]:
         with pytest.raises(UserError, match=rf"arm={name}: .*version:? {other}") as wrong:
             make(panda, address)
         assert "\n" not in str(wrong.value)
-    with pytest.raises(UserError, match=f"arm={name}: no connection to 127.1.2.3: libfranka") as nobody:
+    with pytest.raises(UserError, match=f"arm={name}: no connection to 127.1.2.3: libfranka") as missing:
         make(panda, "127.1.2.3")
-    assert "\n" not in str(nobody.value)
+    assert "\n" not in str(missing.value)
 
 
 @pytest.mark.parametrize(
     ("desk", "control", "there"),
     [("silent", "silent", False), ("refused", "silent", True), ("open", "silent", True), ("silent", "refused", True)],
 )
-def test_an_address_that_is_silent_is_said_within_seconds(desk, control, there, monkeypatch):
-    """It would take libfranka a minute. Who refuses is there, also who answers at one port alone."""
-    answers, waited = {franka.DESK: desk, fci.PORT: control}, []
+def test_an_unreachable_address_is_found_within_seconds(desk, control, there, monkeypatch):
+    """A refusal or one open port counts as reachable; libfranka itself would wait a minute."""
+    answers, waited = {libfranka.DESK_PORT: desk, fci.PORT: control}, []
 
     def create_connection(place, timeout):
         waited.append(timeout)
@@ -378,18 +379,18 @@ def test_an_address_that_is_silent_is_said_within_seconds(desk, control, there, 
             return SimpleNamespace(close=lambda: None)
         raise TimeoutError if answers[place[1]] == "silent" else ConnectionRefusedError
 
-    monkeypatch.setattr(franka.socket, "create_connection", create_connection)
+    monkeypatch.setattr(libfranka.socket, "create_connection", create_connection)
     if there:
-        assert franka.connect(lambda: "a robot", "panda", "172.16.0.2") == "a robot"
+        assert libfranka.connect(lambda: "a robot", "panda", "172.16.0.2") == "a robot"
     else:
-        with pytest.raises(UserError, match=r"arm=panda: no connection to 172.16.0.2: nothing there answers"):
-            franka.connect(pytest.fail, "panda", "172.16.0.2")
+        with pytest.raises(UserError, match=r"arm=panda: no connection to 172.16.0.2: no answer"):
+            libfranka.connect(pytest.fail, "panda", "172.16.0.2")
     assert sum(waited) < 10
 
 
 @pytest.mark.parametrize("name", CLIENTS)
 def test_a_missing_package_is_named(name, panda, monkeypatch):
-    """Without its client package an adapter says which extra to install."""
+    """The error names the extra to install."""
     package, make, _ = CLIENTS[name]
     for module in (package, package.split(".")[0]):
         monkeypatch.setitem(sys.modules, module, None)
@@ -398,12 +399,12 @@ def test_a_missing_package_is_named(name, panda, monkeypatch):
 
 
 def alive(process):
-    """Return whether a process runs; one that nobody has buried does not."""
+    """Return whether a process runs; a zombie does not."""
     return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
 
 
 def test_the_process_dies_with_its_parent(tmp_path):
-    """Even a parent that is killed leaves no server behind."""
+    """A killed parent leaves no server behind."""
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, sys, time\n"
@@ -427,17 +428,17 @@ def test_the_process_dies_with_its_parent(tmp_path):
     assert not alive(child)
 
 
-def test_what_the_emulator_does_not_speak(panda):
-    """A wrong version, address or fault is one line; a free address is found, a taken one is said."""
-    with pytest.raises(UserError, match="version 5, 10, not 7"):
+def test_wrong_emulator_settings_are_one_line(panda):
+    """A wrong version, address or fault is one line; so is a port in use; by default a free address is found."""
+    with pytest.raises(UserError, match="version 7; allowed: 5, 10"):
         Emulator(partial(Bare, panda), version=7)
-    with pytest.raises(UserError, match=r"'192.168.0.1' must be a loopback one"):
+    with pytest.raises(UserError, match=r"'192.168.0.1'; allowed: loopback"):
         Emulator(partial(Bare, panda), version=5, address="192.168.0.1")
-    with pytest.raises(UserError, match=r"fault 'e-stop': allowed are .*; did you mean 'estop'"):
+    with pytest.raises(UserError, match=r"fault: 'e-stop'; allowed: .*; did you mean 'estop'"):
         Fault("e-stop", 3)
     with pytest.raises(UserError, match="cycle=-1"):
         Fault("late", -1)
-    with listen() as one, listen() as other:
+    with open_port() as one, open_port() as other:
         assert one.getsockname()[0] != other.getsockname()[0]
         taken = one.getsockname()[0]
         emulator = Emulator(partial(Bare, panda), version=5, address=taken)
@@ -448,35 +449,35 @@ def test_what_the_emulator_does_not_speak(panda):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--address", "10.0.0.1"], "emulator: address '10.0.0.1' must be a loopback one"),
-        (["--fault", "drop", "soon"], "--fault drop soon: it is KIND CYCLE"),
-        (["--fault", "late"], "--fault late: it is KIND CYCLE"),
+        (["--address", "10.0.0.1"], "emulator: address '10.0.0.1'; allowed: loopback"),
+        (["--fault", "drop", "soon"], "--fault drop soon: expected KIND CYCLE"),
+        (["--fault", "late"], "--fault late: expected KIND CYCLE"),
         (["--robot", "no.yaml"], "--robot no.yaml: No such file"),
         (
             ["--robot", f"{ROOT}/conf/robot/fr3.yaml"],
-            f"--robot {ROOT}/conf/robot/fr3.yaml: it goes on from another file",
+            f"--robot {ROOT}/conf/robot/fr3.yaml: it extends another file",
         ),
     ],
 )
-def test_by_hand_a_mistake_is_one_line(arguments, line, capsys):
-    """`python -m r2s.arm.emulator` says what is wrong and exits with 2."""
+def test_a_wrong_command_line_is_one_line(arguments, line, capsys):
+    """`python -m r2s.arm.emulator` prints the error and exits with 2."""
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert end.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith(line)
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert printed.startswith(line)
+    assert printed.count("\n") == 1
 
 
-def test_the_robots_file_of_a_config_is_one_for_an_emulator(panda):
-    """What it says of tasks is left out."""
-    found = load_robot(**_yaml(ROOT / "conf" / "robot" / "panda.yaml"))
+def test_the_emulator_reads_robot_configs(panda):
+    """Keys of tasks are ignored."""
+    found = load_robot(**_read_robot(ROOT / "conf" / "robot" / "panda.yaml"))
     assert found.name == panda.name
     assert np.array_equal(found.q_max, panda.q_max)
 
 
-def test_layout_of_the_wire():
-    """Sizes and places are those that both clients were seen to accept."""
+def test_wire_layout():
+    """Sizes and offsets equal those that both clients accept."""
     for version, size, command, q, tau, mode in ((5, 2373, 370, 1184, 1016, 2364), (10, 1377, 371, 596, 512, 1372)):
         state = fci.STATE[version]
         assert (state.itemsize, fci.COMMAND[version].itemsize) == (size, command)
@@ -485,9 +486,9 @@ def test_layout_of_the_wire():
     assert [fci.REQUESTS[10].index(name) for name in ("SetLoad", "GetRobotModel")] == [9, 11]
 
 
-def test_the_model_that_is_served_is_the_arm(panda):
-    """The URDF that a client of version 10 gets has the arm's kinematics and inertia."""
-    served = mujoco.MjModel.from_xml_string(fci.urdf(panda))
+def test_the_served_urdf_is_the_arm(panda):
+    """GetRobotModel's URDF has the arm's kinematics and inertia."""
+    served = mujoco.MjModel.from_xml_string(urdf(panda))
     ours = panda.model(gravity=True)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -515,7 +516,7 @@ def begun(robot, version=5):
 
 
 def near_limit(robot, room):
-    """Return a robot that starts `room` rad before the upper limit of its last joint."""
+    """Return a robot whose home is `room` rad below the upper limit of its last joint."""
     return replace(robot, q_home=np.array([0, 0, 0, -2, 0, 1, robot.q_max[6] - room]))
 
 
@@ -528,8 +529,8 @@ def near_limit(robot, room):
         (fci.JOINT_POSITION_LIMITS, lambda k: 0.02),
     ],
 )
-def test_reflexes_have_libfrankas_names(place, torque, panda):
-    """Whichever of its limits an arm names, the error has the place that libfranka gives it; and can be cleared."""
+def test_reflexes_set_libfrankas_error_flags(place, torque, panda):
+    """Each violated limit sets libfranka's flag, and can be cleared."""
     control, _ = begun(replace(near_limit(panda, 0.005), tau_max=np.full(7, 1.5)))
     for k in range(200):
         if control.running:
@@ -544,10 +545,10 @@ def test_reflexes_have_libfrankas_names(place, torque, panda):
 
 
 def test_an_fr3_brakes_before_its_limits(panda):
-    """Version 10 refuses a speed near a position limit of an FR3 that version 5 takes."""
+    """Near a position limit version 10 refuses a speed that version 5 allows."""
     wide = replace(panda, q_max=panda.q_max + 0.2)
     for version, goes_on in ((5, True), (10, False)):
-        control, _ = begun(near_limit(wide, wide.q_max[6] - fci.FR3_Q_MAX[6] + 0.02), version)
+        control, _ = begun(near_limit(wide, wide.q_max[6] - fr3_limits.Q_MAX[6] + 0.02), version)
         for _ in range(50):
             if control.running:
                 control.cycle(0.05 * np.eye(7)[6])
@@ -556,7 +557,7 @@ def test_an_fr3_brakes_before_its_limits(panda):
 
 
 def test_an_fr3_has_limits_of_its_own(panda):
-    """Where a Panda's sixth joint may go, at 0.2 rad, version 10 stops; cleared, the arm is back inside."""
+    """Version 10 stops at 0.2 rad of joint 6, which a Panda allows; recovery moves the arm back inside."""
     low = replace(panda, q_home=np.array([0, 0, 0, -2, 0, 0.2, 0]))
     for version, goes_on in ((5, True), (10, False)):
         control, arm = begun(low, version)
@@ -565,11 +566,11 @@ def test_an_fr3_has_limits_of_its_own(panda):
     assert np.flatnonzero(control.state["errors"]).tolist() == [fci.JOINT_POSITION_LIMITS]
     assert "an FR3 allows 0.4398 to 4.6216" in control.stopped_by
     assert control.recover()
-    assert arm.read().q[5] > fci.FR3_Q_MIN[5]
+    assert arm.read().q[5] > fr3_limits.Q_MIN[5]
 
 
 def test_a_missed_answer_repeats_the_last_torque(panda):
-    """19 in a row are borne with the last torque, the 20th ends the motion."""
+    """19 consecutive misses repeat the last torque, the 20th ends the motion."""
     control, arm = begun(panda)
     control.cycle(np.full(7, 0.5))
     for _ in range(19):
@@ -580,4 +581,4 @@ def test_a_missed_answer_repeats_the_last_torque(panda):
     for _ in range(20):
         control.cycle(None)
     assert not control.running
-    assert "20 cycles in a row" in control.stopped_by
+    assert "20 consecutive cycles" in control.stopped_by

@@ -14,11 +14,11 @@ from r2s.engines.interface import MujocoEngine
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.learning.policy import make_policy
-from r2s.learning.randomization import Around
-from r2s.physics.dynamics import HOLDS, nominal_dynamics
+from r2s.learning.randomization import UniformRandomization
+from r2s.physics.dynamics import STICTION_MODELS, nominal_dynamics
 from r2s.physics.robot import load_robot
-from r2s.tasks.episode import rollout
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import rollout
 
 ODD_ARM = """
 <mujoco model="odd">
@@ -159,13 +159,13 @@ def test_wrong_shapes_are_named():
         DartEngine(panda(), gravity=True, masses=np.ones(3))
 
 
-@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("hold", STICTION_MODELS)
 def test_a_policy_meets_the_same_arm_in_every_engine(hold):
     """Friction, breakaway, offsets, the driver's law, delay: an episode in DART is the batch's, within 1e-3 mm."""
     robot, task = load_robot(**conf("robot/panda")), ReachTask(episode_s=0.88, torque_fraction=0.15)
     truth = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-    truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass, hold=hold)
-    draw = Around(robot, truth, phi_relative=0.1, inertia_relative=0.05)
+    truth = replace(truth, delay=2e-3, lag=1e-3, mass=1.1 * robot.mass, stiction_model=hold)
+    draw = UniformRandomization(robot, truth, phi_relative=0.1, inertia_relative=0.05)
     torch.manual_seed(0)
     policy = make_policy(robot, task, (16,))
     starts, goals = fixed_episodes(robot, task, 4)

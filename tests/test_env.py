@@ -14,11 +14,11 @@ from torchrl.envs.utils import check_env_specs
 
 from r2s.errors import UserError
 from r2s.learning.env import TaskEnv
-from r2s.learning.randomization import Around
+from r2s.learning.randomization import UniformRandomization
 from r2s.physics.actuation import Actuation, low_pass_factor
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.tasks.reach import ReachTask, observe
-from r2s.tasks.rewards import DEAREST, PAPER, TERMS, Curriculum, terms
+from r2s.tasks.rewards import MAX_FACTOR, PAPER, TERMS, Curriculum, terms
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/tables.yaml, reward
 
@@ -26,7 +26,7 @@ K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # shared/paper/table
 @pytest.fixture(scope="module")
 def draw(panda):
     center = nominal_dynamics(panda, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
-    return Around(panda, center, **conf("dr/paper"))
+    return UniformRandomization(panda, center, **conf("dr/paper"))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_a_partial_reset_leaves_the_other_arms_alone(make):
     assert torch.equal(after["observation"][keep], before["observation"][keep])
     assert (after["observation"][new] != before["observation"][new]).any(-1).all()
     assert torch.equal(after["observation"][new][:, 7:14], torch.zeros(2, 7))  # at rest
-    assert not changed.arms.actuation.last[new].any()
+    assert not changed.arms.sim.effort[new].any()
     action = actions(1, 4, seed=3)[0]
     rows = []
     for env in (changed, untouched):
@@ -172,14 +172,14 @@ def test_commands_keep_the_drivers_limits(panda, scale, seed, cutoff):
 def test_the_environment_commands_what_the_actuation_says(make):
     """Commands never exceed torque_fraction of tau_max, also for actions beyond one."""
     env = make(2)
-    limit = env.task.torque(env.robot)
+    limit = env.task.torque_limit(env.robot)
     state = env.reset()
     for _ in range(8):
         state["action"] = torch.full((2, 7), 50.0)
         state = env.step(state)["next"].exclude("reward")
-        assert np.all(np.abs(env.arms.actuation.last) <= limit)
+        assert np.all(np.abs(env.arms.sim.effort) <= limit)
     slow = limit > 20 * 8  # Nm that the rate limit lets pass in 8 steps
-    np.testing.assert_allclose(env.arms.actuation.last[:, ~slow], np.broadcast_to(limit, (2, 7))[:, ~slow], rtol=1e-6)
+    np.testing.assert_allclose(env.arms.sim.effort[:, ~slow], np.broadcast_to(limit, (2, 7))[:, ~slow], rtol=1e-6)
 
 
 def test_the_law_contains_an_arm_under_full_torque(make):
@@ -240,7 +240,7 @@ def test_the_first_two_terms_are_equation_2(distance, distance0, dq, ddq):
     assert out @ PAPER == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert 0 <= out[TERMS.index("precision")] <= 1  # a bonus
     assert -out[TERMS.index("precision")] <= out[TERMS.index("stillness")] <= 0  # takes away no more than that
-    assert out[TERMS.index("limited")] == -0.3  # a price
+    assert out[TERMS.index("filter_penalty")] == -0.3  # a price
 
 
 def test_the_environments_reward_is_equation_2_of_its_own_motion(make):
@@ -271,28 +271,30 @@ def test_the_curriculum_goes_from_one_end_to_the_other():
     start, end = settings["anneal"]
     first, last = ([1.0, *(settings[name][k] for name in TERMS[1:])] for k in (0, 1))
     for progress, weights in ((0.0, first), (start, first), (end, last), (1.0, last), (2.0, last)):
-        np.testing.assert_allclose(Curriculum(**settings)(progress), weights)
-    np.testing.assert_allclose(Curriculum(**settings)(0.5 * (start + end)), np.mean([first, last], axis=0))
+        np.testing.assert_allclose(Curriculum(**settings).weights(None, progress), weights)
+    np.testing.assert_allclose(
+        Curriculum(**settings).weights(None, 0.5 * (start + end)), np.mean([first, last], axis=0)
+    )
 
 
 @pytest.mark.parametrize("light", [0.08, 0.2, 0.02])
-def test_the_price_of_limits_settles_where_the_share_is_what_was_asked_for(light):
-    """Of policies that are limited in light / price of the cycles: no more than limited_most, the price not lower."""
+def test_the_filter_penalty_settles_at_the_largest_filter_rate(light):
+    """Policies with a filter rate of light / factor end at max_filter_rate; the factor stays at 1 or above."""
     curriculum = Curriculum(**conf("reward/curriculum"))
     progress, factor = curriculum.anneal[0], 1.0
     for _ in range(4000):
-        factor = curriculum.dearer(factor, progress, np.array([-1.0, -1.0, 0.5, -0.3, -light / factor]), 160)
-    assert factor == pytest.approx(min(max(light / curriculum.limited_most, 1.0), DEAREST), rel=1e-3)
-    weights = curriculum(progress), curriculum(progress, factor)
+        factor = curriculum.adapt(factor, progress, np.array([-1.0, -1.0, 0.5, -0.3, -light / factor]), 160)
+    assert factor == pytest.approx(min(max(light / curriculum.max_filter_rate, 1.0), MAX_FACTOR), rel=1e-3)
+    weights = curriculum.weights(None, progress), curriculum.weights(None, progress, factor)
     np.testing.assert_array_equal(weights[1], weights[0] * [1, 1, 1, 1, factor])
 
 
-def test_the_price_of_limits_is_left_alone_before_anything_moves():
-    """While a policy is still wild, and where any share is allowed."""
+def test_the_filter_penalty_is_constant_before_the_curriculum_moves():
+    """Also without max_filter_rate at any time."""
     curriculum, paper = (Curriculum(**conf(f"reward/{name}")) for name in ("curriculum", "paper"))
     always = np.array([-1.0, -1.0, 0.5, -0.3, -1.0])
-    assert curriculum.dearer(1.0, 0.99 * curriculum.anneal[0], always, 10_000) == 1.0
-    assert paper.dearer(1.0, 1.0, always, 10_000) == 1.0
+    assert curriculum.adapt(1.0, 0.99 * curriculum.anneal[0], always, 10_000) == 1.0
+    assert paper.adapt(1.0, 1.0, always, 10_000) == 1.0
 
 
 @pytest.mark.parametrize("worse", [{"success_1cm": 0.99}, {"rest": 0.98}, {"limited": 0.06}, {"return_paper": -91.0}])
@@ -307,7 +309,7 @@ def test_the_policy_that_is_saved_reaches_rests_and_is_let_be(task, worse):
 def test_the_papers_reward_never_changes(progress):
     """conf/reward/paper weighs the terms as eq. (2) does, from the first step to the last."""
     weights = [1.0, 1.0] + [0.0] * (len(TERMS) - 2)
-    assert Curriculum(**conf("reward/paper"))(progress).tolist() == PAPER.tolist() == weights
+    assert Curriculum(**conf("reward/paper")).weights(None, progress).tolist() == PAPER.tolist() == weights
 
 
 def test_goals_lie_in_the_region_and_some_posture_reaches_them(panda, task):
@@ -346,9 +348,9 @@ def test_an_unreachable_region_is_one_line(panda, task):
 
 def test_a_list_of_torque_fractions_must_fit(panda):
     """One share per joint or one for all; another number of them is named."""
-    np.testing.assert_allclose(ReachTask(torque_fraction=(0.1,) * 7).torque(panda), 0.1 * panda.tau_max)
-    with pytest.raises(UserError, match=r"^task\.torque_fraction: 2 values for the 7 joints"):
-        ReachTask(torque_fraction=(0.1, 0.2)).torque(panda)
+    np.testing.assert_allclose(ReachTask(torque_fraction=(0.1,) * 7).torque_limit(panda), 0.1 * panda.tau_max)
+    with pytest.raises(UserError, match=r"^task\.torque_fraction: expected 7 values, for the 7 joints"):
+        ReachTask(torque_fraction=(0.1, 0.2)).torque_limit(panda)
 
 
 def test_the_observation_is_the_one_an_arm_gives(make):
@@ -359,11 +361,11 @@ def test_the_observation_is_the_one_an_arm_gives(make):
     run(env, actions(3, 4))
     seen = env.read()["observation"].numpy()
     kinematics = Kinematics(env.robot)
-    torque = env.task.torque(env.robot)
+    torque = env.task.torque_limit(env.robot)
     for k in range(4):
         q, dq = env.arms.sim.q[k].copy(), env.arms.sim.dq[k].copy()
         ee, jacobian = kinematics(q)
-        effort = env.arms.actuation.last[k][None]
+        effort = env.arms.sim.effort[k][None]
         own = observe(q[None], dq[None], ee[None], env.goal[k][None], jacobian[None], effort, torque)
         np.testing.assert_allclose(own[0], seen[k], atol=1e-6)
 

@@ -1,6 +1,4 @@
-"""Excitations are safe, tell more than chance, run from slow to fast with holds, and survive a file; what is not
-safe is named: which joint or link, by how much, when, and what is allowed.
-"""
+"""Excitations are safe, informative, run from slow to fast with rests, and can be saved; errors name violations."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,12 +8,12 @@ import numpy as np
 import pytest
 from conftest import conf
 
-from r2s.arm.tracking import record
-from r2s.arm.twin import Twin
+from r2s.arm.recorder import record
+from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError
 from r2s.excitation.fourier import fourier, information
 from r2s.excitation.motion import Excitation, load
-from r2s.excitation.safety import (
+from r2s.excitation.motion_checks import (
     CLEARANCE_M,
     TORQUE_SHARE,
     Space,
@@ -53,7 +51,7 @@ def lowest(motion):
 
 
 def message(function, *arguments, **named):
-    """Return the one line that a UserError says."""
+    """Return the line of a UserError."""
     with pytest.raises(UserError) as caught:
         function(*arguments, **named)
     assert "\n" not in str(caught.value)
@@ -79,7 +77,7 @@ def moves(*postures, seconds=2.0):
 
 @pytest.mark.parametrize(("duration", "seed"), [(2.0, 0), (3.0, 1), (7.0, 2), (20.0, 0), (20.0, 1)])
 def test_every_motion_keeps_what_is_allowed(duration, seed):
-    """Limits with room on every sample, torque by another formula, rest at both ends, derivatives that fit."""
+    """Limits at every sample, torque by another formula, rest at both ends, consistent derivatives."""
     r, e = arm(), excited(duration, seed)
     check_motion(r, e)
     assert len(e.t) == round(1000 * duration) + 1
@@ -107,7 +105,7 @@ def test_slow_and_fast_in_both_directions_and_still_in_between(seed):
             assert np.mean(direction > 0.2) > 0.01
     still = np.abs(e.dq).max(1) < 1e-9
     rests = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]]))).reshape(-1, 2)
-    rests = rests[np.diff(rests).ravel() >= 100]  # not the instant of a turn
+    rests = rests[np.diff(rests).ravel() >= 100]  # not the instant of a reversal
     assert len(rests) == 2 + 4
     assert np.all(np.diff(rests[1:-1]) >= 399)
     rungs = [slice(a, b) for a, b in zip(rests[:-1, 1], rests[1:, 0], strict=True)]
@@ -118,7 +116,7 @@ def test_slow_and_fast_in_both_directions_and_still_in_between(seed):
 
 
 @pytest.mark.parametrize("gravity", [False, True])
-def test_the_search_tells_more_than_chance(gravity):
+def test_the_search_increases_the_information(gravity):
     """More information than the median random draw, and than any of them here."""
     chance = [information(arm(), excited(6.0, seed, effort=0), gravity=gravity) for seed in range(7)]
     found = information(arm(), excited(6.0, 0, effort=200, gravity=gravity), gravity=gravity)
@@ -127,7 +125,7 @@ def test_the_search_tells_more_than_chance(gravity):
 
 
 def test_information_counts_what_moves():
-    """Nothing is told at rest; a longer motion tells more; a joint that stands tells nothing of itself."""
+    """Rest has no information, a longer motion has more, and a joint at rest gives none about itself."""
     e = excited(3.0, 1)
     still = Excitation(e.t, np.tile(arm().q_home, (len(e.t), 1)), 0 * e.dq, 0 * e.ddq)
     assert information(arm(), still) == pytest.approx(0)
@@ -144,14 +142,14 @@ def test_the_same_seed_is_the_same_motion_and_never_a_period():
     )
     assert np.abs(again.q - other.q).max() > 0.1
     e = excited(20.0, 0)
-    assert Recording(e.t, e.q, e.dq, 0 * e.q, "commanded").repeats_after() is None
+    assert Recording(e.t, e.q, e.dq, 0 * e.q, "commanded").find_period() is None
 
 
 @pytest.mark.parametrize(("duration", "seed"), [(3.0, 1), (10.0, 0)])
 def test_an_arm_follows(duration, seed):
-    """The twin runs it without a stop, within the clearance that the checks keep, but for the light wrist's turn."""
+    """The twin runs it without a stop, within the clearance of the checks, except for the light wrist."""
     e = excited(duration, seed)
-    off = np.abs(record(Twin(arm(), 0), e).q - e.q)
+    off = np.abs(record(RigidTwin(arm(), 0), e).q - e.q)
     assert off[:, :6].max() < 0.08
     assert off.max() < 0.15
 
@@ -159,23 +157,23 @@ def test_an_arm_follows(duration, seed):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"q_center": np.zeros(7)}, ["q_center", "joint 4 at 0 rad", "-3.0718 to -0.0698"]),
-        ({"q_center": np.zeros(3)}, ["q_center", "3 values for 7 joints"]),
-        ({"duration": 0.1}, ["duration=0.1 s", "2 to 120 s"]),
-        ({"duration": np.nan}, ["duration=nan s"]),
-        ({"effort": -1}, ["effort=-1"]),
+        ({"q_center": np.zeros(7)}, ["q_center", "-3.0718 to -0.0698", "got 0 (joint 4)"]),
+        ({"q_center": np.zeros(3)}, ["q_center", "expected 7 values, got 3"]),
+        ({"duration": 0.1}, ["duration: expected 2 to 120 s, got 0.1"]),
+        ({"duration": np.nan}, ["got nan"]),
+        ({"effort": -1}, ["effort: expected", "got -1"]),
         ({"z_min": 2.0}, ["the end effector is 0.5", "above the base plane at robot.q_home", "2 m or more"]),
         ({"q_center": [0, 1.7, 0, -0.4, 0, 1.5, 0]}, ["m above the base plane at excitation.q_center"]),
         ({"table": 0.3}, ["'link2' reaches", "below the table at 0.3 m already at robot.q_home", "-inf"]),
     ],
 )
-def test_what_cannot_be_is_refused(arguments, words):
-    said = message(fourier, arm(), **({"duration": 5.0, "seed": 0} | arguments))
+def test_wrong_arguments_are_errors(arguments, words):
+    text = message(fourier, arm(), **({"duration": 5.0, "seed": 0} | arguments))
     for word in words:
-        assert word in said
+        assert word in text
 
 
-def test_a_cramped_place_makes_the_motion_smaller():
+def test_obstacles_reduce_the_amplitude():
     """Under a floor higher than it went the same draw shrinks, and stays above it."""
     low = excited(6.0, 3, effort=0, z_min=0.1)
     floor = lowest(low) + 0.05
@@ -208,37 +206,37 @@ def home(**change):
         ([home(), home(q6=3.6)], ["'link5' is 0.02", "m from link 'link7' at 1.", "0.03 m or more"]),
     ],
 )
-def test_what_is_forbidden_is_named(postures, words):
+def test_violations_are_named(postures, words):
     """Joint or link, the value, when, and what is allowed, in one line."""
     e = moves(*postures)
-    said = message(check_motion, arm(), e)
-    assert said.startswith("excitation: ")
+    text = message(check_motion, arm(), e)
+    assert text.startswith("excitation: ")
     for word in words:
-        assert word in said
+        assert word in text
 
 
 def test_links_above_the_table_and_links_apart():
-    """Not only the hand is watched: an arm laid down touches the table, one turned inwards its own base."""
+    """All links are checked: an arm that lies down touches the table, a folded one its own base."""
     down = moves(home(), home(q2=0.9, q4=-2.0))
-    said = message(check_space, arm(), down, z_min=-np.inf)
-    assert said.startswith("excitation: link 'link7' is 0.02")
-    assert "m above the table at 1." in said
-    assert said.endswith(f"allowed {CLEARANCE_M} m or more")
+    text = message(check_space, arm(), down, z_min=-np.inf)
+    assert text.startswith("excitation: link 'link7' is 0.02")
+    assert "m above the table at 1." in text
+    assert text.endswith(f"allowed {CLEARANCE_M} m or more")
     check_space(arm(), down, z_min=-np.inf, table=-0.2)
     inwards = moves(home(), home(q2=0.3, q4=-3.0, q6=0.6))
-    said = message(check_space, arm(), inwards, z_min=-np.inf, table=-np.inf)
-    assert "link 'link0' is 0.0" in said
-    assert " m from link 'link" in said
+    text = message(check_space, arm(), inwards, z_min=-np.inf, table=-np.inf)
+    assert "link 'link0' is 0.0" in text
+    assert " m from link 'link" in text
 
 
 def test_torque_counts_gravity_dynamics_and_friction():
-    """What the strong arm may do, one with less torque may not; held still, gravity alone decides."""
+    """A motion of the strong arm exceeds the limits of a weaker one; at rest only gravity counts."""
     out = moves(home(), home(q2=0.9, q4=-0.3), seconds=5.0)
     check_torque(arm(), out)
     weak = replace(arm(), tau_max=arm().tau_max * [1, 0.6, 1, 1, 1, 1, 1])
-    said = message(check_torque, weak, out)
-    assert "torque of joint 2 is 41.8" in said
-    assert "allowed 41.76 Nm, 80 % of tau_max" in said
+    text = message(check_torque, weak, out)
+    assert "torque of joint 2 is 41.8" in text
+    assert "allowed 41.76 Nm, 80 % of tau_max" in text
     still = replace(out, q=np.tile(out.q[-1], (len(out.t), 1)), dq=0 * out.dq, ddq=0 * out.ddq)
     assert "at 0.000 s" in message(check_torque, weak, still)
 
@@ -246,15 +244,15 @@ def test_torque_counts_gravity_dynamics_and_friction():
 def test_a_motion_must_be_one():
     e = excited(3.0, 1)
     jump = replace(e, q=e.q + 0.01 * (np.arange(len(e.t)) >= 1000)[:, None] * np.eye(7)[2])
-    said = message(check_motion, arm(), jump)
-    assert "dq of joint 3" in said
-    assert "off the slope of q at 0.999 s" in said
+    text = message(check_motion, arm(), jump)
+    assert "dq of joint 3" in text
+    assert "off the slope of q at 0.999 s" in text
     cut = Excitation(*(x[: len(e.t) // 2] for x in vars(e).values()))
-    assert "begins and ends at rest" in message(check_motion, arm(), cut)
+    assert "expected 0 at both ends" in message(check_motion, arm(), cut)
     holed = e.q.copy()
     holed[5, 1] = np.nan
     assert "q of joint 2 is nan at 0.005 s" in message(check_shape, arm(), replace(e, q=holed))
-    assert "steps by 0.002 s" in message(check_shape, arm(), replace(e, t=2 * e.t))
+    assert "a time step of 0.001 s, got 0.002 s" in message(check_shape, arm(), replace(e, t=2 * e.t))
     assert "(3001, 6)" in message(check_shape, arm(), replace(e, ddq=e.ddq[:, :6]))
     check_limits(arm(), e)
 
@@ -283,8 +281,8 @@ SHAPES = """
 TABLE = '<geom name="table" type="box" size="9 9 1" pos="0 0 -1"/>'
 
 
-def test_the_lowest_point_of_every_shape_is_what_mujoco_says(tmp_path):
-    """Heights equal the engine's own distance to a box whose top is the plane; what no joint lifts is left out."""
+def test_the_lowest_point_of_every_shape_is_mujocos(tmp_path):
+    """Heights equal MuJoCo's distance to a box below the plane; links at constant height do not count."""
     path = tmp_path / "shapes.xml"
     path.write_text(SHAPES.format(table=""))
     robot = load_robot(str(path), tau_max=[50, 50, 50])
@@ -302,7 +300,7 @@ def test_the_lowest_point_of_every_shape_is_what_mujoco_says(tmp_path):
         np.testing.assert_allclose(seen, expected, atol=2e-5)
 
 
-def test_what_the_checks_watch_of_a_panda():
+def test_the_checked_pairs_of_a_panda():
     """All of links 2 to 7 above the table; of the pairs only joint housings are left out; home is clear of all."""
     space = Space(arm())
     watched = {space.model.body(space.model.geom_bodyid[g]).name for g in space.above}
@@ -328,7 +326,7 @@ def test_a_saved_excitation_comes_back(tmp_path):
     for name in ("t", "q", "dq", "ddq"):
         np.testing.assert_allclose(getattr(back, name), getattr(e, name), rtol=1e-11, atol=1e-14)
     assert [p.name for p in tmp_path.iterdir()] == ["motion.csv"]
-    assert "'motion.txt' ends in '.txt'" in message(e.save, tmp_path / "motion.txt")
+    assert "a file name ending in .csv, got 'motion.txt'" in message(e.save, tmp_path / "motion.txt")
 
 
 def edited(lines, row, column, value):
@@ -340,29 +338,29 @@ def edited(lines, row, column, value):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda x: edited(x, 0, 2, "q_2"), ["no column 'q2'", "t, q1..q7, dq1..dq7, ddq1..ddq7"]),
-        (lambda x: edited(x, 0, 2, "Q2"), ["no column 'q2'", "did you mean 'Q2'?"]),
+        (lambda x: edited(x, 0, 2, "q_2"), ["got no 'q2'", "t, q1..q7, dq1..dq7, ddq1..ddq7"]),
+        (lambda x: edited(x, 0, 2, "Q2"), ["got no 'q2'", "did you mean 'Q2'?"]),
         (lambda x: edited(x, 10, 2, "fast"), ["not a table of numbers", "fast"]),
         (lambda x: [*x[:50], x[50] + ",1", *x[51:]], ["not a table of numbers", "columns"]),
         (lambda x: edited(x, 10, 2, "nan"), ["q of joint 2 is nan at 0.009 s"]),
-        (lambda x: edited(x, 10, 0, "0.0095"), ["t steps by 0.0015 s at 0.008 s"]),
+        (lambda x: edited(x, 10, 0, "0.0095"), ["got 0.0015 s at 0.008 s"]),
         (lambda x: edited(x, 1000, 3, "4"), ["position of joint 3 is 4 rad at 0.999 s"]),
         (lambda x: edited(x, 1000, 3, "0.3"), ["dq of joint 3", "off the slope of q at 0.99"]),
-        (lambda x: x[:1000], ["at 0.998 s; a motion begins and ends at rest"]),
+        (lambda x: x[:1000], ["at 0.998 s; expected 0 at both ends"]),
         (lambda x: x[:1], ["0 rows"]),
-        (lambda x: [], ["no column 't'"]),
-        (lambda x: [x[0] + ",q8", *(y + ",0" for y in x[1:])], ["moves joint 8", "has 7 joints"]),
-        (lambda x: [x[0], *(y + ",0" for y in x[1:])], ["22 names but 23 columns"]),
+        (lambda x: [], ["got no 't'"]),
+        (lambda x: [x[0] + ",q8", *(y + ",0" for y in x[1:])], ["expected 7 joints", "got joint 8"]),
+        (lambda x: [x[0], *(y + ",0" for y in x[1:])], ["expected 22 columns, got 23"]),
     ],
 )
 def test_a_bad_file_gets_one_line(tmp_path, change, words):
-    """The file and what is wrong in it are named; nothing of it is run."""
+    """The error names the file and the problem."""
     path = tmp_path / "motion.csv"
     excited(3.0, 1).save(path)
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
-    said = message(load, path, arm())
+    text = message(load, path, arm())
     for word in [str(path), *words]:
-        assert word in said
+        assert word in text
 
 
 def test_no_file_and_no_text(tmp_path):
@@ -373,8 +371,8 @@ def test_no_file_and_no_text(tmp_path):
     assert "not a table of numbers" in message(load, tmp_path / "noise.csv", arm())
 
 
-def test_a_file_for_another_place_is_refused(tmp_path):
-    """A motion that is safe where it was made is checked where it is to run."""
+def test_a_file_is_checked_for_the_present_robot(tmp_path):
+    """`load` checks a motion for the present table and robot."""
     excited(3.0, 1).save(tmp_path / "motion.csv")
     floor = lowest(excited(3.0, 1)) + 0.02
     assert "above the base plane" in message(load, tmp_path / "motion.csv", arm(), z_min=floor)

@@ -21,8 +21,9 @@ import yaml
 from conftest import ROOT, conf
 
 from r2s import commands
-from r2s.arm.deploy import as_state, episode_driver
 from r2s.arm.interface import ArmState
+from r2s.arm.policy_runner import as_state, episode_driver
+from r2s.control.torque import torque as torque_control
 from r2s.errors import UserError
 from r2s.export.bundle import one_file
 from r2s.export.card import card
@@ -33,6 +34,7 @@ from r2s.learning.policy import export_onnx, make_policy, save_policy
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot, load_robot
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.task import observation_scale, observe
 
 EPISODE = 50  # cycles, of hostile motion
 LIBFRANKA = ROOT / "examples" / "libfranka"
@@ -130,7 +132,7 @@ def hostile(robot: Robot, task: Any, cycles: int) -> dict[str, np.ndarray]:
     )
     share = rng.choice([0.05, 0.3, 0.6, 3.0], (cycles, 1), p=[0.4, 0.4, 0.17, 0.03])
     q, dq = inside[jumps], (share * rng.uniform(-1, 1, (cycles, n)) * robot.dq_max)[jumps]
-    target = 3 * rng.normal(size=(cycles, n)) * task.torque(robot)
+    target = 3 * rng.normal(size=(cycles, n)) * task.torque_limit(robot)
     for values, odd in ((q, 0.002), (dq, 0.002), (target, 0.02)):
         rows = np.flatnonzero(rng.random(cycles) < odd)
         values[rows, rng.integers(n, size=len(rows))] = rng.choice([np.nan, np.inf, -np.inf], len(rows))
@@ -188,7 +190,7 @@ def test_so_it_is_for_other_arms(arm, panda):
     """With rotors of its own and identified ones, joints that turn without end, less speed near position limits."""
     slow = (np.full(7, 6.0), np.full(7, 0.3))
     file = ROOT / "tests" / "models" / "six_joints.xml" if arm == "six_joints" else f"r2s:models/{arm}.xml"
-    robot = replace(panda, slowing=slow) if arm == "fr3" else load_robot(str(file))
+    robot = replace(panda, velocity_envelope=slow) if arm == "fr3" else load_robot(str(file))
     if arm == "six_joints":
         robot = replace(robot, armature=np.full(6, 0.1))
     task, friction = ReachTask(reach=None, height=-9.0, azimuth=3.2), np.linspace(0.0, 1.0, robot.n)
@@ -205,7 +207,7 @@ def by_r2s(exported: Exported, motion: dict[str, np.ndarray]) -> dict[str, np.nd
     arm, and is done.
     """
     robot, task = exported.robot, exported.task
-    torque, kinematics = task.torque(robot), Kinematics(robot)
+    torque, kinematics, control = task.torque_limit(robot), Kinematics(robot), task.control(robot)
     driver, cycles = episode_driver(robot, task, 0.0, exported.friction), len(motion["q"])
     tau, last = np.zeros((2, cycles, robot.n))
     stops = np.zeros((cycles, 2), dtype=bool)
@@ -221,8 +223,8 @@ def by_r2s(exported: Exported, motion: dict[str, np.ndarray]) -> dict[str, np.nd
             told = as_state(kinematics, state, driver.effort, False, share)
             goal = motion["goal"][motion["which"][k], None]
             with torch.no_grad():
-                action = exported.policy.action(torch.from_numpy(task.observe(told, goal, torque))).numpy()
-            target = task.target(action.astype(float), told, goal, torque)[0]
+                action = exported.policy.action(torch.from_numpy(observe(task, control, told, goal, torque))).numpy()
+            target = control.command(action.astype(float), task, told.t, goal)[0]
         tau[k], stops[k] = driver(state, target), (driver.stopping is not None, driver.done)
     return motion | {"tau": tau, "last": last, "stops": stops}
 
@@ -231,7 +233,7 @@ def compare(exported: Exported, runtime: ModuleType, motion: dict[str, np.ndarra
     """Return the largest difference of Runtime and `by_r2s`, of the most that is asked for, over a hostile motion."""
     other, torque = (
         runtime.Runtime(exported.folder, runtime.Arm(**arm_of(exported))),
-        exported.task.torque(exported.robot),
+        exported.task.torque_limit(exported.robot),
     )
     motion, worst, goals, plans = by_r2s(exported, motion), 0.0, list(motion["goal"]), motion["goal"].ndim == 3
     for k, (begin, which) in enumerate(zip(motion["begin"], motion["which"], strict=True)):
@@ -265,11 +267,13 @@ int main() {  // q, dq, tau_J_d, target, goal, is it said, does a motion begin; 
   double x[4 * n + 5];
   while (std::fread(x, sizeof *x, 4 * n + 5, stdin) == 4 * n + 5) {
     law::Joints v[4];
+    law::Command command;
     for (int k = 0; k < 4 * n; ++k) v[k / n][k % n] = x[k];
+    for (int k = 0; k < contract::actions; ++k) command[k] = v[3][k];
     if (x[4 * n + 4] > 0) driver = law::Driver();
     driver.model.place(v[0]);
     const auto seen = law::observe(driver, v[0], v[1], {x[4 * n], x[4 * n + 1], x[4 * n + 2]});
-    const law::Joints tau = driver(v[0], v[1], v[2], x[4 * n + 3] > 0 ? &v[3] : nullptr);
+    const law::Joints tau = driver(v[0], v[1], v[2], x[4 * n + 3] > 0 ? &command : nullptr);
     std::fwrite(tau.data(), sizeof *x, n, stdout);
     for (double s : seen) std::fwrite(&s, sizeof s, 1, stdout);
   }
@@ -291,7 +295,7 @@ def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
     n = exported.robot.n
     got = np.frombuffer(done.stdout).reshape(len(sent), -1)
     assert np.abs(got[:, :n] - motion["tau"]).max() < LAW_NM
-    kinematics, torque = Kinematics(exported.robot), exported.task.torque(exported.robot)
+    kinematics, torque = Kinematics(exported.robot), exported.task.torque_limit(exported.robot)
     k = next(k for k in range(len(sent)) if motion["begin"][k] and np.isfinite(sent[k]).all())  # the effort is zero
     state = ArmState(0.0, motion["q"][k], motion["dq"][k], np.zeros(n), np.zeros(n))
     told = as_state(kinematics, state, np.zeros(n), False, 0.0)
@@ -333,7 +337,7 @@ def test_the_bundle_is_whole(exported, runtime):
     assert {f"model/arm.{kind}" for kind in ("xml", "urdf", "sdf")} <= there
     model = mujoco.MjModel.from_xml_path(str(exported.folder / "model" / "arm.xml"))
     assert np.allclose(model.body_mass[1:].sum(), exported.robot.mass.sum())
-    assert contract["observation"]["size"] == len(exported.task.observation_scale(exported.robot)[0])
+    assert contract["observation"]["size"] == len(observation_scale(exported.task, exported.robot)[0])
 
 
 def test_the_runtime_says_what_a_bundle_wants(exported, runtime, tmp_path, monkeypatch, capsys):
@@ -372,7 +376,7 @@ def test_the_card_of_a_policy_that_follows_paths_says_errors_in_mm(exported, tmp
     assert "follows timed paths" in head
     assert "points" not in head
     assert isinstance(table, pd.DataFrame)
-    assert list(table.index) == ["MuJoCo, as trained, goals on which nothing was chosen", "twin (t)"]
+    assert list(table.index) == ["MuJoCo, as trained, goals without selection", "twin (t)"]
     assert table.loc["twin (t)", "RMSE, mm"] == "1.23"
     assert said["Not tried"][0] == "Not tried: dart."
 
@@ -385,16 +389,13 @@ def test_what_a_runtime_does_not_know_does_not_travel(panda):
         def goals(self, robot, rng, count):
             return np.zeros((count, 4, 2))
 
-        def target(self, action, state, goals, torque):
-            return 2 * action * torque
-
-    with pytest.raises(UserError, match="Odd does not travel: its goals are of 4 x 2 numbers and its act") as refused:
+    with pytest.raises(UserError, match="goals of Odd have 4 x 2 numbers; the runtime") as refused:
         make_contract(panda, Odd(), np.zeros(panda.n))
     assert "\n" not in str(refused.value)
 
 
 def test_the_runtime_needs_numpy_and_onnxruntime_alone():
-    tree = ast.parse(one_file())
+    tree = ast.parse(one_file(torque_control(load_robot(**conf("robot/panda")), ReachTask())))
     names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
     names |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     others = {name.split(".")[0] for name in names} - set(sys.stdlib_module_names)
@@ -408,15 +409,15 @@ def swap(values: list) -> None:
 def limit(contract: dict, name: str, joint: int, value: float) -> None:
     """Change a limit of a joint wherever the contract says it."""
     own, rows = contract["law"]["joint"], {**contract["torque"], **contract["limits"]}
-    in_law = {"max_Nm": "tau_max", "max_rate_Nm_per_s": "step", "asked_for_Nm": "asked", "dq_max_rad_per_s": "dq_max"}
+    in_law = {"max_Nm": "tau_max", "max_rate_Nm_per_s": "step", "limit_Nm": "asked", "dq_max_rad_per_s": "dq_max"}
     rows[name][joint - 1] = value
     own[in_law[name]][joint - 1] = value * (contract["law"]["number"]["cycle_s"] if in_law[name] == "step" else 1)
 
 
 def asks(contract: dict, value: float) -> None:
-    """Let an action of 1 ask the first joint for another torque, and let that be the most."""
-    limit(contract, "asked_for_Nm", 1, value)
-    contract["torque"]["action_Nm"][0] = value
+    """Change the torque of an action of 1 in the first joint, and the torque limit with it."""
+    limit(contract, "limit_Nm", 1, value)
+    contract["control"]["action_scale"][0] = value
 
 
 def fewer(contract: dict) -> None:
@@ -426,34 +427,45 @@ def fewer(contract: dict) -> None:
 
 
 MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
-    "a joint too many": (lambda c: c["joints"].append("joint8"), "of 7 joints, the arm has 8"),
-    "another order": (lambda c: swap(c["joints"]), "joint 1 of the arm is 'joint1', of the bundle 'joint2'"),
-    "another policy rate": (lambda c: c["rates"].update(policy_hz=100), "says policy_hz '100', policy.onnx '50'"),
-    "another cycle": (lambda c: c["rates"].update(cycle_hz=500), "in a cycle of 500 Hz"),
+    "a joint too many": (lambda c: c["joints"].append("joint8"), "expected 8 joints, got 7"),
+    "another order": (lambda c: swap(c["joints"]), "expected joint 1 'joint2', got 'joint1' of the arm"),
+    "another policy rate": (
+        lambda c: c["rates"].update(policy_hz=100),
+        "policy_hz: '100' in contract.json",
+    ),
+    "another cycle": (lambda c: c["rates"].update(cycle_hz=500), "in a cycle at 500 Hz"),
     "a torque limit": (lambda c: limit(c, "max_Nm", 5, 87.0), "tau_max of joint 5"),
     "a limit of the law alone": (lambda c: c["law"]["joint"]["tau_max"].__setitem__(4, 87.0), "law.joint.tau_max is"),
-    "a lower torque limit": (lambda c: limit(c, "max_Nm", 1, 50.0), "says torque_max_Nm"),
+    "a lower torque limit": (lambda c: limit(c, "max_Nm", 1, 50.0), "torque_max_Nm: "),
     "a torque rate": (lambda c: limit(c, "max_rate_Nm_per_s", 3, 2e3), "dtau_max of joint 3"),
     "a speed limit": (lambda c: limit(c, "dq_max_rad_per_s", 2, 9.0), "dq_max of joint 2"),
-    "a position limit": (lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0), "q_min of joint 4 is -3.07"),
-    "what is asked for": (lambda c: limit(c, "asked_for_Nm", 1, 20.0), "Nm, the most that is asked for [20.0, "),
-    "what an action asks for": (lambda c: asks(c, 20.0), "torque_scale_Nm"),
-    "the convention": (lambda c: c["torque"].update(convention="with gravity"), "torque 'with gravity'"),
-    "a missing link": (lambda c: c["model"]["links"].pop(), "model.links is of 6 joints"),
+    "a position limit": (
+        lambda c: c["limits"]["q_min_rad"].__setitem__(3, -4.0),
+        "q_min of joint 4: the arm allows -3.07",
+    ),
+    "the torque limit of the task": (lambda c: limit(c, "limit_Nm", 1, 20.0), "Nm, the torque limit is [20.0, "),
+    "the scale of an action": (lambda c: asks(c, 20.0), "action_scale: "),
+    "the convention": (lambda c: c["torque"].update(convention="with gravity"), "got 'with gravity'"),
+    "a missing link": (lambda c: c["model"]["links"].pop(), "got 6 (model.links)"),
     "a missing row of the law": (lambda c: c["law"]["joint"].pop("most"), "damaged: KeyError 'most'"),
     "a missing number of the law": (lambda c: c["law"]["number"].pop("rate"), "law.number.rate is missing"),
-    "the low-pass": (lambda c: c["rates"].update(low_pass_hz=30.0), "low_pass_hz '30.0'"),
-    "a history": (lambda c: c["observation"].update(history=3), "observations of history 3"),
-    "a preview": (lambda c: c["observation"].update(preview=5), "observations of preview 5"),
+    "the low-pass": (lambda c: c["rates"].update(low_pass_hz=30.0), "low_pass_hz: '30.0'"),
+    "a history": (lambda c: c["observation"].update(history=3), "observation.history is 3"),
+    "a preview": (lambda c: c["observation"].update(preview=5), "observation.preview is 5"),
     "another order of observations": (lambda c: swap(c["observation"]["entries"]), "observation 'dq'"),
     "an observation of something else": (lambda c: c["observation"]["entries"][0].update(of="x"), "'q' is x at"),
-    "too few observations": (lambda c: c["observation"]["entries"].pop(), "47 observations in all, and 54"),
-    "another size": (lambda c: c["observation"].update(size=46), "54 observations in all, and 46"),
+    "too few observations": (lambda c: c["observation"]["entries"].pop(), "expected 54 observations, got 47"),
+    "another size": (lambda c: c["observation"].update(size=46), "expected 46 observations, got 54"),
     "another format": (lambda c: c.update(format=1), "is of format 1"),
-    "a policy of fewer observations": (lambda c: fewer(c), "observations of 47 numbers, policy.onnx takes 54"),
-    "a base": (lambda c: c.update(base={}), "a base, which a goal that is a point does not have"),
-    "another kind of goal": (lambda c: c["goal"].update(kind="pose"), "goals are 'pose'"),
-    "another shape of goal": (lambda c: c["goal"].update(shape=[6]), "a point of shape [6]"),
+    "an unknown controller": (
+        lambda c: c["control"].update(name="mine"),
+        "control is 'mine'",
+    ),
+    "an infinite scale": (lambda c: c["control"]["action_scale"].__setitem__(0, None), "expected finite numbers"),
+    "a policy of fewer observations": (lambda c: fewer(c), "47 observations, policy.onnx takes 54"),
+    "a model without a plan": (lambda c: c["control"].update(model={}), "control.model and control.setpoint"),
+    "another kind of goal": (lambda c: c["goal"].update(kind="pose"), "goal.kind is 'pose'"),
+    "another shape of goal": (lambda c: c["goal"].update(shape=[6]), "expected goal.shape [3], got [6]"),
 }
 
 
@@ -512,14 +524,14 @@ def test_a_damaged_contract_is_refused(runtime, tmp_path, content):
 
 
 OTHER_ARMS = {
-    "joints": ([f"joint{j}" for j in range(1, 7)], "the arm has 6 joints, the bundle is of 7"),
-    "cycle_hz": (500, "the arm's cycle is of 500 Hz, the bundle's of 1000 Hz"),
-    "torque": ("with gravity", "the arm takes torque 'with gravity', the bundle gives 'without gravity'"),
-    "tau_max": ([87.0, 87.0, 50.0, 87.0, 12.0, 12.0, 12.0], "tau_max of joint 3 is 50 Nm at the arm"),
-    "dtau_max": ([999.0] * 7, "dtau_max of joint 1 is 999 Nm/s at the arm"),
-    "dq_max": ([2.175] * 7, "dq_max of joint 5 is 2.175 rad/s at the arm"),
-    "q_max": ([2.8] * 7, "q_max of joint 1 is 2.8 rad at the arm"),
-    "q_min": ([-2.0] * 6, "q_min of the arm has 6 values"),
+    "joints": ([f"joint{j}" for j in range(1, 7)], "expected 7 joints, got 6 of the arm"),
+    "cycle_hz": (500, "expected a cycle of 1000 Hz, got 500 Hz of the arm"),
+    "torque": ("with gravity", "expected torque 'without gravity', got 'with gravity' of the arm"),
+    "tau_max": ([87.0, 87.0, 50.0, 87.0, 12.0, 12.0, 12.0], "tau_max of joint 3: the arm allows 50 Nm"),
+    "dtau_max": ([999.0] * 7, "dtau_max of joint 1: the arm allows 999 Nm/s"),
+    "dq_max": ([2.175] * 7, "dq_max of joint 5: the arm allows 2.175 rad/s"),
+    "q_max": ([2.8] * 7, "q_max of joint 1: the arm allows 2.8 rad"),
+    "q_min": ([-2.0] * 6, "expected 7 values of q_min, got 6 of the arm"),
 }
 
 
@@ -548,7 +560,7 @@ def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
         with pytest.raises(UserError, match=words):
             commands.run_command(["export", str(run), *more])
 
-    refused("bundle is there already", exported.run)
+    refused("bundle exists", exported.run)
     refused("^export: .* is no finished run folder of stage=train", tmp_path / "nothing")
     run = shutil.copytree(exported.run, tmp_path / "run", ignore=shutil.ignore_patterns("bundle"))
     (run / "policy.onnx").write_bytes(b"no")
@@ -558,12 +570,12 @@ def test_what_cannot_be_exported_says_so(exported, tmp_path, monkeypatch):
         other = make_policy(exported.robot, exported.task, (16, 16))
     save_policy(run, other)
     refused("is not its policy.pt", run, f"to={tmp_path / 'to'}")
-    monkeypatch.delattr(ReachTask, "layout")
-    refused("ReachTask does not say how its observations are made", run)
+    monkeypatch.delattr(ReachTask, "observation_terms")
+    refused("ReachTask does not describe its observations", run)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    config["algo"] = {"_target_": "r2s.learning.computed_torque.Oracle", **conf("algo/oracle")}
+    config["algo"] = {"_target_": "r2s.learning.model_based.Oracle", **conf("algo/oracle")}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    refused("algo=oracle, which is no network", run)
+    refused("algo=oracle has no network to export", run)
     assert {p.name for p in tmp_path.iterdir()} == {"run"}
     assert not [p for p in run.iterdir() if "part" in p.name]
 
@@ -607,7 +619,7 @@ def runs_in(python: Path, exported: Exported, motion: dict[str, np.ndarray], to:
     arm = {f"arm_{k}": np.array(v) for k, v in arm_of(exported).items() if k not in ("cycle_hz", "torque")}
     motion = by_r2s(exported, motion)
     kept = {k: motion[k] for k in ("q", "dq", "goal", "which", "begin", "tau", "last")}
-    np.savez(to / "data.npz", **kept, **arm, torque=exported.task.torque(exported.robot))
+    np.savez(to / "data.npz", **kept, **arm, torque=exported.task.torque_limit(exported.robot))
     (to / "lean.py").write_text(LEAN)
     words = [str(python), str(to / "lean.py"), str(to / "data.npz"), str(exported.folder)]
     here = {"PYTHONPATH": str(exported.folder), "PYTHONSAFEPATH": "1"}

@@ -9,23 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from conftest import ROOT, conf
 from test_export import POLICY, arm_of, bare, compare, drawn, edited, fewer, hostile, loaded, refuses, runs_in, swap  # noqa: F401
 
 from r2s import commands
-from r2s.arm.deploy import DrivenArm
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.export.contract import make_contract
+from r2s.export.control import Control
 from r2s.export.plan import Follower, check_goal
-from r2s.learning.networks import Told
-from r2s.learning.policy import make_policy, save_policy
-from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import FAMILIES, SIGMOID
 from r2s.physics.robot import load_robot
-from r2s.tasks.episode import rollout
-from r2s.tasks.task import State
+from r2s.tasks.rollout import rollout
 from r2s.tasks.track import TrackTask
 
 SETTINGS = {k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/track").items()}
@@ -74,7 +71,7 @@ def along(exported, cycles: int, calm: int) -> dict[str, np.ndarray]:
 def dynamics_of(robot, family: str):
     """Return dynamics that have something of all that a model may say, with one family of friction."""
     friction = conf("friction/paper") if robot.n == 7 else {"phi1": 1.0, "phi2": 20.0, "phi3": 0.01}
-    rng, d = np.random.default_rng(2), of_family(nominal_dynamics(robot, **friction), family)
+    rng, d = np.random.default_rng(2), with_family(nominal_dynamics(robot, **friction), family)
     optional = 0.3 * rng.random((robot.n, len(d.family.names) - d.phi.shape[-1]))
     d = replace(d, phi=np.concatenate([d.phi, optional], -1), offset=rng.normal(size=robot.n), delay=0.004, lag=0.002)
     d = replace(d, drag=rng.normal(size=(robot.n, 2)), load=0.1 * rng.random(robot.n), armature=np.full(robot.n, 0.1))
@@ -87,17 +84,19 @@ def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
     """At any state and in any row of any plan, the end and what comes after included."""
     robot = panda if arm == "panda" else load_robot(str(ROOT / "tests" / "models" / "six_joints.xml"))
     more = {} if arm == "panda" else {"reach": None, "torque_fraction": 0.2}
-    task = TrackTask(**SETTINGS | more).believing(robot, dynamics_of(robot, family))
-    contract = json.loads(json.dumps(make_contract(robot, task, task.model.dynamics.level), allow_nan=False))
+    task = TrackTask(**SETTINGS | more).with_model(robot, dynamics_of(robot, family))
+    contract = json.loads(json.dumps(make_contract(robot, task, task.model.level), allow_nan=False))
     check_goal(contract)
-    follow, rng, n = Follower(contract), np.random.default_rng(3), robot.n
+    control, rng, n = task.control(robot), np.random.default_rng(3), robot.n
+    follow = Follower(contract, Control(contract))
     plan = rng.normal(size=contract["goal"]["shape"])
     follow.take(plan)
     for step in (0, 1, 17, task.steps - 2, task.steps - 1, task.steps, task.steps + 50):
-        q, dq, ee, still = *rng.normal(size=(2, n)), np.zeros(3), State.still(robot)
-        state = replace(still, t=np.array([step / task.ctrl_hz]), q=q[None], dq=dq[None])
-        wanted = task.computed(state, plan[None])[0]
-        assert np.abs(follow(step, q, dq, ee, 0.0)["base"] - wanted).max() < BASE * np.abs(wanted).max()
+        q, dq, t = *rng.normal(size=(2, n)), np.array([step / task.ctrl_hz])
+        command = control.command(np.zeros((1, n)), task, t, plan[None])
+        wanted = control.torque(q[None], dq[None], command)[0]
+        made = follow(step, q, dq, np.zeros(3), 0.0)["control"]
+        assert np.abs(made - wanted).max() < BASE * np.abs(wanted).max()
 
 
 def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
@@ -106,10 +105,10 @@ def test_the_runtime_follows_a_plan_as_r2s_does(planned, runtime):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("base", ["model", "none"])
-def test_so_it_does_for_ten_thousand_cycles(tmp_path, base):
-    """Of both bases; the calm motion is longer than its plan."""
-    exported = export(tmp_path, f"task.base={base}")
+@pytest.mark.parametrize("control", ["computed_torque", "torque"])
+def test_so_it_does_for_ten_thousand_cycles(tmp_path, control):
+    """Under both controllers; the calm motion is longer than its plan."""
+    exported = export(tmp_path, f"control={control}")
     assert compare(exported, loaded(exported.folder), along(exported, 10_000, 1500)) < POLICY
 
 
@@ -119,10 +118,10 @@ def test_an_arm_follows_as_it_does_behind_r2s(planned, runtime):
     robot, task = planned.robot, planned.task
     plan = np.load(planned.folder / "plans.npz")["plans"][0]
     start, noise = plan[0, 6 : 6 + robot.n], {"position_noise": 1e-5, "velocity_noise": 1e-3}
-    driven = DrivenArm(SimulatedArm(robot, task.model.dynamics, **noise), task, planned.friction)
+    driven = PolicyRunner(SimulatedArm(robot, task.model, **noise), task, planned.friction)
     wanted = rollout(planned.policy, driven, task, start[None], plan[None])
     arm, other = (
-        SimulatedArm(robot, task.model.dynamics, **noise),
+        SimulatedArm(robot, task.model, **noise),
         runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned))),
     )
     arm.move_to(start)
@@ -163,7 +162,7 @@ def test_a_plan_is_made_of_joint_angles(planned, runtime):
     plan = np.load(planned.folder / "plans.npz")["plans"][0]
     joints = [plan[:, 6 + k * n : 6 + (k + 1) * n] for k in range(3)]
     np.testing.assert_allclose(other.plan(*joints), plan, atol=1e-9)
-    with pytest.raises(runtime.BundleError, match=r"\(123, 7\), .* \(124, 7\) is allowed"):
+    with pytest.raises(runtime.BundleError, match=r"shape \(124, 7\), got \(123, 7\)"):
         other.plan(*(x[1:] for x in joints))
 
 
@@ -183,8 +182,8 @@ def test_a_plan_is_made_of_a_curve(planned):
 
 
 def test_the_page_makes_a_plan_of_a_curve(planned, tmp_path, monkeypatch):
-    """docs/export.md, as it is written."""
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "export.md").read_text(), re.S | re.M)
+    """The code of docs/how_to/export.md runs as written."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "how_to" / "export.md").read_text(), re.S | re.M)
     (block,) = (b for b in blocks if "task.plan(" in b)
     monkeypatch.chdir(tmp_path)
     exec(block.replace("runs/train/NAME", str(planned.run)), {})
@@ -194,10 +193,10 @@ def test_the_page_makes_a_plan_of_a_curve(planned, tmp_path, monkeypatch):
 
 
 WRONG: dict[str, tuple[Callable[[np.ndarray], object], str]] = {
-    "none": (lambda p: None, "follows plans: one is told to `reset`"),
-    "too short": (lambda p: p[1:], r"\(123, 27\); \(124, 27\) is allowed"),
-    "of another arm": (lambda p: p[:, :24], r"\(124, 24\); \(124, 27\) is allowed"),
-    "a point": (lambda p: p[0, :3], r"\(3,\); \(124, 27\) is allowed"),
+    "none": (lambda p: None, "follows plans: pass one to `reset`"),
+    "too short": (lambda p: p[1:], r"shape \(124, 27\), got \(123, 27\)"),
+    "of another arm": (lambda p: p[:, :24], r"shape \(124, 27\), got \(124, 24\)"),
+    "a point": (lambda p: p[0, :3], r"shape \(124, 27\), got \(3,\)"),
     "not finite": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 30, np.nan, p), "nan in row 1, column 3"),
     "endless": (lambda p: np.where(np.arange(p.size).reshape(p.shape) == 0, np.inf, p), "inf in row 0, column 0"),
 }
@@ -212,16 +211,20 @@ def test_a_plan_of_another_size_or_that_is_not_finite_is_refused(planned, runtim
     with pytest.raises(runtime.BundleError, match=words) as refused:
         other.reset(plan)
     assert "\n" not in str(refused.value)
-    with pytest.raises(runtime.BundleError, match="one is told to `reset`"):
+    with pytest.raises(runtime.BundleError, match="pass one to `reset`"):
         other(*np.zeros((3, 7)))
     with pytest.raises(runtime.BundleError, match=r"\(7,\), \(3,\); 7 joints and no goal are allowed"):
         other(*np.zeros((3, 7)), np.zeros(3))
 
 
-def without_base(contract: dict) -> None:
-    """Leave the base out, and its observation."""
+def model(contract: dict) -> dict:
+    return contract["control"]["model"]
+
+
+def without_model(contract: dict) -> None:
+    """Leave the model of computed torque out, and its observation."""
     fewer(contract)
-    contract["base"] = None
+    contract["control"].update(model=None, setpoint=None)
 
 
 def as_points(contract: dict) -> None:
@@ -235,10 +238,10 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
     ),
     "no preview": (lambda c: c["observation"].update(preview=0), "a preview of 0 samples in 120 steps"),
     "half a sample": (lambda c: c["observation"].update(preview=2.5), "a preview of 2.5 samples"),
-    "a history": (lambda c: c["observation"].update(history=3), "observations of history 3"),
+    "a history": (lambda c: c["observation"].update(history=3), "observation.history is 3"),
     "a preview of another width": (
         lambda c: (c["observation"].update(preview=4), c["goal"].update(shape=[125, 27])),
-        "observation 'the next 3 places - ee' is ahead at [54, 63]; 54 is next",
+        "observation 'the next 3 places - ee' is ahead at [54, 63]; 54 comes next",
     ),
     "longer plans": (lambda c: c["goal"].update(steps=400), "shape [124, 27]; 400 steps"),
     "plans of another rate": (lambda c: c["goal"].update(row_hz=50), "plans of 50 Hz and a policy of 100 Hz"),
@@ -247,30 +250,48 @@ MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
         "'place' of a plan is at [3, 6]; 0 is next",
     ),
     "a missing column": (lambda c: c["goal"]["columns"].pop("ddq"), "damaged: KeyError 'ddq'"),
-    "goals that are points": (as_points, "observations of preview 3; a goal that is a point has none"),
-    "another kind of goal": (lambda c: c["goal"].update(kind="path"), "goals are 'path'; this runtime takes 'point'"),
-    "no base": (lambda c: c.update(base=None), "observations of a base that is not there"),
-    "neither base nor its observation": (without_base, "an action of 1 is [2.61, "),
-    "a base that none observes": (fewer, "a base that no observation has"),
+    "goals that are points": (as_points, "observation.preview is 3; with point goals it is 0"),
+    "another kind of goal": (lambda c: c["goal"].update(kind="path"), "goal.kind is 'path'; allowed: point"),
+    "no model": (lambda c: c["control"].update(model=None), "an observation term needs control.model"),
+    "neither model nor its observation": (without_model, "observations, policy.onnx takes"),
+    "a model that no term observes": (fewer, "no observation term has the controller's torque"),
     "an action of more than is asked for": (
-        lambda c: c["torque"]["action_Nm"].__setitem__(0, 99.0),
+        lambda c: c["control"]["action_scale"].__setitem__(0, 99.0),
         "an action of 1 is [99.0",
     ),
-    "what an action adds": (lambda c: c["torque"]["action_Nm"].__setitem__(0, 9.0), "says torque_scale_Nm '9 "),
+    "what an action adds": (lambda c: c["control"]["action_scale"].__setitem__(0, 9.0), "action_scale: '9 "),
     "an unknown friction": (
-        lambda c: c["base"]["friction"].update(family="rubber"),
-        "is 'rubber'; this runtime knows",
+        lambda c: model(c)["friction"].update(family="rubber"),
+        "is 'rubber'; this runtime has",
     ),
-    "a missing parameter": (lambda c: c["base"]["friction"]["parameters"].pop("phi2"), "damaged: KeyError 'phi2'"),
-    "another family": (lambda c: c["base"]["friction"].update(family="coulomb"), "damaged: KeyError 'coulomb'"),
-    "a joint less": (lambda c: c["base"]["offset_Nm"].pop(), "base.offset_Nm is of 6 joints, the arm has 7"),
-    "a number that is none": (lambda c: c["base"]["load"].__setitem__(2, None), "base.load is [0.0, 0.0, None"),
-    "a link less": (lambda c: c["base"]["links"].pop(), "base.links is of 6 joints"),
-    "a link without mass": (lambda c: c["base"]["links"][3].pop("mass"), "base.links has a link without mass"),
-    "no gravity": (lambda c: c["base"].pop("gravity_m_per_s2"), "damaged: KeyError 'gravity_m_per_s2'"),
-    "no delay": (lambda c: c["base"]["number"].pop("late_s"), "base.number.late_s is None"),
-    "a delay backwards": (lambda c: c["base"]["number"].update(late_s=-0.01), "base.number.late_s is -0.01"),
-    "no bandwidth": (lambda c: c["base"]["number"].update(bandwidth_rad_per_s=0), "bandwidth_rad_per_s is 0"),
+    "a missing parameter": (
+        lambda c: model(c)["friction"]["parameters"].pop("phi2"),
+        "damaged: KeyError 'phi2'",
+    ),
+    "another family": (
+        lambda c: model(c)["friction"].update(family="coulomb"),
+        "damaged: KeyError 'coulomb'",
+    ),
+    "a joint less": (lambda c: model(c)["offset_Nm"].pop(), "got 6 (control.model.offset_Nm)"),
+    "a number that is none": (
+        lambda c: model(c)["load"].__setitem__(2, None),
+        "control.model.load is [0.0, 0.0, None",
+    ),
+    "a link less": (lambda c: model(c)["links"].pop(), "got 6 (control.model.links)"),
+    "a link without mass": (
+        lambda c: model(c)["links"][3].pop("mass"),
+        "control.model.links has a link without mass",
+    ),
+    "no gravity": (lambda c: model(c).pop("gravity_m_per_s2"), "damaged: KeyError 'gravity_m_per_s2'"),
+    "no delay": (lambda c: model(c)["number"].pop("ahead_s"), "control.model.number.ahead_s is None"),
+    "a delay backwards": (
+        lambda c: model(c)["number"].update(ahead_s=-0.01),
+        "control.model.number.ahead_s is -0.01",
+    ),
+    "a parameter of the law": (
+        lambda c: c["control"]["parameters"].__setitem__(0, None),
+        "control.parameters is [None",
+    ),
 }
 
 
@@ -282,23 +303,7 @@ def test_a_contract_that_says_another_thing_is_refused(planned, runtime, tmp_pat
 
 def test_a_friction_of_ones_own_does_not_travel(panda):
     family = replace(SIGMOID, name="mine")
-    task = TrackTask(**SETTINGS).believing(panda, replace(dynamics_of(panda, "sigmoid"), family=family))
-    with pytest.raises(
-        UserError, match="friction of family 'mine' does not travel; the runtime of a bundle knows sig"
-    ):
+    task = TrackTask(**SETTINGS).with_model(panda, replace(dynamics_of(panda, "sigmoid"), family=family))
+    with pytest.raises(UserError, match="the runtime of a bundle has no friction of family 'mine'; allowed: sig"):
         make_contract(panda, task, np.zeros(7))
-    bare_task = replace(task, base="none", model=None)
-    assert make_contract(panda, bare_task, np.zeros(7))["base"] is None
-
-
-def test_a_policy_that_is_told_of_its_arm_does_not_travel(planned, tmp_path):
-    """What tells it is an adapter, with a memory of what the arm did."""
-    run = tmp_path / "runs" / "train" / "told"
-    run.mkdir(parents=True)
-    for name in ("config.yaml", "meta.json", "summary.json", "policy.onnx"):
-        (run / name).write_bytes((planned.run / name).read_bytes())
-    torch.manual_seed(0)
-    save_policy(run, make_policy(planned.robot, planned.task, (16, 16), Told(15)))
-    with pytest.raises(UserError, match="is told of its arm by an adapter, which no bundle has"):
-        commands.run_command(["export", str(run)])
-    assert not (run / "bundle").exists()
+    assert make_contract(panda, replace(task, model=None), np.zeros(7))["control"]["model"] is None

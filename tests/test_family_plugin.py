@@ -9,24 +9,24 @@ import pytest
 import yaml
 from conftest import conf
 
+from r2s.arm.recorder import record
 from r2s.arm.simulated import SimulatedArm
-from r2s.arm.tracking import record
 from r2s.errors import UserError
 from r2s.excitation.fourier import fourier
 from r2s.identification.identify import identify
 from r2s.identification.parameter_file import load_parameters, save_parameters
 from r2s.identification.parameters import parameter_space
-from r2s.identification.problem import check_choices, searched
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
-from r2s.physics.dynamics import Dynamics, nominal_dynamics, of_family
-from r2s.physics.friction import FAMILIES, SIGMOID, Family, family, spelled
+from r2s.identification.terms import search_space
+from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
+from r2s.physics.friction import FAMILIES, SIGMOID, Family, family, family_path
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import load_robot
 from r2s.physics.simulator import Simulator
 
 MINE = '''
-"""Friction that turns with the velocity over a width of its own."""
+"""Friction with a parameter for the width of its sign change."""
 
 import numpy as np
 from numba import njit
@@ -80,7 +80,7 @@ ARM = """
   </worldbody>
 </mujoco>
 """
-SETTINGS = conf("config")["identify"]
+SETTINGS = conf("identify/default")
 BOUNDS = SETTINGS["bounds"]
 PHI = np.array([[1.6, 0.08], [0.7, 0.03]])  # Nm, rad/s
 
@@ -104,7 +104,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(path, arm):
-    """What a short recording of an arm with that friction says of it, the paper's law as a start."""
+    """Return the identification of a short recording of an arm with that friction, started from the paper's law."""
     truth = replace(Dynamics.of(arm, PHI, family(path)), delay=2e-3)
     noise = {k: conf("data/simulated")[k] for k in ("position_noise", "velocity_noise")}
     motion = record(SimulatedArm(arm, truth, **noise, seed=0), fourier(arm, duration=8.0, seed=0, effort=0))
@@ -113,8 +113,7 @@ def result(path, arm):
         nominal_dynamics(arm, **conf("friction/uniform") | {"family": path}),
         motion,
         [LeastSquares(level="torque", max_evaluations=12), LeastSquares(max_evaluations=12, ftol=1e-3)],
-        Settings(BOUNDS, SETTINGS["prior"]["commanded"], ["offset", "delay"], family=path, breakaway=None),
-        nthread=1,
+        Settings(BOUNDS, SETTINGS["prior"]["commanded"], ["offset", "delay"], family=path, breakaway=None, nthread=1),
     )
 
 
@@ -123,10 +122,10 @@ def test_a_family_is_found_by_its_dotted_path(path):
     own = family(path)
     assert isinstance(own, Family)
     assert family(path) is own
-    assert spelled(own) == path
-    assert [spelled(f) for f in FAMILIES] == [f.name for f in FAMILIES]
+    assert family_path(own) == path
+    assert [family_path(f) for f in FAMILIES] == [f.name for f in FAMILIES]
     assert own not in FAMILIES
-    check_choices(path, ["viscous", "offset"])
+    Settings(BOUNDS, {}, ["viscous", "offset"], family=path)
 
 
 def test_its_native_form_is_its_numpy_form(path, arm):
@@ -176,16 +175,16 @@ def test_it_goes_through_the_file(result, path, arm, tmp_path):
 
 def test_scales_and_optional_parameters_are_the_records(path, arm):
     """Logarithmic ones have their geometric mean in the middle of the cube; a term brings the optional one in."""
-    own = of_family(nominal_dynamics(arm, **conf("friction/uniform")), path)
+    own = with_family(nominal_dynamics(arm, **conf("friction/uniform")), path)
     motion = SimpleNamespace(torque="commanded")
-    space = searched(arm, own, BOUNDS, ["viscous"], motion)
+    space = search_space(arm, own, BOUNDS, ["viscous"], motion)
     middle = space.from_unit(np.full(6, 0.5))
     np.testing.assert_allclose(space.block(middle, "width"), np.sqrt(0.005 * 0.5))
     np.testing.assert_allclose(space.block(middle, "viscous"), 5.0)
-    narrow = searched(arm, own, BOUNDS | {"width": [0.01, 0.1]}, ["viscous"], motion)
+    narrow = search_space(arm, own, BOUNDS | {"width": [0.01, 0.1]}, ["viscous"], motion)
     np.testing.assert_allclose(narrow.block(narrow.upper, "width"), 0.1)
     for terms, blocks in ((["offset"], 3), (["viscous", "offset"], 4)):
-        assert len(searched(arm, own, BOUNDS, terms, motion).blocks) == blocks
+        assert len(search_space(arm, own, BOUNDS, terms, motion).blocks) == blocks
     with pytest.raises(UserError, match=r"^bounds\.phi1: friction family 'tanh' has level, width, viscous$"):
         parameter_space(arm, own, {"phi1": BOUNDS["phi1"]})
     taken = replace(own, family=replace(own.family, names=("level", "lag", "viscous"), logarithmic=()))
@@ -193,7 +192,7 @@ def test_scales_and_optional_parameters_are_the_records(path, arm):
         parameter_space(arm, taken, {"level": [0.1, 1.0]})
     without = {k: v for k, v in BOUNDS.items() if k not in own.family.names}
     with pytest.raises(UserError, match=r"^identify\.bounds: none for level, width"):
-        searched(arm, replace(own, family=replace(own.family, bounds=())), without, ["offset"], motion)
+        search_space(arm, replace(own, family=replace(own.family, bounds=())), without, ["offset"], motion)
 
 
 @pytest.mark.parametrize(
@@ -201,13 +200,19 @@ def test_scales_and_optional_parameters_are_the_records(path, arm):
     [
         ("no_such_module.MINE", "cannot import 'no_such_module.MINE'"),
         ("my_friction.TAHN", "cannot import 'my_friction.TAHN'"),
-        ("my_friction.law", "'my_friction.law' is of type function; a Family is asked for"),
-        ("my_friction.OTHER", "'viscous' of 'my_friction.OTHER' is Nm linear, that of 'sigmoid' is Nm s/rad linear"),
-        ("my_friction", "no family 'my_friction'; allowed: sigmoid, coulomb, stribeck, bristle, auto, or my_module"),
+        ("my_friction.law", "expected a Family, got 'my_friction.law' of type function"),
+        (
+            "my_friction.OTHER",
+            "expected 'viscous' of 'my_friction.OTHER' to be Nm s/rad linear, as in 'sigmoid', got Nm linear",
+        ),
+        (
+            "my_friction",
+            "expected sigmoid, coulomb, stribeck, bristle, auto, or my_module.MY_FAMILY, got 'my_friction'",
+        ),
     ],
 )
 def test_a_wrong_path_is_one_line(path, name, words):
-    """What cannot be imported, is no family, or uses a name for something else is said."""
+    """A failed import, another type and a name with another unit are errors."""
     family(path)
     sys.modules["my_friction"].OTHER = replace(family(path), units=("Nm", "rad/s", "Nm"))
     with pytest.raises(UserError) as error:

@@ -1,4 +1,4 @@
-"""A run folder holds data and says the truth of itself, whatever happens; benchmarks/faults.py does worse to it."""
+"""A run folder holds data only and its status is correct, whatever happens; see also tests/test_fuzz.py."""
 
 import ast
 import fcntl
@@ -15,11 +15,11 @@ import torch
 from conftest import ROOT
 from packaging.requirements import Requirement
 
-from r2s.cli import typed_in
+from r2s.cli import typed_overrides
 from r2s.errors import UserError
 from r2s.learning.checkpoint import load_tensors, save_tensors
-from r2s.runs import Run, is_done, load_arrays, read_summary
-from r2s.typed import check_option
+from r2s.override_checks import check_option
+from r2s.runs import Job, Run, is_done, is_locked, load_arrays, read_summary
 
 SOURCES = [*sorted((ROOT / "r2s").rglob("*.py")), *sorted((ROOT / "hydra_plugins").glob("*.py")), ROOT / "run.py"]
 NEVER = {
@@ -47,18 +47,18 @@ def calls(path):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_nothing_that_is_read_runs(path):
-    """No pickle is loaded, and what could load one is told not to."""
+    """No call loads a pickle; calls that could are given the option against it."""
     for name, call in calls(path):
         assert name not in NEVER, f"{path}:{call.lineno}: {name}"
         if name in ALWAYS:
             key, value = ALWAYS[name]
-            told = {k.arg: ast.literal_eval(k.value) for k in call.keywords if isinstance(k.value, ast.Constant)}
-            assert told.get(key) is value, f"{path}:{call.lineno}: {name} without {key}={value}"
+            given = {k.arg: ast.literal_eval(k.value) for k in call.keywords if isinstance(k.value, ast.Constant)}
+            assert given.get(key) is value, f"{path}:{call.lineno}: {name} without {key}={value}"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_servers_listen_on_loopback_only(path):
-    """What binds a socket or serves says which address, and that is one of this machine alone."""
+    """Calls that bind a socket or serve name an address, which is a loopback address."""
     assert not re.search(r"""["'](0\.0\.0\.0|::)["']""", path.read_text())
     for name, call in calls(path):
         owner, _, verb = name.rpartition(".")
@@ -99,28 +99,31 @@ def test_every_pin_is_there():
 
 def opened(root, **change):
     """Return a run folder, open."""
-    words = {"config": "stage: train\n", "overrides": ["seed=1"], "seed": 1, "threads": 1} | change
-    return Run(root, "train", words.pop("name", "a"), **words)
+    how = {k: change.pop(k) for k in ("resume", "exact_name") if k in change}
+    words = {"name": "a", "config": "stage: train\n", "overrides": ["seed=1"], "seed": 1, "threads": 1} | change
+    return Run(root, Job("train", **words), **how)
 
 
 def test_a_run_belongs_to_one_process_at_a_time(tmp_path):
-    """While it is open nobody goes on in it; a name that must be this one is not given twice."""
+    """While it is open no other process resumes it; an exact name is given once."""
     with opened(tmp_path) as run:
         assert json.loads((run.folder / "meta.json").read_text())["status"] == "running"
-        with pytest.raises(UserError, match=rf"process {os.getpid()} of .* is still at it"):
+        with pytest.raises(UserError, match=rf"process {os.getpid()} on .* is still writing"):
             is_done(run.folder)
-        with pytest.raises(UserError, match=r"is still at it"):
+        with pytest.raises(UserError, match=r"is still writing"):
             opened(tmp_path, resume=run.folder)
         with pytest.raises(UserError, match=r"train/a is taken"):
-            opened(tmp_path, only=True)
+            opened(tmp_path, exact_name=True)
         assert {p.name for p in run.folder.parent.iterdir()} == {"a"}
+        assert is_locked(run.folder)
     assert is_done(run.folder)
+    assert not is_locked(run.folder)
     with opened(tmp_path) as other:
         assert other.folder.name == "a_2"
 
 
-def test_a_process_id_that_another_program_has_now_is_no_reason_to_wait(tmp_path):
-    """The lock says who is at it, not the number in meta.json: after a restart that may be anybody's."""
+def test_a_reused_process_id_is_no_reason_to_wait(tmp_path):
+    """The lock decides, not the process id in meta.json, which another program may have after a restart."""
     with opened(tmp_path) as run:
         pass
     meta = json.loads((run.folder / "meta.json").read_text())
@@ -129,18 +132,18 @@ def test_a_process_id_that_another_program_has_now_is_no_reason_to_wait(tmp_path
     assert not is_done(run.folder)
     with open(run.folder / "overrides.yaml", "r+") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(UserError, match=r"process 1 of .* is still at it"):
+        with pytest.raises(UserError, match=r"process 1 on .* is still writing"):
             is_done(run.folder)
 
 
-def test_an_overrides_yaml_that_lacks_a_line_is_damaged(tmp_path):
-    """Cut off between two lines it is a list still, of fewer words than were typed."""
+def test_an_overrides_yaml_with_a_missing_line_is_damaged(tmp_path):
+    """Cut off between two lines it is still a list, of fewer overrides than the user typed."""
     with opened(tmp_path, overrides=["seed=1", "algo=td3"]) as run:
-        assert typed_in(run.folder) == ["seed=1", "algo=td3"]
+        assert typed_overrides(run.folder) == ["seed=1", "algo=td3"]
     path = run.folder / "overrides.yaml"
     path.write_text(path.read_text().splitlines(keepends=True)[0])
-    with pytest.raises(UserError, match=r"overrides.yaml is damaged: 1 words, 2 were typed"):
-        typed_in(run.folder)
+    with pytest.raises(UserError, match=r"overrides.yaml is damaged: expected 2 overrides, got 1"):
+        typed_overrides(run.folder)
 
 
 @pytest.mark.parametrize("name", ["..", ".", ".hidden", "a/b", "a\0b", "a\nb", "x" * 300])
@@ -170,7 +173,7 @@ def test_rewinding_keeps_what_was_whole_as_it_was_written(tmp_path):
 
 
 def test_a_disk_that_is_full_takes_nothing_away(tmp_path, monkeypatch):
-    """A run that cannot write its last word stays marked as running, and raises what was wrong."""
+    """A run that cannot write its summary keeps the status running and raises the error."""
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -188,8 +191,8 @@ def test_a_disk_that_is_full_takes_nothing_away(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
-def test_what_is_cut_off_is_said_in_one_line(share, tmp_path):
-    """Tensors, arrays and JSON that are not whole raise a UserError that names the file."""
+def test_a_truncated_file_gets_one_line(share, tmp_path):
+    """Truncated tensors, arrays and JSON raise a UserError that names the file."""
     save_tensors(tmp_path / "a.pt", {"x": torch.zeros(100)})
     np.savez(tmp_path / "a.npz", x=np.arange(100.0))
     (tmp_path / "summary.json").write_text(json.dumps({"best": {"x": 1.0}}))
@@ -199,9 +202,9 @@ def test_what_is_cut_off_is_said_in_one_line(share, tmp_path):
         path = tmp_path / name
         assert read(path)
         path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-        with pytest.raises(UserError, match=re.escape(str(path))) as said:
+        with pytest.raises(UserError, match=re.escape(str(path))) as caught:
             read(path)
-        assert "\n" not in str(said.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_a_pickled_object_in_a_run_folder_is_refused(tmp_path):
@@ -216,8 +219,8 @@ def test_a_pickled_object_in_a_run_folder_is_refused(tmp_path):
 
 @pytest.mark.parametrize("value", [True, None, -1, 1.5, {"a": 1}, [], [True]])
 def test_an_option_of_a_group_is_a_word(value):
-    """Hydra stops with a traceback where it is none; trackers alone may be none at all."""
-    with pytest.raises(UserError, match=r"algo: .* is not allowed; allowed: td3, tqc"):
+    """Hydra raises a traceback for other values; only trackers may be an empty list."""
+    with pytest.raises(UserError, match=r"algo: expected one of td3, tqc, got"):
         check_option("algo", value, ["td3", "tqc"])
     check_option("algo", "tqc", ["td3", "tqc"])
     check_option("tracker", [], ["csv"])

@@ -1,4 +1,4 @@
-"""The simulator of benchmarks/independent_arms.py, and what its judge measures."""
+"""The simulator of benchmarks/independent_arms.py and the scores of its judge."""
 
 import sys
 from pathlib import Path
@@ -22,13 +22,13 @@ def still(seed: int, **changes):
 
 
 def test_rigid_bodies_agree_with_mujoco():
-    from independent_arms import off
+    from independent_arms import rigid_body_error
 
-    assert off() < 1e-10
+    assert rigid_body_error() < 1e-10
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_joint_holds_up_to_its_edge_and_not_beyond(seed):
+def test_a_joint_holds_up_to_its_breakaway_torque(seed):
     from independent_dynamics import cycle
 
     arm, truth, state = still(seed)
@@ -45,7 +45,7 @@ def test_a_joint_holds_up_to_its_edge_and_not_beyond(seed):
     assert state.q[joint] > start[joint]
 
 
-def test_a_joint_that_another_one_pulls_lets_go():
+def test_a_joint_that_another_one_pulls_slips():
     from independent_dynamics import cycle
 
     arm, _, state = still(1)
@@ -57,7 +57,7 @@ def test_a_joint_that_another_one_pulls_lets_go():
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_half_the_step_moves_the_arm_the_same_way(seed):
-    """Through stops, reversals and releases: within a tenth of the least bit of an encoder."""
+    """Through stops, reversals and releases: within a tenth of the encoder resolution."""
     from independent_dynamics import cycle
 
     arm, _, _ = still(seed)
@@ -70,7 +70,7 @@ def test_half_the_step_moves_the_arm_the_same_way(seed):
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=2e-6)
 
 
-def test_delay_and_lag_are_those_that_are_asked_for():
+def test_delay_and_lag_are_exact():
     from independent_dynamics import cycle
 
     arm, _, state = still(0)
@@ -81,20 +81,20 @@ def test_delay_and_lag_are_those_that_are_asked_for():
         np.testing.assert_allclose(state.drive, 1 - np.exp(-since / arm.lag), atol=1e-12)
 
 
-def test_the_truth_itself_is_judged_right():
-    """Friction minus offset of eq. (5) is exact in r2s's family; edges are those of the truth."""
+def test_the_truth_itself_has_no_error():
+    """Friction minus offset of eq. (5) is exact in r2s's family; breakaway torques are those of the truth."""
     from independent_arms import CENTRE, draw, friction
-    from independent_judge import SPEEDS, Pull, drags, edges, speeds, true_dynamics
+    from independent_judge import SPEEDS, OtherTorques, drags, edges, speeds, true_dynamics
 
     truth = draw(0)
     found, v = true_dynamics(truth), speeds(np.ones((2, 7)), SPEEDS)
-    told = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
-    for at in (None, Pull(CENTRE[None])):  # the truth has nothing beside friction and offset
+    true_edges = np.stack([truth["breakaway_command_neg"], truth["breakaway_command_pos"]], -1)
+    for at in (None, OtherTorques(CENTRE[None])):  # the truth has friction and offset only
         np.testing.assert_allclose(drags(found, v, at), friction(truth, v) - truth["offset"], atol=1e-12)
-        np.testing.assert_allclose(edges(found, at), told, atol=1e-12)
+        np.testing.assert_allclose(edges(found, at), true_edges, atol=1e-12)
 
 
-def test_the_speeds_that_count_are_those_of_either_direction():
+def test_scored_speeds_are_those_of_each_direction():
     from independent_judge import speeds, visited
 
     t = np.arange(0, 10, 1e-3)[:, None]
@@ -106,7 +106,7 @@ def test_the_speeds_that_count_are_those_of_either_direction():
 
 
 def test_plain_regression_finds_coulomb_friction(tmp_path):
-    """Within 1 % of the level, as the offset and the asymmetric levels are in what it searches."""
+    """Within 1 % of the level: its columns contain the offset and a level per direction."""
     from independent_arms import draw, friction, make_arm, record_motion
     from independent_judge import plain_regression, speeds
 
@@ -114,27 +114,29 @@ def test_plain_regression_finds_coulomb_friction(tmp_path):
     np.savez(tmp_path / "train.npz", **record_motion(make_arm(truth), np.array(truth["friction"]["fc_pos"]), 1, 1))
     v = speeds(np.full((2, 7), 0.8), 10)
     right = friction(truth, v)
-    off = plain_regression(tmp_path / "train.npz")(v) - (right - truth["offset"])
-    assert (np.abs(off).max((0, 1)) < 0.01 * np.abs(right).mean((0, 1))).all()
+    error = plain_regression(tmp_path / "train.npz")(v) - (right - truth["offset"])
+    assert (np.abs(error).max((0, 1)) < 0.01 * np.abs(right).mean((0, 1))).all()
 
 
 @pytest.mark.parametrize(("seed", "all_rows", "family"), [(27, "coulomb", "stribeck"), (26, "coulomb", "coulomb")])
-def test_friction_that_falls_where_joints_also_stop_is_told_by_slow_slides(seed, all_rows, family, tmp_path):
-    """Arm 27's friction falls below 0.1 rad/s. All rows together take it for Coulomb's, 28 % wrong."""
-    from common import OLD, ROBOT, how
-    from independent_arms import make
+def test_slow_sliding_reveals_a_stribeck_effect(seed, all_rows, family, tmp_path):
+    """The friction of arm 27 falls below 0.1 rad/s. A fit of all rows selects Coulomb friction, 28 % wrong."""
+    from common import OLD, ROBOT, identify_settings
+    from independent_arms import write_arm
 
-    from r2s.identification.family_selection import compare_families
     from r2s.identification.identify import STANDSTILL
-    from r2s.identification.problem import believed
+    from r2s.identification.structure.cross_validation import CrossValidation
+    from r2s.identification.structure.family_selection import compare_families
+    from r2s.identification.terms import scaled_prior
     from r2s.physics.friction import FAMILIES
     from r2s.recordings.readers import read
 
-    make(tmp_path / "arm", seed)
+    write_arm(tmp_path / "arm", seed)
     recording = read(tmp_path / "arm" / "train.npz", torque="commanded", n_joints=ROBOT.n, name="train")
-    settings = how()
-    prior = believed(settings.prior, ROBOT, recording)
-    given = ROBOT, OLD, recording, settings.bounds, prior, settings.terms, settings.folds
+    settings = identify_settings()
+    prior = scaled_prior(settings.prior, ROBOT, recording)
+    given = ROBOT, OLD, recording, settings.bounds, prior, settings.folds, settings.cutoff_hz
+    cv = CrossValidation(*given, report=lambda row: None)
     for slowest, picked in ((0.0, all_rows), (STANDSTILL, family)):
-        chosen = compare_families(*given, {"cutoff_hz": settings.cutoff_hz}, lambda row: None, slowest)
+        chosen = compare_families(cv, settings.terms, slowest)
         assert FAMILIES[chosen["best"]].name == picked

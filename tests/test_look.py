@@ -1,4 +1,4 @@
-"""`r2s list` and `r2s look`: what the run folders are, and what a person sees of them."""
+"""`r2s list` and `r2s look`: the table of run folders, and the viewer on them."""
 
 import base64
 import io
@@ -28,10 +28,10 @@ from PIL import Image
 
 from r2s import cli
 from r2s.errors import UserError
-from r2s.reporting import look
-from r2s.reporting.colours import KNOWN
+from r2s.reporting.figures.colours import KNOWN
 from r2s.reporting.run_list import ago, run_rows
-from r2s.reporting.viewer_layout import Overlay
+from r2s.reporting.viewer import look
+from r2s.reporting.viewer.data import Content, Overlay
 from r2s.runs import status_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -84,8 +84,8 @@ def root(tmp_path) -> Path:
     return tmp_path
 
 
-def test_a_run_that_was_killed_says_so():
-    """SIGKILL leaves `running` in meta.json; on another computer nobody can know."""
+def test_the_status_of_a_killed_run():
+    """SIGKILL leaves `running` in meta.json; the process of another computer cannot be checked."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     meta = {"status": "running", "process": {"host": platform.node(), "pid": child.pid}}
     assert status_of(meta) == "running"
@@ -97,7 +97,7 @@ def test_a_run_that_was_killed_says_so():
 
 
 def test_the_list_has_status_figures_and_age(root):
-    """Every run is in it, with the figures that its stage is about."""
+    """It has every run with the key figures of its stage."""
     rows = run_rows(root)
     assert rows["status"].to_dict() == {
         "train/good": "done",
@@ -108,12 +108,12 @@ def test_the_list_has_status_figures_and_age(root):
         "transfer/there": "done",
     }
     assert set(rows["age"]) == {"2 h"}
-    figures = rows["what came of it"]
-    assert figures["train/good"] == "98 % < 1 cm, return -85"
-    assert figures["train/shot"] == "75 % < 1 cm, return -90 after 2k env steps"
+    figures = rows["result"]
+    assert figures["train/good"] == "success at 1 cm 98 %, return (eq. 2) -85.2"
+    assert figures["train/shot"] == "success at 1 cm 75 %, return (eq. 2) -90.0 after 2k env steps"
     assert figures["train/wrong"] == "UserError: no such thing"
     assert figures["identify/found"] == "torque RMSE 0.3 Nm, nominal 1.5"
-    assert figures["transfer/there"] == "mujoco 98 %; twin 90 % < 1 cm"
+    assert figures["transfer/there"] == "success at 1 cm, %: mujoco 98, twin 90"
     assert set(run_rows(root, failed=True).index) == {"train/shot", "train/wrong"}
     assert set(run_rows(root, stage="identify").index) == {"identify/found"}
     assert run_rows(root / "nowhere").empty
@@ -123,9 +123,12 @@ def test_the_list_has_status_figures_and_age(root):
 def typed(*words: str, monkeypatch, capsys) -> tuple[int, str, str]:
     """Do a command in this process: exit status, output, errors."""
     monkeypatch.setattr(sys, "argv", ["r2s", *words])
-    with pytest.raises(SystemExit) as end:
+    status = 0
+    try:
         cli.main()
-    return end.value.code, *capsys.readouterr()
+    except SystemExit as end:
+        status = end.code
+    return status, *capsys.readouterr()
 
 
 def test_the_command_lists(root, monkeypatch, capsys):
@@ -139,7 +142,7 @@ def test_the_command_lists(root, monkeypatch, capsys):
     assert "did you mean 'train'" in err
 
 
-def test_without_a_screen_it_says_so_and_writes_pictures(root, monkeypatch, capsys):
+def test_without_a_screen_it_writes_pictures(root, monkeypatch, capsys):
     """Two runs side by side: one recording with both, and their curves as a PNG."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -148,25 +151,28 @@ def test_without_a_screen_it_says_so_and_writes_pictures(root, monkeypatch, caps
     runs = [str(root / "train" / "good"), str(other)]
     status, out, err = typed("look", *runs, monkeypatch=monkeypatch, capsys=capsys)
     assert status == 0, err
-    assert "no screen here" in out
+    assert "no screen (neither DISPLAY" in out
     (picture,) = re.findall(r"^  (\S+\.png)$", out, flags=re.M)
     assert Path(picture).stat().st_size > 5000
     assert (Path(picture).parent / "recording.rrd").stat().st_size > 1000
 
 
 def test_what_cannot_be_looked_at_is_one_line(root, monkeypatch, capsys):
-    """An argument that is none, a folder that is none, a run that was stopped, arms that differ."""
-    for words, said in ((["list", "--faild"], "no argument '--faild'"), (["look"], "required: RUN; see r2s look")):
+    """A wrong argument, a wrong folder, an unfinished run, different arms."""
+    for words, expected in (
+        (["list", "--faild"], "no argument '--faild'"),
+        (["look"], "required: RUN; see r2s look"),
+    ):
         status, _, err = typed(*words, monkeypatch=monkeypatch, capsys=capsys)
         assert status == 2
         assert len(err.splitlines()) == 1
-        assert said in err
-    for word, said in (("god", "did you mean 'good'"), ("halted", "it was stopped before its end")):
+        assert expected in err
+    for word, expected in (("god", "did you mean 'good'"), ("halted", "the run did not reach its end")):
         run = str(root / "train" / word)
         status, _, err = typed("look", run, monkeypatch=monkeypatch, capsys=capsys)
         assert status == 2
         assert len(err.splitlines()) == 1
-        assert said in err
+        assert expected in err
     other = root / "transfer" / "there"
     (other / "config.yaml").write_text("robot: {name: ur10e}\n")
     runs = [str(root / "train" / "good"), str(other)]
@@ -195,11 +201,11 @@ def test_only_this_computer_is_served(monkeypatch):
 
 
 def test_a_port_that_is_taken_is_one_line():
-    """`--web` never says the address of somebody else's server; the port beside it is needed too."""
+    """`--web` refuses a port in use; it needs the next port too."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         for asked in (port, port - 1):
-            with pytest.raises(UserError, match=f"something listens at port {port} already; --port {asked + 2}"):
+            with pytest.raises(UserError, match=f"port {port} is in use; try --port {asked + 2}"):
                 look.show_in_browser([Path("recording.rrd")], asked)
 
 
@@ -229,15 +235,15 @@ def test_the_web_viewer_opens_without_an_error(root, panda, tmp_path):
     """`r2s look --web` in headless Chromium: curves of the recording are drawn and its console has no error."""
     from websockets.sync.client import connect
 
-    from r2s.reporting.viewer import write_recording
+    from r2s.reporting.viewer.recording import write_recording
 
     run = root / "identify" / "found"
     t = np.arange(4000) * 1e-3
     torque = np.sin(np.outer(t, np.arange(1, 8)))
     overlay = Overlay(t, torque, {"nominal": 0.5 * torque, "identified": 0.95 * torque})
-    write_recording(run / "recording.rrd", panda, overlays={"torque": overlay})
+    write_recording(run / "recording.rrd", panda, Content(overlays={"torque": overlay}))
     web = [sys.executable, str(ROOT / "run.py"), "look", str(run), "--web", "--port", "9490"]
-    said = open(tmp_path / "web.log", "w+")  # noqa: SIM115
+    log = open(tmp_path / "web.log", "w+")  # noqa: SIM115
     surf = [
         CHROMIUM,
         "--headless=new",
@@ -253,7 +259,7 @@ def test_the_web_viewer_opens_without_an_error(root, panda, tmp_path):
         "about:blank",
     ]
     with (
-        subprocess.Popen(web, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT) as server,
+        subprocess.Popen(web, stdout=log, stderr=subprocess.STDOUT, cwd=ROOT) as server,
         subprocess.Popen(surf, stderr=subprocess.PIPE, text=True) as browser,
     ):
         try:
@@ -292,7 +298,7 @@ def waited(ask, seconds: float = 90.0):
 
 
 def visited(connect, tab: str, url: str, seconds: float = 240.0) -> tuple[list[str], bytes]:
-    """Return what the console of a page says of errors until its curves are seen, for so long at most, and a PNG.
+    """Return the console errors of a page until its curves appear, or for `seconds`, and a PNG.
 
     The viewer asks for news and sends statistics; where there is no way out, those two fail.
     """
@@ -305,10 +311,10 @@ def visited(connect, tab: str, url: str, seconds: float = 240.0) -> tuple[list[s
             words = {"id": count, "method": method, "params": params} | ({"sessionId": session} if session else {})
             spoken.send(json.dumps(words))
             while (answer := json.loads(spoken.recv(timeout=90))).get("id") != count:
-                heard(answer)
+                handle(answer)
             return answer["result"]
 
-        def heard(message: dict) -> None:
+        def handle(message: dict) -> None:
             kind, params = message.get("method"), message.get("params", {})
             if kind == "Runtime.exceptionThrown":
                 errors.append(json.dumps(params))
@@ -325,6 +331,6 @@ def visited(connect, tab: str, url: str, seconds: float = 240.0) -> tuple[list[s
             looked = time.monotonic() + 5.0
             while (left := looked - time.monotonic()) > 0:
                 with suppress(TimeoutError):
-                    heard(json.loads(spoken.recv(timeout=left)))
+                    handle(json.loads(spoken.recv(timeout=left)))
             picture = base64.b64decode(ask("Page.captureScreenshot", session, format="png")["data"])
     return [e for e in errors if "Failed to fetch" not in e], picture

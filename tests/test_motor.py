@@ -14,11 +14,12 @@ from r2s.identification.identify import identify
 from r2s.identification.parameter_file import load_parameters, save_parameters
 from r2s.identification.parameters import parameter_space
 from r2s.identification.prediction import prediction_errors
-from r2s.identification.problem import Problem, believed, searched
+from r2s.identification.problem import Problem
+from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
-from r2s.identification.torque_residual import TorqueResidual
-from r2s.learning.randomization import Around
+from r2s.identification.terms import scaled_prior, search_space
+from r2s.learning.randomization import UniformRandomization
 from r2s.physics.description import write_description
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.friction import family
@@ -27,7 +28,7 @@ from r2s.physics.simulator import Simulator, single_arm
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
 
-SETTINGS = conf("config")["identify"]
+SETTINGS = conf("identify/default")
 NOISE = 0.5  # Nm, white, of every sample
 COULOMB = np.array([[32.0, 0.0, 14.0], [24.0, 0.0, 9.0], [11.0, 0.0, 5.0]])  # friction of tens of Nm
 OFFSET = np.array([2.0, -1.5, 0.8])
@@ -83,7 +84,7 @@ def settings(torque="motor", **change):
 
 
 def found_in(arm, start, recording, **change):
-    return identify(arm, start, recording, [LeastSquares()], settings(recording.torque, **change), nthread=1)
+    return identify(arm, start, recording, [LeastSquares()], settings(recording.torque, nthread=1, **change))
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +104,13 @@ def test_what_was_injected_is_found(arm, truth, motion, found):
     White noise of 0.5 Nm is flat up to 500 Hz and cut at 10 Hz, so 2 * 10 * seconds numbers are independent. What
     differentiation and the filter leave of the noise-free motion adds 1 % of each value.
     """
-    residual = TorqueResidual(arm, found.space, motion)
+    residual = TorqueResidual(found.space, motion)
     x = found.space.start.copy()
     true = {"coulomb": COULOMB[:, 0], "asymmetry": 0 * OFFSET, "viscous": COULOMB[:, 2]}
     true |= {"offset": OFFSET, "armature": ARMATURE}
     for name, values in true.items():
         x[found.space.where(name)] = values
-    residual._scale = np.full(arm.n, NOISE * np.sqrt(2 * 10 / 1000))
+    residual._weights = np.ones(arm.n), np.full(arm.n, NOISE * np.sqrt(2 * 10 / 1000))
     step = 1e-4 * np.maximum(np.abs(x), 0.1)
     jacobian = residual.change(x, x + step) / step
     rows_each = len(jacobian) / arm.n / (2 * 10 * motion.duration)
@@ -139,20 +140,20 @@ def test_beliefs_and_bounds_grow_with_the_arm(arm, start, motion):
     arm = replace(arm, tau_max=np.array([150.0, 1.0, 60.0]))  # a limit that the recording proves wrong
     largest = np.maximum(arm.tau_max, np.abs(motion.tau).max(0))
     prior = SETTINGS["prior"]["motor"]
-    own = believed(prior, arm, motion)
+    own = scaled_prior(prior, arm, motion)
     for name in ("offset", "armature", "viscous"):
         np.testing.assert_allclose(own[name], prior[name] * largest)
     assert own["link_alpha"] == prior["link_alpha"]
-    space = searched(arm, start, SETTINGS["bounds"], ["offset", "armature"], motion)
+    space = search_space(arm, start, SETTINGS["bounds"], ["offset", "armature"], motion)
     assert np.all(space.upper >= np.tile(np.minimum(largest, 0.05), len(space.blocks)))
     np.testing.assert_allclose(space.block(space.lower, "offset"), -largest)
     other = replace(motion, torque="commanded")
-    commanded = believed(prior, arm, other)
+    commanded = scaled_prior(prior, arm, other)
     np.testing.assert_allclose(commanded.pop("armature"), prior["armature"] * largest)
     assert commanded == {name: sigma for name, sigma in prior.items() if name != "armature"}
-    space = searched(arm, start, SETTINGS["bounds"], ["offset"], other)
+    space = search_space(arm, start, SETTINGS["bounds"], ["offset"], other)
     np.testing.assert_allclose(space.block(space.upper, "offset"), SETTINGS["bounds"]["offset"][1])
-    assert len(Problem(*[TorqueResidual(arm, space, other)] * 2, prior).sigma) == len(space.start)
+    assert len(Problem.of(*[TorqueResidual(space, other)] * 2, prior).sigma) == len(space.start)
 
 
 def test_a_link_side_sensor_does_not_feel_rotors(arm, start, truth):
@@ -161,20 +162,20 @@ def test_a_link_side_sensor_does_not_feel_rotors(arm, start, truth):
     space = parameter_space(arm, start, {"offset": [-5.0, 5.0]})
     heavy = replace(truth, armature=10 * ARMATURE)
     for torque, feels in (("measured", False), ("motor", True), ("commanded", True)):
-        residual = TorqueResidual(arm, space, replace(measured, torque=torque))
+        residual = TorqueResidual(space, replace(measured, torque=torque))
         moved = residual.predict(heavy) - residual.predict(truth)
         np.testing.assert_allclose(moved, 9 * ARMATURE * residual.motion.ddq * feels, atol=1e-9)
     terms = ["offset", "armature", "gain", "delay"]
     own = {"measured": {"offset", "gain"}, "motor": {"offset", "armature", "gain"}}
     for torque, names in (own | {"commanded": {"offset", "armature", "delay"}}).items():
-        found = searched(arm, start, SETTINGS["bounds"], terms, replace(measured, torque=torque))
+        found = search_space(arm, start, SETTINGS["bounds"], terms, replace(measured, torque=torque))
         assert set(terms) & set(found.blocks) == names
 
 
 def test_the_gain_of_a_motor_is_that_of_its_torque_constant(arm, start, truth):
     """All of the torque is wrong by it: 1 + gain times friction, rotors and links."""
     motor = recorded(arm, truth, 2.0, noise=0.0)
-    residual = TorqueResidual(arm, parameter_space(arm, start, {"offset": [-5.0, 5.0]}), motor)
+    residual = TorqueResidual(parameter_space(arm, start, {"offset": [-5.0, 5.0]}), motor)
     gain = np.array([0.1, -0.05, 0.2])
     predicted = residual.predict(replace(truth, gain=gain))
     np.testing.assert_allclose(predicted, (1 + gain) * residual.predict(truth), rtol=1e-12)
@@ -183,8 +184,8 @@ def test_the_gain_of_a_motor_is_that_of_its_torque_constant(arm, start, truth):
 def test_the_jacobian_of_every_block_is_that_of_differences(arm, start, motion):
     """`change` against one evaluation per value, rotors, payload and gain included."""
     terms = ["offset", "link", "payload", "armature", "gain", "load", "drag_sin", "drag_cos"]
-    space = searched(arm, start, SETTINGS["bounds"], terms, motion)
-    residual = TorqueResidual(arm, space, motion)
+    space = search_space(arm, start, SETTINGS["bounds"], terms, motion)
+    residual = TorqueResidual(space, motion)
     u = np.clip(space.to_unit(space.start) + 0.02, 0.0, 1.0)
     x, stepped = space.from_unit(u), space.from_unit(u + 1e-3)
     one_by_one = np.where(np.eye(len(x), dtype=bool), stepped, x)
@@ -197,7 +198,7 @@ def test_a_payload_is_told_from_the_links(arm, start, truth, payload):
     """Of links and payload, both searched, only what motion left out needs is kept: a payload, or neither."""
     recording = recorded(arm, truth, 4.0, payload=payload)
     terms = ["offset", "link", "payload", "armature"]
-    result = found_in(arm, start, recording, terms=terms, spare=["payload", "link"], folds=3)
+    result = found_in(arm, start, recording, terms=terms, prunable_terms=["payload", "link"], folds=3)
     blocks = set(result.space.blocks)
     assert "link_alpha" not in blocks
     assert ("payload_mass" in blocks) == (payload > 0)
@@ -235,7 +236,7 @@ def test_rotors_move_the_simulated_arm(arm, start):
 
 def test_rotors_go_where_the_arm_goes(arm, truth, tmp_path, start):
     """Through draws, parameters.yaml and the MJCF that is written; SDF cannot say them and is left out."""
-    drawn = Around(arm, truth, 0.1, 0.05)(np.random.default_rng(0), 4)
+    drawn = UniformRandomization(arm, truth, 0.1, 0.05)(np.random.default_rng(0), 4)
     np.testing.assert_array_equal(drawn.armature, ARMATURE)
     write_description(tmp_path, arm, truth)
     assert {p.name for p in tmp_path.iterdir()} == {"arm.xml", "arm.urdf"}
@@ -252,11 +253,11 @@ def test_rotors_go_where_the_arm_goes(arm, truth, tmp_path, start):
 
 def test_spare_terms_are_terms():
     """An unknown one gets one line; leaving motion out needs two folds, but only where a spare term is searched."""
-    with pytest.raises(UserError, match=r"^identify\.spare: unknown term 'lnk'; .*did you mean 'link'"):
-        settings(spare=["lnk"])
+    with pytest.raises(UserError, match=r"^identify\.prunable_terms: unknown term 'lnk'; .*did you mean 'link'"):
+        settings(prunable_terms=["lnk"])
     with pytest.raises(UserError, match=r"^identify\.folds: 1 is too few"):
-        settings(spare=["link"], folds=1)
-    settings(terms=["offset"], spare=["link"], folds=1)
+        settings(prunable_terms=["link"], folds=1)
+    settings(terms=["offset"], prunable_terms=["link"], folds=1)
 
 
 def log(path, **change):
@@ -292,17 +293,17 @@ def test_currents_with_their_constants_are_torque(tmp_path):
 WRONG = [
     ({}, {}, "column 'current' is a current: set data.torque_constant="),
     ({}, {"columns": {"tau": "current"}}, "column 'current' is a current: set data.torque_constant="),
-    ({}, {"torque_constant": [1.0, 2.0]}, "data.torque_constant has 2 values for 3 joints"),
-    ({}, {"torque_constant": [1.0, np.nan, 2.0]}, "must be finite Nm/A, not 0"),
-    ({}, {"torque_constant": [1.0, 0.0, 2.0]}, "must be finite Nm/A, not 0"),
-    ({}, {"torque_constant": "a few"}, "data.torque_constant: a few is not a number of Nm/A"),
+    ({}, {"torque_constant": [1.0, 2.0]}, "data.torque_constant: expected 3 values, one per joint, got 2"),
+    ({}, {"torque_constant": [1.0, np.nan, 2.0]}, "data.torque_constant: expected finite Nm/A other than 0"),
+    ({}, {"torque_constant": [1.0, 0.0, 2.0]}, "data.torque_constant: expected finite Nm/A other than 0"),
+    ({}, {"torque_constant": "a few"}, "data.torque_constant: expected a number of Nm/A or one per joint, got a few"),
     (
         {},
         {"torque_constant": 1.0, "torque": "measured"},
-        "torque_constant is for data.torque=motor, not measured",
+        "data.torque_constant: expected null unless data.torque=motor",
     ),
     ({"tau_motor": 1.0}, {"torque_constant": 1.0}, "no column 'current' for tau (motor torque)"),
-    ({"tau_motor": 1.0}, {"torque_constant": 1.0}, "tau_motor is torque already"),
+    ({"tau_motor": 1.0}, {"torque_constant": 1.0}, "if tau_motor is in Nm, leave data.torque_constant null"),
     ({"tau_motor": 1.0}, {"torque": "measured"}, "tau_motor is motor torque (set data.columns.tau)"),
     ({"tau_motor": 1.0}, {"torque": "moter"}, "unknown torque 'moter'; allowed: measured, commanded, motor; did you"),
     ({"tau_motor": 0.0}, {}, "is 0 in every row: this log holds no motor torque"),

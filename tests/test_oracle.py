@@ -8,13 +8,13 @@ from omegaconf import OmegaConf
 
 from r2s.errors import UserError
 from r2s.excitation.minimum_jerk import minimum_jerk
-from r2s.learning.computed_torque import Oracle
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
+from r2s.learning.model_based import Oracle
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.stages.build import unread
-from r2s.tasks.episode import measures
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import measures
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_wrong_model_shows(panda, task, dynamics):
 
 def test_inverse_kinematics_ends_at_the_goal_within_the_limits(panda, task, dynamics):
     """The hand is at the goal to 0.2 mm; a joint that an action does not move stays where it is."""
-    oracle, stuck = Oracle(panda, task, dynamics), task.torque(panda) < dynamics.level
+    oracle, stuck = Oracle(panda, task, dynamics), task.torque_limit(panda) < dynamics.level
     assert np.flatnonzero(stuck).tolist() == [4, 6]
     from r2s.physics.rigid_body import Kinematics
 
@@ -96,13 +96,13 @@ def test_an_episode_begins_where_there_is_no_effort(panda, task, dynamics):
 
 @pytest.mark.parametrize("move_s", [float("nan"), 0.0, -1.0])
 def test_a_motion_takes_time(panda, task, dynamics, move_s):
-    with pytest.raises(UserError, match=r"move_s: .* is not allowed"):
+    with pytest.raises(UserError, match=r"move_s: expected .*, got .*"):
         Oracle(panda, task, dynamics, move_s=move_s)
 
 
 def test_what_a_training_reads_is_nothing_to_a_controller():
     """Also where an experiment has set it for all algorithms."""
-    target = "r2s.learning.computed_torque.Oracle"
+    target = "r2s.learning.model_based.Oracle"
     algo = {"_target_": target, "name": "oracle"}
     cfg = OmegaConf.create({"stage": "train", "calibration": None, "algo": algo, "adapt": {"name": "none"}})
     cfg.algo.update({"move_s": 0.6, "batch_size": 32, "n_envs": 8})

@@ -17,7 +17,7 @@ from test_extending import EXAMPLES
 
 DOCS = ROOT / "docs"
 OWN = "extending.md"  # test_extending.py types it
-PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.glob("*.md")) if p.name != OWN)]
+PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.rglob("*.md")) if p.name != OWN)]
 PROGRAM = r"(?:python|r2s|make|pip|pytest|rerun|source|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) "
 ELSEWHERE = {  # what this file does not type, and why
     r"make \w+": "sets up from the network; what it then does is stage=pipeline, these tests, the site below",
@@ -46,7 +46,7 @@ def commands(page: Path) -> list[str]:
     return list(dict.fromkeys([*in_blocks(page), *inline]))
 
 
-LISTED = set(in_blocks(DOCS / "commands.md"))  # test_cli.py types them; test_look.py, test_export.py
+LISTED = set(in_blocks(DOCS / "reference" / "commands.md"))  # test_cli.py types them; test_look.py, test_export.py
 TYPED = {
     page: [c for c in commands(page) if c not in LISTED and not any(re.match(k, c) for k in ELSEWHERE)]
     for page in PAGES
@@ -78,7 +78,7 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
         wanted = [t for t in TRACKERS if any(w.startswith("tracker=") and t in w for w in words)]
         if [t for t in wanted if not find_spec(t)]:
             continue  # an extra that is not installed here
-        if words[0] not in ("list", "look", "--help"):
+        if words[0] not in ("list", "look", "export", "--help"):
             words += TOY
             name = next((w.removeprefix("name=") for w in words if w.startswith("name=")), None)
             named = name and f"runs/identify/{name}/ramps.npz" in page.read_text()
@@ -88,11 +88,13 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
 
 
 def test_the_site_leads_to_every_page():
-    """mkdocs.yml has each page of docs/ once, besides those that are made; no page links to what the site lacks."""
+    """mkdocs.yml names each page of docs/ once, besides the generated ones; no page links outside docs/."""
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     found = re.findall(r"(\S+\.md)$", yaml.safe_dump(nav), flags=re.M)
-    assert sorted(found) == sorted(["index.md", *(p.name for p in DOCS.glob("*.md"))])
-    assert not [p.name for p in DOCS.glob("*.md") if "](../" in p.read_text()]
+    pages = sorted(DOCS.rglob("*.md"))
+    assert sorted(found) == sorted(["index.md", *(p.relative_to(DOCS).as_posix() for p in pages)])
+    links = {(p, link) for p in pages for link in re.findall(r"\]\(([^)\s#]+)", p.read_text()) if "://" not in link}
+    assert not [(p.name, link) for p, link in links if not (p.parent / link).resolve().is_relative_to(DOCS)]
 
 
 def opened(browser: str, page: str, picture: Path, folder: Path) -> tuple[str, list[str]]:
@@ -121,7 +123,9 @@ def test_the_site_and_a_report_open_without_a_word_on_the_console(tmp_path):
     if browser is None:
         pytest.skip("no Chromium here: the site was built, and not opened")
     succeed("stage=identify", "name=seen", *TOY, at=tmp_path)
-    pages = [tmp_path / "site" / f"{name}.html" for name in ("index", "without_arm", "gallery", "api/physics")]
+    pages = [
+        tmp_path / "site" / f"{name}.html" for name in ("index", "tutorials/without_arm", "gallery", "api/physics")
+    ]
     for page in [*pages, tmp_path / "runs/identify/seen/report.html"]:
         seen, said = opened(browser, page.as_uri(), tmp_path / f"{page.stem}.png", tmp_path / "browser")
         assert said == [], page

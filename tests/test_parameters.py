@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from r2s.errors import UserError
 from r2s.identification.link_inertia import CHOLESKY, LINK, inertia_scale, links, log_cholesky, pseudo_inertia
 from r2s.identification.parameter_file import load_parameters, load_posterior, save_parameters
-from r2s.identification.parameters import WHOLE_ARM, Estimate, parameter_space, units
-from r2s.learning.randomization import Around, Identified, physical
-from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.identification.parameters import WHOLE_ARM, ParameterEstimate, parameter_space, units
+from r2s.learning.randomization import PosteriorRandomization, UniformRandomization, physical
+from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import FAMILIES, STRIBECK
 from r2s.physics.robot import load_robot
 
-ALL = conf("config")["identify"]["bounds"]
+ALL = conf("identify/default")["bounds"]
 EDGES = {"breakaway_positive": [0.0, 1.5], "breakaway_negative": [-1.5, 0.0]}
 PAPER = {k: ALL[k] for k in ("phi1", "phi2", "phi3", "inertia_scale", "offset")}
 REST = {k: ALL[k] for k in ("offset", *LINK, "delay", "lag", "load", "drag_sin", "drag_cos", "gain")}
@@ -38,7 +38,7 @@ def space(panda, paper):
 @pytest.fixture(scope="module")
 def whole(panda, paper):
     """Everything that can be searched at once: another family, whole links, blocks of one value."""
-    stribeck = of_family(paper, "stribeck")
+    stribeck = with_family(paper, "stribeck")
     friction = {k: ALL[k] for k in STRIBECK.names if k not in STRIBECK.optional}
     return parameter_space(panda, stribeck, friction | REST | EDGES)
 
@@ -56,8 +56,8 @@ def some(space, seed, count=None):
 
 def same(a, b, rtol):
     """Assert that two dynamics agree, field by field."""
-    assert (a.family, a.hold) == (b.family, b.hold)
-    for name in (f.name for f in fields(a) if f.name not in ("family", "hold")):
+    assert (a.family, a.stiction_model) == (b.family, b.stiction_model)
+    for name in (f.name for f in fields(a) if f.name not in ("family", "stiction_model")):
         atol = max(rtol * 1e-3, 1e-12)
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=rtol, atol=atol, err_msg=name)
 
@@ -84,7 +84,7 @@ def test_outside_of_the_cube_is_its_edge(either):
 
 
 def test_logarithmic_coordinates_have_their_geometric_mean_in_the_middle(space, whole):
-    """What spans decades is searched by ratio, the rest by difference; `spread` is the width in that coordinate."""
+    """What spans decades is searched by ratio, the rest by difference; `width` is the width in that coordinate."""
     middle = space.from_unit(np.full(len(space.start), 0.5))
     np.testing.assert_allclose(space.block(middle, "phi1"), np.sqrt(0.05 * 10.0))
     np.testing.assert_allclose(space.block(middle, "inertia_scale"), np.sqrt(0.3 * 3.0))
@@ -92,8 +92,8 @@ def test_logarithmic_coordinates_have_their_geometric_mean_in_the_middle(space, 
     middle = whole.from_unit(np.full(len(whole.start), 0.5))
     np.testing.assert_allclose(whole.block(middle, "stribeck_velocity"), np.sqrt(0.01 * 0.5))
     np.testing.assert_allclose(whole.block(middle, "delay"), [0.005])
-    np.testing.assert_allclose(whole.block(whole.spread, "coulomb"), np.log(10.0 / 0.02))
-    np.testing.assert_allclose(whole.block(whole.spread, "drag_sin"), 2.0)
+    np.testing.assert_allclose(whole.block(whole.width, "coulomb"), np.log(10.0 / 0.02))
+    np.testing.assert_allclose(whole.block(whole.width, "drag_sin"), 2.0)
 
 
 def test_the_start_is_the_nominal_arm(space, whole, paper):
@@ -119,18 +119,10 @@ def test_blocks_of_the_whole_arm_are_one_value(whole):
     many = whole.dynamics(some(whole, 0, 3))
     assert many.delay.shape == many.lag.shape == (3,)
     assert np.ndim(whole.dynamics(whole.start).delay) == 0
-    out = whole.spread_out({"delay": 1.0, "offset": 2.0}, -1.0)
+    out = whole.expand({"delay": 1.0, "offset": 2.0}, -1.0)
     assert whole.block(out, "delay").tolist() == [1.0]
     assert whole.block(out, "offset").tolist() == [2.0] * 7
     assert np.count_nonzero(out == -1.0) == len(x) - 8
-
-
-def test_a_joints_parameters_are_friction_and_offset(whole):
-    """`of_joints` marks what can be kept for a joint alone: no link, no delay."""
-    joints = np.arange(7) == 3
-    marked = [n for n, one in zip(whole.names, whole.of_joints(joints), strict=True) if one]
-    assert {"coulomb[4]", "viscous[4]", "offset[4]", "load[4]", "breakaway_positive[4]"} <= set(marked)
-    assert all(n.endswith("[4]") and not n.startswith("link_") for n in marked)
 
 
 def test_a_batch_of_vectors_is_a_batch_of_arms(either, panda):
@@ -168,8 +160,8 @@ def test_a_searched_viscous_term_extends_the_sigmoid(panda, paper):
 
 @pytest.mark.parametrize("name", [f.name for f in FAMILIES])
 def test_the_arm_of_another_family_has_the_same_level(panda, paper, name):
-    """of_family and friction.family keep the mean friction at 1 rad/s and everything else."""
-    found, one = of_family(paper, name), np.ones(7)
+    """with_family and friction.family keep the mean friction at 1 rad/s and everything else."""
+    found, one = with_family(paper, name), np.ones(7)
     np.testing.assert_allclose(found.family.level(found.phi, one), paper.family.level(paper.phi, one), rtol=1e-7)
     same(replace(found, phi=paper.phi, family=paper.family), paper, rtol=0)
     settings = conf("friction/paper") | {"family": name}
@@ -181,7 +173,7 @@ def test_the_arm_of_another_family_has_the_same_level(panda, paper, name):
 def test_measured_edges_of_the_dead_zone_move_with_the_offset(panda, paper):
     """The command at which a joint let go was seen: edge = command + offset, on its own side of zero."""
     command = np.stack([np.full(7, -0.4), np.full(7, 0.6)], -1)
-    space = parameter_space(panda, paper, {"offset": [-2.0, 2.0]}, break_command=command)
+    space = parameter_space(panda, paper, {"offset": [-2.0, 2.0]}, breakaway_command=command)
     x = np.array([[0.0] * 7, [0.1] * 7, [-0.25] * 7, [0.9] * 7, [-0.9] * 7])
     edges = space.dynamics(x).breakaway
     np.testing.assert_allclose(edges[:, 0], [[-0.4, 0.6], [-0.3, 0.7], [-0.65, 0.35], [0.0, 1.5], [-1.3, 0.0]])
@@ -250,7 +242,7 @@ def test_an_unphysical_tensor_becomes_a_flat_one(panda):
 
 def write(path, space, x, samples=None):
     draws = x + 0.01 * np.random.default_rng(0).normal(size=(5, len(x))) if samples is None else samples
-    found = Estimate(x, x - 0.01, x + 0.01, np.arange(len(x)) % 2 == 0, draws)
+    found = ParameterEstimate(x, x - 0.01, x + 0.01, np.arange(len(x)) % 2 == 0, draws)
     save_parameters(path, space, found, {"recording": "test"}, {"remark": ["kept"]})
 
 
@@ -288,7 +280,7 @@ def test_draws_come_back_from_their_file(tmp_path, panda, whole):
     space, _ = load_parameters(tmp_path, panda)
     for place in (tmp_path, tmp_path / "parameters.yaml"):
         assert np.array_equal(load_posterior(place, space), samples)
-    drawn = Identified(space, samples)(np.random.default_rng(0), 40)
+    drawn = PosteriorRandomization(space, samples)(np.random.default_rng(0), 40)
     rows = whole.dynamics(samples)
     assert drawn.offset.shape == (40, 7)
     which = np.abs(drawn.delay[:, None] - rows.delay).argmin(1)
@@ -389,7 +381,7 @@ def test_a_file_of_something_else_is_one_line(tmp_path, panda, text):
         ({"parameters": {"coulomb": {"value": [1.0] * 7}}}, ["bounds.coulomb", "'sigmoid' has phi1"]),
         ({"parameters": {}}, ["no parameter is named"]),
         ({"parameters": "none"}, []),
-        ({"friction_family": "coulom"}, ["no family 'coulom'", "did you mean 'coulomb'?"]),
+        ({"friction_family": "coulom"}, ["friction.family", "'coulom'", "did you mean 'coulomb'?"]),
         ({"fixed": {"phi": [[1.0, 2.0, 0.0]] * 6}}, ["phi", "7 finite values"]),
         ({"fixed": {"breakaway_positive": [1.0]}}, ["breakaway_positive", "7 finite values"]),
     ],
@@ -433,10 +425,10 @@ def test_wrong_bounds_are_named(panda, paper, bounds, words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"phi1": [1.0, 2.0]}, ["friction.phi1", "2 values", "7 joints"]),
-        ({"phi2": -1.0}, ["friction.phi2", "-1", "negative"]),
-        ({"offset": float("nan")}, ["friction.offset", "not finite"]),
-        ({"inertia_scale": 0.0}, ["inertia.scale", "not positive"]),
+        ({"phi1": [1.0, 2.0]}, ["friction.phi1", "expected 7 values", "got 2"]),
+        ({"phi2": -1.0}, ["friction.phi2", "got -1"]),
+        ({"offset": float("nan")}, ["friction.offset", "finite"]),
+        ({"inertia_scale": 0.0}, ["inertia.scale", "positive", "got 0"]),
         ({"breakaway_positive": -0.1}, ["friction.breakaway"]),
         ({"family": "colomb"}, ["friction.family", "'colomb'", "did you mean 'coulomb'?"]),
     ],
@@ -452,7 +444,7 @@ def test_impossible_dynamics_are_named(panda, change, words):
 def test_the_papers_randomization_stays_in_its_ranges(panda, paper):
     """Phi within 10 %, tensor elements within 5 %, every tensor physical, each phi and link a draw of its own."""
     m = 400
-    drawn = Around(panda, paper, phi_relative=0.10, inertia_relative=0.05)(np.random.default_rng(0), m)
+    drawn = UniformRandomization(panda, paper, phi_relative=0.10, inertia_relative=0.05)(np.random.default_rng(0), m)
     phi = drawn.phi / paper.phi
     assert phi.shape == (m, 7, 3)
     assert 0.9 <= phi.min() < 0.901
@@ -472,7 +464,7 @@ def test_the_papers_randomization_stays_in_its_ranges(panda, paper):
 def test_tensors_are_uniform_over_what_is_physical(panda, paper):
     """What the docstring says of the Panda at 5 %: how alike elements are, and that each of them spans its range."""
     m = 4000
-    drawn = Around(panda, paper, phi_relative=0.0, inertia_relative=0.05)(np.random.default_rng(0), m)
+    drawn = UniformRandomization(panda, paper, phi_relative=0.0, inertia_relative=0.05)(np.random.default_rng(0), m)
     elements = (drawn.inertia / paper.inertia)[..., *np.triu_indices(3)]
     span = elements.std(0) / (0.05 / np.sqrt(3))  # of a uniform draw
     assert span.min() > 0.7
@@ -502,7 +494,8 @@ def test_physical_tells_apart():
 def test_same_seed_same_draws(panda, paper):
     """A seed gives the same arms twice and another seed gives others."""
     first, again, other = (
-        Around(panda, paper, phi_relative=0.1, inertia_relative=0.05)(np.random.default_rng(s), 3) for s in (5, 5, 6)
+        UniformRandomization(panda, paper, phi_relative=0.1, inertia_relative=0.05)(np.random.default_rng(s), 3)
+        for s in (5, 5, 6)
     )
     assert np.array_equal(first.phi, again.phi)
     assert np.array_equal(first.inertia, again.inertia)
@@ -511,6 +504,6 @@ def test_same_seed_same_draws(panda, paper):
 
 def test_zero_widths_give_the_centre(panda, paper):
     """conf/dr/none is m copies of the centre."""
-    drawn = Around(panda, paper, **conf("dr/none"))(np.random.default_rng(0), 5)
+    drawn = UniformRandomization(panda, paper, **conf("dr/none"))(np.random.default_rng(0), 5)
     assert np.array_equal(drawn.phi, np.broadcast_to(paper.phi, (5, 7, 3)))
     assert np.array_equal(drawn.inertia, np.broadcast_to(paper.inertia, (5, 7, 3, 3)))

@@ -1,12 +1,12 @@
-"""Ways are checked before they are driven: what forbids one is said, and another one is found where there is one."""
+"""Paths: the error names the violation, and `approach` finds a free path."""
 
 import numpy as np
 import pytest
 from conftest import conf
 
 from r2s.errors import UserError
+from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.excitation.paths import approach, check_path
-from r2s.excitation.safety import CLEARANCE_M, Space
 from r2s.physics.robot import load_robot
 
 ROBOT = load_robot(**conf("robot/panda"))
@@ -14,7 +14,7 @@ SPACE = Space(ROBOT)
 LOW = np.array([0.0, 1.2, 0, -1.9, 0, 2.2, 0.8])  # the hand far out, a little above the table
 
 
-def said(path, **more):
+def violation(path, **more):
     with pytest.raises(UserError) as caught:
         check_path(ROBOT, np.array(path), space=SPACE, **more)
     assert "\n" not in str(caught.value)
@@ -27,22 +27,24 @@ def allowed():
     return q[(SPACE.gaps(q) >= 0).all(1)]
 
 
-def test_a_path_names_joint_or_link_where_and_what_is_allowed():
+def test_violations_of_a_path_are_named():
     home, far, below = ROBOT.q_home, ROBOT.q_home.copy(), ROBOT.q_home.copy()
     far[3], below[1] = 0.5, 1.7
     check_path(ROBOT, np.array([home, home + 0.1]), space=SPACE)
-    assert said([home, far]) == "the path: joint 4 would be at 0.5 rad 100 % of the way, allowed -3.0718 to -0.0698"
-    line = said([home, home + 0.1, below], what="data.ramp_poses")
+    assert (
+        violation([home, far]) == "the path: joint 4 would be at 0.5 rad 100 % of the way, allowed -3.0718 to -0.0698"
+    )
+    line = violation([home, home + 0.1, below], what="data.ramp_poses")
     assert line.startswith("data.ramp_poses: the end effector is 0.0")
     assert "% of the way, from posture 2 to 3 of 3, allowed 0.1 m or more" in line
-    line = said([home, below])
+    line = violation([home, below])
     assert "% of the way, allowed" in line
-    assert "joint 2 of posture 2 is nan" in said([home, np.where(np.arange(7) == 1, np.nan, home)])
-    assert "(1, 7)" in said([home])
+    assert "joint 2 of posture 2 is nan" in violation([home, np.where(np.arange(7) == 1, np.nan, home)])
+    assert "(1, 7)" in violation([home])
 
 
-def test_nothing_between_two_samples_comes_nearer_than_touching():
-    """Of every path that is allowed, at more samples, no distance is used up."""
+def test_nothing_touches_between_two_samples():
+    """On every allowed path all distances stay positive at a finer sampling."""
     postures, checked = allowed(), 0
     for a, b in zip(postures[:30:2], postures[1:30:2], strict=True):
         try:
@@ -56,16 +58,16 @@ def test_nothing_between_two_samples_comes_nearer_than_touching():
 
 
 def test_an_arm_that_is_too_near_may_leave_but_not_come_nearer():
-    """The first posture is where the arm is; off the table is allowed from there, towards it is not."""
+    """From a start too near to the table an arm may move away from it, but not towards it."""
     near = LOW + np.array([0, 0.12, 0, 0, 0, 0, 0])
     gap = SPACE.gaps(near[None])[0]
     assert gap.min() < 0
     check_path(ROBOT, np.array([near, ROBOT.q_home]), space=SPACE)
-    assert "above" in said([near, near + np.array([0, 0.05, 0, 0, 0, 0, 0])])
+    assert "above" in violation([near, near + np.array([0, 0.05, 0, 0, 0, 0, 0])])
 
 
-def test_another_way_is_found_where_the_straight_one_is_forbidden():
-    """Between postures left and right of what is in the way, most lead by way of home or joint by joint."""
+def test_a_detour_is_found_if_the_straight_path_is_blocked():
+    """Around an obstacle most paths lead through home or joint by joint."""
     postures, ways, refused = allowed(), [], []
     for a, b in zip(postures[:70:2], postures[1:70:2], strict=True):
         try:

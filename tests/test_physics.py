@@ -10,7 +10,7 @@ import pytest
 
 from r2s.errors import UserError
 from r2s.physics.dynamics import AXES, Dynamics
-from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, passive_torque, presliding
+from r2s.physics.friction import COULOMB, FAMILIES, SIGMOID, STRIBECK, WIDTH_DQ, family, presliding
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
 
@@ -167,8 +167,19 @@ def mass_matrix(model, data):
     return full
 
 
+def passive_torque(dq, tau, friction, offset, breakaway, dq_min):
+    """Return the torque (..., n) Nm on the joints beside the command `tau`, for stiction_model="command".
+
+    It is offset - friction. In the dead zone (eq. 6 and Table II: |dq| < dq_min, command plus offset within the
+    breakaway band) command and offset have no effect, and it is -tau - friction.
+    """
+    drive = tau + offset
+    held = (np.abs(dq) < dq_min) & (drive > breakaway[..., 0]) & (drive < breakaway[..., 1])
+    return np.where(held, -tau, offset) - friction
+
+
 def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
-    """Assert that each step of simulation k is that of the NumPy law from the same state; count who was held.
+    """Assert that each step of simulation k is that of the NumPy law from the same state; count the held joints.
 
     From the same state, because a step may amplify what the one before left by the dozen: Stribeck's falling branch
     pushes a light joint, and which bits it amplifies is the processor's choice.
@@ -243,7 +254,7 @@ def test_one_step_of_the_native_law(panda, law):
 
 
 @pytest.mark.parametrize("which", ["panda", "damped", "hanging"])
-def test_what_gravity_compensation_misses(which, request):
+def test_errors_of_gravity_compensation(which, request):
     """A step is that of MuJoCo with the true links under gravity and the nominal arm's gravity torque commanded.
 
     What is welded to a link is part of both, so it is compensated.
@@ -257,13 +268,13 @@ def test_what_gravity_compensation_misses(which, request):
     out = sim.rollout(np.zeros((nsim, 1, robot.n)), record=("qvel",))["qvel"][:, 0]
     nominal, true = robot.model(gravity=True), robot.model(gravity=True)
     for k in range(nsim):
-        believed, arm = mujoco.MjData(nominal), mujoco.MjData(true)
+        compensated, arm = mujoco.MjData(nominal), mujoco.MjData(true)
         set_links(true, d.mass[k], d.com[k], d.inertia[k])
-        believed.qpos[:] = q[k]
-        mujoco.mj_forward(nominal, believed)  # at rest: the bias is gravity
-        arm.qpos[:], arm.qvel[:], arm.qfrc_applied[:] = q[k], dq[k], believed.qfrc_bias
+        compensated.qpos[:] = q[k]
+        mujoco.mj_forward(nominal, compensated)  # at rest: the bias is gravity
+        arm.qpos[:], arm.qvel[:], arm.qfrc_applied[:] = q[k], dq[k], compensated.qfrc_bias
         mujoco.mj_step(true, arm)
-        forces = np.abs(believed.qfrc_bias) + np.abs(arm.qfrc_bias) + np.abs(arm.qfrc_passive)
+        forces = np.abs(compensated.qfrc_bias) + np.abs(arm.qfrc_bias) + np.abs(arm.qfrc_passive)
         bound = rounding(mass_matrix(true, arm), forces, dq[k], arm.qvel)
         np.testing.assert_allclose(out[k], arm.qvel, rtol=0, atol=bound)
         assert np.abs(out[k] - dq[k]).max() > 1e-4
@@ -405,9 +416,9 @@ def test_the_slope_is_the_derivative(law):
 @pytest.mark.parametrize("other", FAMILIES, ids=named)
 @pytest.mark.parametrize("law", FAMILIES, ids=named)
 def test_a_family_converted_has_the_same_level(law, other):
-    """`like` keeps the mean friction at plus and minus 1 rad/s, and parameters of the same family as they are."""
+    """`matched_to` keeps the mean friction at plus and minus 1 rad/s, and the parameters of the same family."""
     phi = some_phi(law, (20, 7), np.random.default_rng(5))
-    new, one = other.like(law, phi), np.ones((20, 7))
+    new, one = other.matched_to(law, phi), np.ones((20, 7))
     np.testing.assert_allclose(other.level(new, one), law.level(phi, one), rtol=1e-7)
     if law is other:
         assert np.array_equal(new, phi)
@@ -425,8 +436,8 @@ def test_the_viscous_term_of_the_sigmoid_may_be_left_out():
 
 
 @pytest.mark.parametrize(("law", "at_rest"), [(COULOMB, 1.2), (STRIBECK, 1.2 * 1.5)], ids=("coulomb", "stribeck"))
-def test_levels_are_what_the_parameters_say(law, at_rest):
-    """1 Nm with 20 % asymmetry, and a half more at rest: both show beside the turn, and the rise is gone at speed."""
+def test_levels_follow_the_parameters(law, at_rest):
+    """1 Nm with 20 % asymmetry and 50 % rise: both appear near zero speed, and the rise vanishes at high speed."""
     values = dict(coulomb=1.0, asymmetry=0.2, viscous=0.3, rise=0.5, stribeck_velocity=0.1)
     phi = np.array([values[name] for name in law.names if name in values])
     slow = np.array([0.06, -0.06])
@@ -440,7 +451,7 @@ def test_levels_are_what_the_parameters_say(law, at_rest):
 
 
 def test_presliding_goes_by_the_distance():
-    """The sign turns as 1 - exp(-distance / scale), at any speed and step; after a reversal from 1 to -1."""
+    """The sign changes as 1 - exp(-distance / scale), at any speed and step; after a reversal from 1 to -1."""
     for speed, dt in ((0.01, 1e-3), (0.1, 1e-3), (0.02, 5e-3)):
         path = np.full((200, 1), speed)
         z = presliding(path, dt, 1e-3)[:, 0]
@@ -459,7 +470,7 @@ def test_presliding_goes_by_the_distance():
 def test_an_unknown_family_is_named():
     """One line with the nearest of those that exist."""
     assert all(family(f.name) is f for f in FAMILIES)
-    with pytest.raises(UserError, match=r"^friction\.family: no family 'stribek'; allowed: .*mean 'stribeck'\?$"):
+    with pytest.raises(UserError, match=r"^friction\.family: expected .*, got 'stribek'; did you mean 'stribeck'\?$"):
         family("stribek")
 
 
@@ -490,7 +501,7 @@ def test_a_pushed_joint_reaches_the_speed_at_which_friction_balances(light, law)
 
 UNTOUCHED = """
 import mujoco, numpy as np
-from r2s.physics import native_friction as friction
+from r2s.physics import mujoco_callback as friction
 ARM = '''<mujoco>{size}<worldbody><body><joint axis="0 1 0" damping="0.1" {user}/><geom size="0.1" pos="0 0 -0.3"/>
 <body pos="0 0 -0.3"><joint axis="0 1 0" {user}/><geom size="0.05" pos="0 0 -0.3"/></body></body>
 </worldbody></mujoco>'''

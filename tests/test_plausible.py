@@ -10,7 +10,7 @@ from conftest import REAL
 
 from r2s.errors import UserError
 from r2s.identification.checks import check_recording
-from r2s.identification.plausible import check_numbers
+from r2s.identification.unit_checks import check_units
 from r2s.physics.robot import load_robot
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
@@ -114,10 +114,10 @@ def test_a_mistake_is_named(panda, recordings, torque, mistake):
 def test_the_wrong_kind_of_torque_is_named(panda, recordings):
     """Gravity tells a sensor from a command."""
     measured, commanded = recordings["measured"], recordings["commanded"]
-    with pytest.raises(UserError, match=r"said to be commanded, contains gravity \(\d+ % .*data.torque=measured"):
-        check_numbers(panda, replace(measured, torque="commanded"))
-    with pytest.raises(UserError, match=r"said to be measured, hardly contains gravity .*data.torque=commanded"):
-        check_numbers(panda, replace(commanded, torque="measured"))
+    with pytest.raises(UserError, match=r"commanded tau contains gravity \(\d+ % .*data.torque=measured"):
+        check_units(panda, replace(measured, torque="commanded"))
+    with pytest.raises(UserError, match=r"measured tau hardly contains gravity .*data.torque=commanded"):
+        check_units(panda, replace(commanded, torque="measured"))
 
 
 def test_all_columns_in_another_order_are_named(tmp_path):
@@ -135,10 +135,10 @@ def test_all_columns_in_another_order_are_named(tmp_path):
 def test_a_dead_sensor_is_named(panda, recordings):
     r = recordings["measured"]
     with pytest.raises(UserError, match="tau of joint 1 is 0 Nm in every row, though the joint moves"):
-        check_numbers(panda, replace(r, tau=r.tau * [0, 1, 1, 1, 1, 1, 1]))
+        check_units(panda, replace(r, tau=r.tau * [0, 1, 1, 1, 1, 1, 1]))
     over = replace(r, tau=r.tau * [1, 1, 1, 1, 1, 1, 700])
     with pytest.raises(UserError, match=r"reaches [\d.e+]+ Nm in joint 7, panda has at most 12"):
-        check_numbers(panda, over)
+        check_units(panda, over)
 
 
 @pytest.mark.parametrize(("field", "value"), [("dq", 1e308), ("tau", -1e200), ("dq", 60.0)])

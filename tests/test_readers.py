@@ -1,4 +1,4 @@
-"""The user's own logs: bags, HDF5 and libfranka's CSV come back as what was written into them, or are refused."""
+"""Readers of robot logs: bags, HDF5 and libfranka's CSV restore the written data or raise one-line errors."""
 
 import sqlite3
 import sys
@@ -144,16 +144,14 @@ def test_without_stamps_the_time_of_the_bag_counts(tmp_path):
 
 @pytest.mark.parametrize("absent", [NOTHING, np.full(7, np.nan)])
 def test_absent_velocity_is_derived_and_absent_effort_refused(tmp_path, absent):
-    """Empty (ROS 1) or NaN (ROS 2 broadcasters) both mean: this driver does not say."""
+    """Empty (ROS 1) and NaN (ROS 2 broadcasters) values are missing values."""
     path = joint_states(tmp_path, change=lambda k, q, dq, tau: (q, absent, tau))
     recording = read(path, torque="measured")
     assert np.abs(recording.dq - motion()[2]).max() < 0.01 * OMEGA
     (tmp_path / "b").mkdir()
     path = joint_states(tmp_path / "b", change=lambda k, q, dq, tau: (q, dq, absent))
     text = message(read, path, torque="measured")
-    assert text == (
-        f"{path}: the messages on '/joint_states' carry no effort; a recording needs both, position and effort"
-    )
+    assert text == (f"{path}: expected position and effort in the messages on '/joint_states', got no effort")
 
 
 def test_late_messages_are_put_in_order_and_repeated_ones_dropped(tmp_path):
@@ -208,8 +206,8 @@ def test_franka_states_hold_both_torques(tmp_path, kind, tau_J, tau_J_d):
     assert_motion(read(path, torque="measured", n_joints=7), data)
     commanded = read(path, torque="commanded", n_joints=7, model_joints=[f"joint{j}" for j in range(1, 8)])
     np.testing.assert_allclose(commanded.tau[:-1], data[4][1:], rtol=0, atol=1e-9)
-    assert "name no joints: leave data.joints=null" in message(read, path, torque="measured", joints=PANDA)
-    assert "q has 7 joints (q), the robot has 6" in message(read, path, torque="measured", n_joints=6)
+    assert "data.joints: expected null, as the messages on" in message(read, path, torque="measured", joints=PANDA)
+    assert "q: expected 6 joints, got 7 (q)" in message(read, path, torque="measured", n_joints=6)
 
 
 def test_franka_robot_state_holds_both_torques(tmp_path):
@@ -237,8 +235,8 @@ def forget_definitions(path):
     connection.close()
 
 
-def test_old_ros2_bags_hold_no_definitions(tmp_path):
-    """Before Iron: JointState is known anyway, Franka's own messages are not."""
+def test_old_ros2_bags_have_no_definitions(tmp_path):
+    """Bags before ROS 2 Iron: JointState is readable without a definition, Franka's messages are not."""
     path = joint_states(tmp_path, "db3")
     forget_definitions(path)
     assert_motion(read(path, torque="measured"), motion())
@@ -251,7 +249,7 @@ def test_old_ros2_bags_hold_no_definitions(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("written", "arguments", "said"),
+    ("written", "arguments", "expected"),
     [
         (
             {"others": "text"},
@@ -259,23 +257,31 @@ def test_old_ros2_bags_hold_no_definitions(tmp_path):
             "no topic '/joint_state'; topics: /joint_states (sensor_msgs/JointState), /chatter (std_msgs/String); "
             "did you mean '/joint_states'? (set data.topic)",
         ),
-        ({"others": "text"}, {"topic": "/chatter"}, "topic '/chatter' is std_msgs/String; allowed: JointState, Fr"),
+        (
+            {"others": "text"},
+            {"topic": "/chatter"},
+            "topic '/chatter': expected JointState, FrankaRobotState, FrankaState, got std_msgs/String",
+        ),
         ({"others": "second"}, {}, "several topics hold joint states: /joint_states (sensor_msgs/JointState), /arm2"),
         ({}, {"joints": [*PANDA[:6], "panda_jont7"]}, "'/joint_states': no joint 'panda_jont7'; joints: panda_jo"),
         ({}, {"joints": [*PANDA[:6], "panda_jont7"]}, "; did you mean 'panda_joint7'? (set data.joints)"),
-        ({}, {"joints": PANDA[:6], "n_joints": 7}, "data.joints names 6 different joints (panda_joint1, panda_joi"),
-        ({}, {"joints": PANDA[:6], "n_joints": 7}, "it must name 7, as the robot has"),
-        ({}, {"joints": [*PANDA[:6], PANDA[0]]}, "names 6 different joints"),
-        ({}, {"joints": []}, "it must name at least one"),
-        ({"names": PANDA[:3]}, {"n_joints": 7}, "3 joints (panda_joint"),
-        ({"others": "gripper"}, {"joints": ["panda_joint1", "f1"]}, "holds all of panda_joint1, f1; they hold panda"),
+        (
+            {},
+            {"joints": PANDA[:6], "n_joints": 7},
+            "data.joints: expected 7 different names, got panda_joint1, panda_joi",
+        ),
+        ({}, {"joints": PANDA[:6], "n_joints": 7}, "data.joints: expected 7 different names"),
+        ({}, {"joints": [*PANDA[:6], PANDA[0]]}, "data.joints: expected 7 different names"),
+        ({}, {"joints": []}, "data.joints: expected 1 different names, got none"),
+        ({"names": PANDA[:3]}, {"n_joints": 7}, "expected 7 joints, got 3 (panda_joint"),
+        ({"others": "gripper"}, {"joints": ["panda_joint1", "f1"]}, "expected panda_joint1, f1 in one message on"),
         ({}, {"torque": None}, "torque is not declared"),
         ({}, {"columns": {"tau": "tau_J"}}, "no column 'tau_J' for tau"),
         ({}, {"max_gap_s": 1e-4}, "most steps in time are longer than max_gap_s"),
         (
             {"change": lambda k, q, dq, tau: (q, dq, tau[: 6 if k == 8 else 7])},
             {},
-            "message 8 on '/joint_states' holds 6 values of tau for 7 joints",
+            "message 8 on '/joint_states': expected 7 values of tau, got 6",
         ),
         (
             {"change": lambda k, q, dq, tau: (q, dq, 0 * tau)},
@@ -284,11 +290,11 @@ def test_old_ros2_bags_hold_no_definitions(tmp_path):
         ),
     ],
 )
-def test_a_bad_bag_is_named_in_one_line(tmp_path, written, arguments, said):
+def test_a_bad_bag_is_named_in_one_line(tmp_path, written, arguments, expected):
     path = joint_states(tmp_path, data=motion(rows=20, n=len(written.get("names", PANDA))), **written)
     text = message(read, path, **{"torque": "measured", **arguments})
     assert text.startswith(f"{path}: ")
-    assert said in text
+    assert expected in text
 
 
 def test_a_bag_without_joint_states(tmp_path):
@@ -303,7 +309,7 @@ def test_a_bag_without_joint_states(tmp_path):
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
 def test_a_truncated_bag_is_refused(tmp_path, kind, share):
-    """Whether the end is missing or all but the start: one line, nothing half-read."""
+    """Any truncation gives one line of error and no partial data."""
     path = joint_states(tmp_path, kind)
     file = path if kind == "bag" else next(path.glob(f"*.{kind}"))
     whole = file.read_bytes()
@@ -317,11 +323,11 @@ def test_what_only_looks_like_a_bag(tmp_path):
         (tmp_path / name).write_bytes(b"\x00\x01" * 99)
         assert "cannot be read as a bag: " in message(read, tmp_path / name, torque="measured")
     (tmp_path / "folder.bag").mkdir()
-    assert "is a folder; a recording is one file" in message(read, tmp_path / "folder.bag", torque="measured")
+    assert "expected a file (.csv" in message(read, tmp_path / "folder.bag", torque="measured")
 
 
-def test_joint_names_are_told_or_known_or_numbered_or_as_they_come():
-    """The order of a message is never taken for the robot's where something better is known."""
+def test_the_order_of_joints():
+    """Names from the user, the model or a number take precedence over the order of a message."""
     shuffled = ["panda_joint2", "panda_finger_joint1", "panda_joint1", "panda_joint3"]
     known = ["panda_joint1", "panda_joint2", "panda_joint3"]
     assert choose_joints(shuffled, None, None, 3) == known
@@ -333,7 +339,7 @@ def test_joint_names_are_told_or_known_or_numbered_or_as_they_come():
     ]
     assert choose_joints(["elbow", "pan", "grip"], None, None, 2) == ["elbow", "pan"]
     assert choose_joints(["elbow", "pan", "grip"], ["pan", "elbow"], ["a", "b"], 2) == ["pan", "elbow"]
-    assert "say which they are" in message(choose_joints, ["elbow", "pan"], None, ["a", "b"], 2)
+    assert "name them in order" in message(choose_joints, ["elbow", "pan"], None, ["a", "b"], 2)
     two = [f"{side}_joint{j}" for side in ("left", "right") for j in (1, 2)]
     assert "several arms of 2 joints" in message(choose_joints, two, None, ["joint1", "joint2"], 2)
 
@@ -345,16 +351,16 @@ def without(monkeypatch, *heads):
             monkeypatch.setitem(sys.modules, name, None)
 
 
-def test_missing_extras_say_what_to_install(tmp_path, monkeypatch):
+def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     bag, file = joint_states(tmp_path), tmp_path / "log.h5"
     with h5py.File(file, "w") as h5:
         h5["t"] = np.arange(20.0)
     without(monkeypatch, "rosbags", "h5py")
     assert message(read, bag, torque="measured") == (
-        f"{bag}: reading it needs rosbags, which is not installed: pip install 'r2s[bags]'"
+        f"{bag}: reading this file needs rosbags, which is not installed: pip install 'r2s[bags]'"
     )
     assert message(read, file, torque="measured") == (
-        f"{file}: reading it needs h5py, which is not installed: pip install 'r2s[hdf5]'"
+        f"{file}: reading this file needs h5py, which is not installed: pip install 'r2s[hdf5]'"
     )
 
 
@@ -391,7 +397,7 @@ def test_hdf5_datasets_by_name(tmp_path, suffix, group):
         )
 
 
-def test_hdf5_says_its_torque_and_text_is_no_column(tmp_path):
+def test_hdf5_declares_its_torque_and_text_is_no_column(tmp_path):
     ns, q, dq, tau, _ = motion()
     path = tmp_path / "log.h5"
     with h5py.File(path, "w") as h5:
@@ -400,9 +406,9 @@ def test_hdf5_says_its_torque_and_text_is_no_column(tmp_path):
         h5["note"] = ["a"] * 300
         h5["torque"] = "commanded"
     assert_motion(read(path, torque=None), motion(), "commanded")
-    assert "declares torque=commanded" in message(read, path, torque="measured")
+    assert "expected torque=commanded, as the file declares" in message(read, path, torque="measured")
     text = message(read, path, torque="commanded", columns={"t": "note"})
-    assert text == f"{path}: column 'note' is not numeric: 'a' at row 0"
+    assert text == f"{path}: column 'note': expected numbers, got 'a' at row 0"
 
 
 def test_a_damaged_hdf5_file_is_refused(tmp_path):
@@ -420,7 +426,7 @@ HEADERS = [(b"(99999,), }", b"(99999,,(}"), (b"'shape'", b"  shape'"), (b"{'desc
 
 @pytest.mark.parametrize("change", HEADERS)
 def test_a_damaged_header_in_an_npz_is_refused(tmp_path, change):
-    """NumPy reads it as Python's words, and tells of it as Python does of a program."""
+    """NumPy parses the header as a Python literal and raises Python's parser errors."""
     path = tmp_path / "log.npz"
     np.savez(path, t=np.arange(99999.0))  # large: a small one has its checksum looked at first
     content = path.read_bytes()
@@ -434,7 +440,7 @@ def test_what_belongs_to_bags_is_not_silently_ignored(tmp_path, key):
     path = tmp_path / "log.csv"
     path.write_text("t,q1\n")
     text = message(read, path, torque="measured", **{key: "x"})
-    assert text == f"{path}: data.{key}=x is for bags (.bag, .db3, .mcap); leave it null for .csv"
+    assert text == f"{path}: data.{key}: expected null for .csv, got x: it is for .bag, .db3, .mcap"
 
 
 # --- CSV
@@ -484,7 +490,7 @@ def test_a_libfranka_log_of_position_control_holds_no_command(tmp_path):
     read(path, torque="measured")
     with open(path, "a") as file:
         file.write("cut off,here\n")
-    assert "column 't' is not numeric: 'cut off' at row 300" in message(read, path, torque="measured")
+    assert "column 't': expected numbers, got 'cut off' at row 300" in message(read, path, torque="measured")
 
 
 @pytest.mark.parametrize("joint", ["{}{}", "{}_{}", "{}[{}]"])

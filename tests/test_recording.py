@@ -81,41 +81,44 @@ def test_duration_and_rate_leave_out_the_time_between_trajectories():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
-        (lambda x: x["tau"].__setitem__((7, 1), np.nan), "tau is nan at row 7 of joint 2 (1 such value"),
+        (
+            lambda x: x["tau"].__setitem__((7, 1), np.nan),
+            "tau: expected finite values, got nan at row 7 of joint 2 (1 such value",
+        ),
         (
             lambda x: x["q"].__setitem__((slice(4, 6), 0), np.inf),
-            "q is inf at row 4 of joint 1 (2 such values",
+            "q: expected finite values, got inf at row 4 of joint 1 (2 such values",
         ),
-        (lambda x: x["t"].__setitem__(3, np.nan), "t is nan at row 3"),
+        (lambda x: x["t"].__setitem__(3, np.nan), "t: expected finite values, got nan at row 3"),
         (lambda x: x["t"].__setitem__(9, 0.008), "time does not increase at row 9: t is 0.008, then 0.008 s"),
-        (lambda x: x.update(dq=x["dq"][:, :2]), "dq is (50, 2) but q is (50, 3)"),
-        (lambda x: x.update(q=x["q"][1:]), "q is (49, 3) but t is (50,)"),
-        (lambda x: x.update(q=x["q"][:, 0]), "t must be (T,) and q (T, n); they are (50,) and (50,)"),
-        (lambda x: x.update(trajectory=np.zeros(3)), "trajectory is (3,) but t is (50,)"),
+        (lambda x: x.update(dq=x["dq"][:, :2]), "expected dq of shape (50, 3), got (50, 2)"),
+        (lambda x: x.update(q=x["q"][1:]), "expected q of shape (50, 3), got (49, 3)"),
+        (lambda x: x.update(q=x["q"][:, 0]), "expected t of shape (T,) and q of shape (T, n), got (50,) and (50,)"),
+        (lambda x: x.update(trajectory=np.zeros(3)), "expected trajectory of shape (50,), got (3,)"),
         (
             lambda x: x.update(trajectory=np.full(50, 0.5)),
-            "trajectory must hold whole numbers; it is 0.5 at row 0",
+            "expected whole numbers in trajectory, got 0.5 at row 0",
         ),
         (
             lambda x: x.update(trajectory=np.repeat([0, 1, 0], [20, 20, 10])),
-            "trajectory 0 starts again at row 40",
+            "trajectory 0 occurs again at row 40",
         ),
         (lambda x: x.update(torque=""), "torque is not declared"),
         (
             lambda x: x.update(torque="mesured"),
             "unknown torque 'mesured'; allowed: measured, commanded, motor; did you mean",
         ),
-        (lambda x: x.update(q="abc"), "q is not a rectangular array of numbers"),
-        (lambda x: x.update(period=-1), "period=-1"),
+        (lambda x: x.update(q="abc"), "expected q to be a rectangular array of numbers"),
+        (lambda x: x.update(period=-1), "period: expected a positive number of s, got -1"),
         (
             lambda x: x.update({k: v[:4] for k, v in x.items() if k != "torque"}),
-            "4 rows is too short; at least 10",
+            "expected at least 10 rows, got 4",
         ),
     ],
 )
-def test_a_bad_array_is_named_in_one_line(change, said):
+def test_a_bad_array_is_named_in_one_line(change, expected):
     t = np.arange(50) * 1e-3
     fields = {
         "t": t,
@@ -125,7 +128,7 @@ def test_a_bad_array_is_named_in_one_line(change, said):
         "torque": "measured",
     }
     change(fields)
-    assert said in message(Recording, **fields)
+    assert expected in message(Recording, **fields)
 
 
 def test_undeclared_torque_is_explained():
@@ -178,7 +181,7 @@ def test_acceleration_follows_logged_time():
 
 
 def test_nothing_bridges_two_trajectories():
-    """Two constants side by side stay constants under every operation."""
+    """Two trajectories with different constants stay constant under every operation."""
     t = np.arange(400) * 1e-3
     step = np.repeat([0.0, 1.0], 200)[:, None]
     r = Recording(t, step, step, step, "commanded", np.repeat([0, 1], 200))
@@ -199,7 +202,7 @@ def test_smooth_has_no_phase_and_removes_what_is_above_the_cutoff():
 
 def test_a_single_row_has_no_acceleration():
     mask = np.arange(60) % 2 == 0
-    assert "single row" in message(sine(np.arange(60) * 1e-3).select(mask).acceleration)
+    assert "1 row" in message(sine(np.arange(60) * 1e-3).select(mask).acceleration)
 
 
 # --- the split
@@ -264,7 +267,7 @@ def test_repeats_whose_clock_restarts_are_held_out_by_phase(tmp_path, late):
     assert len(held) + len(fitted) > 0.9 * len(when)
 
 
-def test_repeats_started_by_hand_are_seen_and_other_motion_is_not():
+def test_repetitions_started_by_hand_are_aligned():
     """The same motion at 0, 11.3 and 30 s of one clock has one phase; trajectories of other motion keep the clock."""
     t = np.arange(0, 5, 0.01)
     clock = np.concatenate([t, t + 11.3, t + 30.0])
@@ -277,15 +280,15 @@ def test_repeats_started_by_hand_are_seen_and_other_motion_is_not():
     assert apart.in_phase() is apart
 
 
-def test_slow_motion_is_not_taken_for_repeated_motion():
-    """At 0.01 rad/s the arm is where it was half a second ago; that is no period."""
+def test_slow_motion_has_no_period():
+    """At 0.01 rad/s postures half a second apart are equal within the tolerance, but that is no period."""
     t = np.arange(0, 60, 0.02)
     q = 0.01 * t[:, None] * [1.0, -1.0]
-    assert Recording(t, q, 0 * q, q, "measured").repeats_after() is None
+    assert Recording(t, q, 0 * q, q, "measured").find_period() is None
 
 
-def test_motion_that_is_known_from_another_recording():
-    """The same with other noise, later, on another clock is known; a faster, a mirrored, another motion is not."""
+def test_overlap_of_two_recordings():
+    """Other noise and another clock do not change the overlap; a faster, mirrored or other motion has none."""
     t, rng = np.arange(0, 10, 2e-3), np.random.default_rng(0)
 
     def moved(when, scale=(1.0, 1.0)):
@@ -294,19 +297,19 @@ def test_motion_that_is_known_from_another_recording():
 
     first = moved(t)
     again = moved(t)
-    assert again.known_from(first) == 1.0
+    assert again.overlap(first) == 1.0
     late = again.select(again.t > 3.3)
-    assert replace(late, t=late.t + 100.0).known_from(first) == 1.0
+    assert replace(late, t=late.t + 100.0).overlap(first) == 1.0
     for other in (moved(1.1 * t), moved(t, (1.0, -1.0)), moved(t + 7.0, (0.8, 1.0))):
-        assert other.known_from(first) < 0.2
-    assert moved(0 * t).known_from(first) == 0.0
+        assert other.overlap(first) < 0.2
+    assert moved(0 * t).overlap(first) == 0.0
 
 
-def test_a_split_that_cannot_be_is_refused():
+def test_an_impossible_split_is_an_error():
     r = sine(np.arange(500) * 1e-3)
-    assert "between 0 and 1" in message(r.split, 1.5)
-    assert "for validation; at least 10" in message(r.split, 0.001)
-    assert "for training; at least 10" in message(r.split, 0.99)
+    assert "a number in (0, 1)" in message(r.split, 1.5)
+    assert "expected at least 10 rows for validation, got 1 of 500" in message(r.split, 0.001)
+    assert "expected at least 10 rows for training" in message(r.split, 0.99)
 
 
 def test_gaz2019_splits_by_phase():
@@ -340,16 +343,18 @@ def test_two_dimensional_columns(tmp_path):
 
 
 @pytest.mark.parametrize("period", [None, 13.33])
-def test_a_saved_recording_comes_back_as_it_was(tmp_path, period):
+def test_a_saved_recording_is_restored(tmp_path, period):
     t = np.concatenate([jittered_time(200), 40 + jittered_time(200)])  # a gap inside trajectory 3 stays inside
     r = sine(t, torque="commanded", trajectory=np.full(400, 3), period=period, name="a name")
     path = tmp_path / "saved.npz"
     r.save(path)
     for torque in (None, "???", "commanded"):
         assert_same(read(path, torque=torque), r)
-    assert "declares torque=commanded, but data.torque=measured" in message(read, path, torque="measured")
+    assert "expected torque=commanded, as the file declares, got data.torque=measured" in message(
+        read, path, torque="measured"
+    )
     assert "did you mean 'measured'" in message(read, path, torque="mesured")
-    assert "'saved.txt' ends in '.txt'" in message(r.save, tmp_path / "saved.txt")
+    assert "expected a file name ending in .npz, got 'saved.txt'" in message(r.save, tmp_path / "saved.txt")
     assert [p.name for p in tmp_path.iterdir()] == ["saved.npz"]
 
 
@@ -390,9 +395,9 @@ def drop(table, *names):
 
 
 @pytest.mark.parametrize(
-    ("change", "arguments", "said"),
+    ("change", "arguments", "expected"),
     [
-        (lambda x: x, {"torque": None}, "torque is not declared; say data.torque=measured"),
+        (lambda x: x, {"torque": None}, "torque is not declared; set data.torque=measured"),
         (lambda x: x, {"torque": "???"}, "data.torque=commanded"),
         (
             lambda x: x,
@@ -403,25 +408,29 @@ def drop(table, *names):
         (lambda x: x, {"columns": {"t": "tt"}}, "no column 'tt' for t; columns: t, segment, q1"),
         (lambda x: x, {"columns": {"t": "segmnt"}}, "did you mean 'segment'?"),
         (lambda x: x, {"columns": {"tau": ["tau_J1", "tau_J9"]}}, "no column 'tau_J9' for tau"),
-        (lambda x: x, {"columns": {"t": ["t", "q1"]}}, "t and trajectory are one column each, not 2: t, q1"),
+        (lambda x: x, {"columns": {"t": ["t", "q1"]}}, "expected one column for t and for trajectory, got 2: t, q1"),
         (lambda x: x, {"columns": {"trajectory": "run"}}, "no column 'run' for trajectory"),
         (lambda x: x, {"torque": "commanded"}, "no column 'tau_J_d' for tau (commanded torque)"),
         (lambda x: x, {"torque": "commanded"}, "tau_J is measured torque"),
-        (lambda x: x, {"n_joints": 7}, "q has 3 joints (q1, q2, q3), the robot has 7"),
-        (lambda x: drop(x, "tau_J3"), {}, "tau is (50, 2) but q is (50, 3)"),
-        (lambda x: drop(x, "q2"), {}, "column 'q2' is missing, though 'q3' is there"),
-        (lambda x: x | {"q2": ["a b"] * 50}, {}, "column 'q2' is not numeric: 'a b' at row 0"),
-        (lambda x: x | {"q2": np.where(np.arange(50) == 3, np.nan, 1)}, {}, "q is nan at row 3 of joint 2"),
+        (lambda x: x, {"n_joints": 7}, "q: expected 7 joints, got 3 (q1, q2, q3)"),
+        (lambda x: drop(x, "tau_J3"), {}, "expected tau of shape (50, 3), got (50, 2)"),
+        (lambda x: drop(x, "q2"), {}, "expected column 'q2' before 'q3'"),
+        (lambda x: x | {"q2": ["a b"] * 50}, {}, "column 'q2': expected numbers, got 'a b' at row 0"),
+        (
+            lambda x: x | {"q2": np.where(np.arange(50) == 3, np.nan, 1)},
+            {},
+            "q: expected finite values, got nan at row 3 of joint 2",
+        ),
         (lambda x: x | {"t": (x["t"] * 1e9).astype(np.int64)}, {}, "t must be in seconds"),
         (lambda x: x | {"t": np.zeros(50)}, {}, "time does not increase at row 1"),
     ],
 )
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
-def test_a_bad_file_is_named_in_one_line(tmp_path, suffix, change, arguments, said):
+def test_a_bad_file_is_named_in_one_line(tmp_path, suffix, change, arguments, expected):
     path = write(tmp_path / f"log{suffix}", change(columns_of(sine(np.arange(50) * 1e-3))))
     text = message(read, path, **{"torque": "measured", **arguments})
     assert text.startswith(str(path))
-    assert said in text
+    assert expected in text
 
 
 def test_a_zero_based_file_does_not_lose_its_first_joint(tmp_path):
@@ -440,33 +449,33 @@ def test_a_path_that_is_no_recording(tmp_path):
     np.savez(tmp_path / "whole.npz", t=np.arange(9999.0))
     (tmp_path / "half.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:5000])
     np.savez(tmp_path / "pickled.npz", meta=np.array([{}], dtype=object))
-    for name, said in {
+    for name, expected in {
         "swin.csv": "no file .*did you mean 'swing.csv'",
-        "nowhere/swing.csv": "there is no folder",
-        "": "is a folder",
+        "nowhere/swing.csv": "no folder",
+        "": "got another folder",
         "log.pkl": r"unknown suffix '.pkl'; allowed: .csv, .npz, .parquet",
         "empty.csv": "cannot be read as csv: No columns",
-        "noise.npz": "not an .npz archive",
+        "noise.npz": "expected an .npz archive",
         "noise.csv": "cannot be read as csv|no column",
         "noise.parquet": "cannot be read as parquet",
-        "half.npz": "cannot be read as npz|not an .npz archive",
+        "half.npz": "cannot be read as npz|expected an .npz archive",
         "pickled.npz": "'meta' is pickled",
     }.items():
         text = message(read, tmp_path / name, torque="measured")
-        assert re.search(said, text), text
+        assert re.search(expected, text), text
         assert str(tmp_path / name) in text
     assert read(good, torque="measured").name == "swing"
     assert read(good, torque="measured", name="mine", period=2).name == "mine"
 
 
-def test_a_motion_that_comes_again_is_noticed():
-    """`repeats_after` finds the period of an excitation across a gap in the log, and none where nothing repeats."""
+def test_find_period():
+    """`find_period` finds the period of an excitation across a gap in the log, and None without a repetition."""
     t = np.arange(0, 12, 0.01)
     t = t[(t < 3.0) | (t > 4.4)]
     q = np.stack([np.sin(2 * np.pi * t / 5.0), 0.5 * np.cos(4 * np.pi * t / 5.0)], -1)
     made = {"t": t, "dq": np.zeros_like(q), "tau": np.zeros_like(q), "torque": "commanded"}
-    assert Recording(q=q, **made).split_at_gaps(0.05).repeats_after() == pytest.approx(5.0, abs=0.03)
+    assert Recording(q=q, **made).split_at_gaps(0.05).find_period() == pytest.approx(5.0, abs=0.03)
     chirp = np.stack([np.sin(0.4 * t**2), np.cos(0.3 * t**2)], -1)
-    assert Recording(q=chirp, **made).repeats_after() is None
+    assert Recording(q=chirp, **made).find_period() is None
     still = np.zeros_like(q)
-    assert Recording(q=still, **made).repeats_after() is None
+    assert Recording(q=still, **made).find_period() is None

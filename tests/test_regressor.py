@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r2s.identification.link_inertia import links
-from r2s.physics.rigid_body import LinkInertia, kinematics, regressor, rigid_body, six
+from r2s.physics.rigid_body import LinkInertia, joint_kinematics, regressor, rigid_body, tensor_elements
 from r2s.physics.robot import load_robot
 
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s^2, an upright base
@@ -23,7 +23,7 @@ def inertial(rng, size):
     com = m @ points / m.sum()
     p = points - com
     tensor = np.einsum("k,kij->ij", m, (p**2).sum(-1)[:, None, None] * np.eye(3) - p[:, :, None] * p[:, None])
-    return f'<inertial pos="{numbers(com)}" mass="{m.sum():.12g}" fullinertia="{numbers(six(tensor))}"/>'
+    return f'<inertial pos="{numbers(com)}" mass="{m.sum():.12g}" fullinertia="{numbers(tensor_elements(tensor))}"/>'
 
 
 def place(rng):
@@ -165,7 +165,7 @@ def test_kinematics_are_those_of_mujoco(tmp_path):
     """Origins, frames, anchors and axes in the base frame, a row per sample."""
     robot = random_arm(tmp_path, 5, plain=False)
     q, _, _ = motion(robot, 5, 3)
-    origin, frame, anchor, axis = kinematics(robot, q)
+    origin, frame, anchor, axis = joint_kinematics(robot, q)
     model = robot.model(gravity=False)
     data = mujoco.MjData(model)
     for t in range(3):
@@ -190,5 +190,5 @@ def test_standard_parameters_are_about_the_links_origin():
         )
 
     out = LinkInertia(m.sum(-1), com, tensor(points - com[:, :, None])).standard()
-    expected = [m.sum(-1)[..., None], np.einsum("abk,abki->abi", m, points), six(tensor(points))]
+    expected = [m.sum(-1)[..., None], np.einsum("abk,abki->abi", m, points), tensor_elements(tensor(points))]
     np.testing.assert_allclose(out, np.concatenate(expected, -1), atol=1e-12)

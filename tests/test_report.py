@@ -1,6 +1,7 @@
-"""What people read: figures that show something, tables that hold the numbers given, a recording to open."""
+"""Figures show something, tables hold the numbers given, recordings open."""
 
 import base64
+import json
 import os
 import re
 import subprocess
@@ -22,37 +23,44 @@ from rerun.chunk import RrdReader
 from rich.console import Console
 from scipy.stats import t as student
 
-from r2s.identification.breakaway import Breakaway
+from r2s.errors import UserError
+from r2s.export.card import card
+from r2s.identification.friction.breakaway import Breakaway
 from r2s.identification.link_inertia import LINK
-from r2s.identification.parameters import Estimate, parameter_space
+from r2s.identification.parameters import ParameterEstimate, parameter_space
 from r2s.identification.prediction import prediction_errors
-from r2s.identification.uncertainty import Identified
-from r2s.physics.dynamics import nominal_dynamics, of_family
+from r2s.identification.result import IdentificationResult
+from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import Robot, load_robot
 from r2s.recordings.recording import Recording
-from r2s.reporting import pages, viewer
-from r2s.reporting.colours import colours
-from r2s.reporting.document import UNSEEN, report_html, report_markdown
-from r2s.reporting.doubts import _grouped
-from r2s.reporting.identification_figures import (
+from r2s.reporting import pages
+from r2s.reporting.document import KEPT, report_html, report_markdown
+from r2s.reporting.figures.colours import colours
+from r2s.reporting.figures.episodes import error_figure
+from r2s.reporting.figures.learning import learning_figure
+from r2s.reporting.figures.log_rows import without_pauses
+from r2s.reporting.identification.figures import (
     _running,
-    autocorrelation,
     convergence_figure,
     friction_figure,
     position_figure,
     torque_figure,
-    whiteness_figure,
-    whiteness_table,
 )
-from r2s.reporting.identification_page import identification_sections
-from r2s.reporting.identification_tables import identification_table, identification_tables
-from r2s.reporting.learning_figures import learning_figure
-from r2s.reporting.log_rows import without_pauses
-from r2s.reporting.reach_figures import reach_figure
-from r2s.reporting.tables import SUCCESS, reach_table
-from r2s.reporting.viewer_layout import PAUSE, Episode, Overlay, starts_of
+from r2s.reporting.identification.identifiability import _grouped
+from r2s.reporting.identification.page import Evidence, identification_page, identification_sections
+from r2s.reporting.identification.tables import identification_table, identification_tables
+from r2s.reporting.identification.whiteness import autocorrelation, whiteness_figure, whiteness_table
+from r2s.reporting.measures import measures_of
+from r2s.reporting.run_list import run_rows
+from r2s.reporting.tables import diagnostic_rows, print_measures
+from r2s.reporting.viewer.data import Content, Episode, Overlay
+from r2s.reporting.viewer.layout import PAUSE, starts_of
+from r2s.reporting.viewer.recording import write_recording
+from r2s.tasks.measures import Measure, MeasureTable, write_measures
+from r2s.tasks.reach import REACH
 
+CURVES = [REACH[key] for key in REACH.curves]
 EVERY_SHAPE = """
 <mujoco model="shapes">
   <asset><mesh name="wedge" vertex="0 0 0  0.1 0 0  0 0.1 0  0 0 0.1"/></asset>
@@ -97,16 +105,16 @@ def make_overlay(n: int, rows: int = 400) -> Overlay:
     return Overlay(t, measured, {"nominal": 0.7 * measured, "identified": measured + 0.01})
 
 
-def make_identified(robot: Robot, bounds: dict, family: str = "sigmoid") -> Identified:
+def make_identified(robot: Robot, bounds: dict, family: str = "sigmoid") -> IdentificationResult:
     """A result: every third parameter not identifiable, the fifth unseen, draws of 1 % of the bounds."""
-    nominal = of_family(nominal_dynamics(robot, phi1=0.5, phi2=8.0, phi3=0.01), family)
+    nominal = with_family(nominal_dynamics(robot, phi1=0.5, phi2=8.0, phi3=0.01), family)
     space = parameter_space(robot, nominal, bounds)
     rng = np.random.default_rng(0)
     u = space.to_unit(space.start)
     u = np.where(np.arange(len(u)) == 4, u, u + 0.05)
     x, samples = space.from_unit(u), space.from_unit(u + 0.01 * rng.normal(size=(400, len(u))))
     low, high = np.quantile(samples, [0.025, 0.975], axis=0)
-    found = Estimate(x, low, high, np.arange(len(x)) % 3 > 0, samples)
+    found = ParameterEstimate(x, low, high, np.arange(len(x)) % 3 > 0, samples)
     rows = [{"search": f"family {f}", "evaluations": 0, "cost": 9.0, "done": k, "total": 3, "seconds": 0.2 * k}
             for k, f in enumerate(("sigmoid", "coulomb", "stribeck"), 1)]  # fmt: skip
     for search, count, start in (("ga", 8, 1.0), ("torque", 3, 9.0), ("torque", 3, 12.0), ("breakaway", 3, 15.0)):
@@ -115,7 +123,7 @@ def make_identified(robot: Robot, bounds: dict, family: str = "sigmoid") -> Iden
             rows.append(row if search == "breakaway" else row | {"cost": 100.0 / k})
     null = [(0.97, {"phi1[2]": -0.8, "phi2[2]": 0.6}), (0.9, {space.names[4]: 1.0})]
     families = {"sigmoid": 1.0, "coulomb": 1.21, "stribeck": 1.01}
-    return Identified(space, found, pd.DataFrame(rows), families, null, [space.names[4]])
+    return IdentificationResult(space, found, pd.DataFrame(rows), families, null, [space.names[4]])
 
 
 BOUNDS = {"phi1": [0.05, 5], "phi2": [1, 50], "offset": [-1, 1], "delay": [0, 0.01]}
@@ -124,7 +132,7 @@ LINKS = BOUNDS | {name: [-0.5, 0.5] for name in LINK}
 
 
 @pytest.fixture(scope="module")
-def identified(panda) -> Identified:
+def identified(panda) -> IdentificationResult:
     return make_identified(panda, SCALES)
 
 
@@ -166,7 +174,7 @@ def strict():
     rr.set_strict_mode(False)
 
 
-def figures(folder: Path, robot: Robot, found: Identified) -> list[Path]:
+def figures(folder: Path, robot: Robot, found: IdentificationResult) -> list[Path]:
     overlay, rng = make_overlay(robot.n), np.random.default_rng(0)
     windows = rng.normal(size=(9, 40, robot.n))
     near = {"nominal": windows + 0.01 * rng.normal(size=windows.shape), "identified": windows}
@@ -182,8 +190,8 @@ def figures(folder: Path, robot: Robot, found: Identified) -> list[Path]:
         friction_figure(folder / "friction.png", laws, robot.dq_max, cloud, draws),
         convergence_figure(folder / "convergence.png", found.history),
         whiteness_figure(folder / "whiteness.png", overlay.t, errors, 10.0, 0.4),
-        learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}),
-        reach_figure(folder / "reach.png", episodes),
+        learning_figure(folder / "learning.png", {"a": make_curve(), "b": make_curve(1)}, CURVES),
+        error_figure(folder / "reach.png", episodes, REACH),
     ]
 
 
@@ -199,18 +207,17 @@ def test_every_figure_is_written_and_shows_something(tmp_path, panda, identified
 
 def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
     path = tmp_path / "recording.rrd"
-    picture = learning_figure(tmp_path / "learning.png", {"a": make_curve()})
+    picture = learning_figure(tmp_path / "learning.png", {"a": make_curve()}, CURVES)
     labels = {"mujoco": 3, "twin, nominal": 2, "a/b": 1}
-    written = viewer.write_recording(
-        path,
-        panda,
-        episodes={label: [make_episode(panda, k) for k in range(count)] for label, count in labels.items()},
-        overlays={"validation": make_overlay(panda.n)},
-        curves={"tqc": make_curve()},
-        figures={"learning": picture},
-        torque=np.full(panda.n, 5.0),
+    content = Content(
+        REACH,
+        {label: [make_episode(panda, k) for k in range(count)] for label, count in labels.items()},
+        {"validation": make_overlay(panda.n)},
+        {"tqc": make_curve()},
+        {"learning": picture},
+        np.full(panda.n, 5.0),
     )
-    assert written == path
+    assert write_recording(path, panda, content) == path
     assert [p.name for p in tmp_path.glob("*.rrd")] == ["recording.rrd"]
     checked = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", path], capture_output=True, text=True)
     assert checked.returncode == 0, checked.stderr
@@ -230,7 +237,7 @@ def test_the_recording_verifies_and_holds_what_was_asked_for(tmp_path, panda):
 def test_the_drawn_links_are_where_the_arm_was(tmp_path, panda):
     """The last link of every frame, in the recording, ends at the end effector of the episode."""
     episode = make_episode(panda, 3)
-    path = viewer.write_recording(tmp_path / "r.rrd", panda, episodes={"arm": [episode]})
+    path = write_recording(tmp_path / "r.rrd", panda, Content(REACH, {"arm": [episode]}))
     chunks = [c for c in RrdReader(path).stream() if c.entity_path == "/arms/arm/links/link7" and not c.is_static]
     assert sum(c.num_rows for c in chunks) == len(episode.t)
     assert chunks[0].timeline_names == ["time"]
@@ -255,7 +262,7 @@ def test_every_kind_of_geom_is_drawn_and_other_arms_work(tmp_path):
     """Even with a body named as one of our own entities; a plane is not part of an arm."""
     (tmp_path / "arm.xml").write_text(EVERY_SHAPE)
     robot = load_robot(str(tmp_path / "arm.xml"))
-    path = viewer.write_recording(tmp_path / "r.rrd", robot, episodes={"arm": [make_episode(robot, 0)], "none": []})
+    path = write_recording(tmp_path / "r.rrd", robot, Content(REACH, {"arm": [make_episode(robot, 0)], "none": []}))
     found = entities(path)
     assert not any(entity.startswith("/arms/none") for entity in found)
     assert len([entity for entity in found if "/geom" in entity]) == 6
@@ -264,7 +271,7 @@ def test_every_kind_of_geom_is_drawn_and_other_arms_work(tmp_path):
 
 def test_a_recording_that_fails_leaves_nothing(tmp_path, panda):
     with pytest.raises(FileNotFoundError):
-        viewer.write_recording(tmp_path / "r.rrd", panda, figures={"gone": tmp_path / "gone.png"})
+        write_recording(tmp_path / "r.rrd", panda, Content(figures={"gone": tmp_path / "gone.png"}))
     assert not list(tmp_path.iterdir())
 
 
@@ -293,7 +300,7 @@ def test_the_identification_table_holds_the_numbers_in_110_columns(console, pand
     parameters = (f"0.5 → {f.x[1]:.3g}", f"[{f.low[1]:.3g}, {f.high[1]:.3g}]", f"0 → {1e3 * f.x[21]:.3g}")
     for expected in (*parameters, "0.111", "0.444", "0.25", "6.25", "0.81", "451", "mean", "delay, ms"):
         assert expected in text
-    assert text.count(UNSEEN) == 1 + text.count("?: it is wider")
+    assert text.count(KEPT) == 1 + text.count("?: the interval is")
     assert text.count(" ? ") == np.sum(~f.identifiable)
 
 
@@ -307,17 +314,10 @@ def test_ten_numbers_per_link_take_one_line_in_the_terminal(console, panda):
     assert len(text.splitlines()) < 60
 
 
-def everything(robot, found, recording, **more) -> dict:
-    how = {
-        "pictures": {},
-        "fastest": np.ones(robot.n),
-        "whiteness": pd.DataFrame(),
-        "window_s": 0.2,
-        "cutoff_hz": 10.0,
-    }
+def everything(robot, found, recording, nominal=None) -> dict:
+    evidence = Evidence({}, np.ones(robot.n), pd.DataFrame(), window_s=0.2, cutoff_hz=10.0)
     summary = {"train": SUMMARY | {"seconds": 8.0}, "validation": SUMMARY | {"seconds": 2.0}}
-    nominal = more.pop("nominal", found.space.nominal)
-    return identification_sections(robot, nominal, found, recording, summary, **how | more)
+    return identification_sections(robot, nominal or found.space.nominal, found, recording, summary, evidence)
 
 
 def words_of(sections: dict) -> str:
@@ -344,12 +344,12 @@ def test_tables_one_to_four_hold_old_new_and_interval(panda, identified, recordi
     assert tensors.loc["3", "Ixz"].startswith(f"{1e3 * panda.inertia[2, 0, 2]:.3g} → ")
     assert scales.loc["3", "new"].split()[0] == f"{space.block(f.x, 'inertia_scale')[2]:.3g}"
     friction = tables_of(sections, "Table IV")[0]
-    assert friction.loc["5", "phi1\nNm"] == f"0.5\n{UNSEEN}"
+    assert friction.loc["5", "phi1\nNm"] == f"0.5\n{KEPT}"
     assert friction.loc["1", "phi1\nNm"].split("\n")[0].endswith(" ?")
 
 
 def test_mass_and_centre_carry_the_interval_of_the_joint_distribution(panda, recording):
-    """The mass goes with exp(2 alpha), and is told where alpha is."""
+    """The mass goes with exp(2 alpha), and is identifiable if alpha is."""
     found = make_identified(panda, LINKS)
     links, tensors = tables_of(everything(panda, found, recording), "Table III")
     alpha = found.space.block(found.found.samples, "link_alpha")
@@ -361,16 +361,16 @@ def test_mass_and_centre_carry_the_interval_of_the_joint_distribution(panda, rec
     assert len(tensors.columns) == 6
 
 
-def test_breakaway_is_told_as_it_was_measured(panda, identified, recording):
+def test_the_breakaway_table_shows_how_it_was_measured(panda, identified, recording):
     edges = np.stack([np.full(7, -0.3), np.full(7, 0.4)], -1)
     old = identified.space.nominal
     scanned = replace(identified, space=replace(identified.space, nominal=replace(old, breakaway=edges)))
     sections = everything(panda, scanned, recording, nominal=old)
     assert tables_of(sections, "Table II:")[0].loc["1"].tolist() == ["0", "-0.3", "0", "0.4"]
-    assert "looked for in the recording" in words_of(sections)
+    assert "found by search in the recording" in words_of(sections)
     spread, count, tried = np.full((7, 2), 0.01), np.full((7, 2), 2), np.zeros((7, 2))
     spread[6, 1], spread[5, 1], count[6, 1], count[5, 1], tried[6, 1] = np.nan, np.nan, 0, 1, 0.7
-    rest = {"ramped": 0 * count + 2, "tried": tried, "resolution": 0 * tried, "command": edges}
+    rest = {"ramped": 0 * count + 2, "held": tried, "resolution": 0 * tried, "command": edges}
     rest |= dict.fromkeys(("value", "misfit", "joint", "sign", "pose"), np.zeros(0))
     ramps = replace(scanned, edges=Breakaway(spread=spread, count=count, **rest))
     ramped = tables_of(everything(panda, ramps, recording, nominal=old), "Table II:")[0]
@@ -387,7 +387,7 @@ def test_breakaway_is_told_as_it_was_measured(panda, identified, recording):
     assert not tables_of(everything(panda, scanned, measured, nominal=old), "Table II:")
 
 
-def test_bristles_hold_without_a_dead_zone(panda, recording):
+def test_a_presliding_family_holds_without_a_dead_zone(panda, recording):
     bounds = {"coulomb": [0.05, 5], "asymmetry": [-0.5, 0.5], "viscous": [0, 5], "rise": [0, 1]}
     found = make_identified(panda, bounds, "bristle")
     p = found.dynamics.phi[2]
@@ -396,13 +396,13 @@ def test_bristles_hold_without_a_dead_zone(panda, recording):
     assert found.dynamics.family == BRISTLE
 
 
-def test_what_the_data_cannot_tell_is_said_in_words(panda, identified, recording):
+def test_identifiability_is_stated_in_words(panda, identified, recording):
     text = words_of(everything(panda, identified, recording))
     assert "97 %: 0.80 phi1 of joint 2 - 0.60 phi2 of joint 2" in text
     assert "phi1 of joint 5" in text
-    assert "and 1 more, mostly of the numbers kept nominal" in text
+    assert "and 1 more, mostly of parameters kept nominal" in text
     assert "worse than nominal: joint 7 (1.11)" in text
-    assert "low-passed at 10 Hz" in text
+    assert "zero-phase low-pass of 10 Hz" in text
     assert "40 Hz (4 times the cutoff)" in text
     everywhere = [f"{b}[{j}]" for b in ("phi3", "link_d1") for j in range(1, 8)] + ["delay"]
     assert _grouped(everywhere, 7) == "phi3 of all joints; d1 of all links; delay"
@@ -447,6 +447,41 @@ def test_pauses_are_cut_short():
     clock, pauses = without_pauses(np.array([5.0, 5.01, 5.02, 9.0, 9.01, 0.0, 0.01]))
     assert clock.tolist() == pytest.approx([0, 0.01, 0.02, 0.12, 0.13, 0.23, 0.24])
     assert pauses.tolist() == [3, 5]
+
+
+def test_a_measure_table_with_an_unknown_key_is_refused():
+    """The message names the list, the key and the nearest match."""
+    force = Measure("force_N", "force", "force error", "N")
+    with pytest.raises(UserError, match=r"measure_table.rows: no measure 'forse_N'; .*did you mean 'force_N'"):
+        MeasureTable((force,), ("force_N",), rows=("forse_N",))
+
+
+def test_a_task_from_outside_r2s_shows_its_own_measures(tmp_path, panda, console):
+    """Pages, list and tables read the measures from the run folder, whatever their keys."""
+    force = Measure("force_N", "force", "RMS force error", "N", 1, 2, lower_is_better=True)
+    held = Measure("held", "held", "time in contact", "%", 100, 0)
+    table = MeasureTable((force, held), ("held", "force_N"), description="It presses on a surface.")
+    folder = tmp_path / "train" / "press"
+    (folder / "figures").mkdir(parents=True)
+    write_measures(folder, table)
+    row = {"env_steps": 2000, "updates": 10, "wall_clock_s": 60.0, "force_N": 1.234, "held": 0.97}
+    pd.DataFrame([row | {"env_steps": 1000, "held": 0.5}, row]).to_csv(folder / "evaluations.csv", index=False)
+    meta = {"stage": "train", "status": "done", "start": "2026-01-01T00:00:00+00:00"}
+    (folder / "meta.json").write_text(json.dumps(meta))
+    assert run_rows(tmp_path)["result"].item() == "time in contact 97 %, RMS force error 1.23 N after 2k env steps"
+    (folder / "summary.json").write_text(json.dumps({"best": row, "last": row}))
+    assert run_rows(tmp_path)["result"].item() == "time in contact 97 %, RMS force error 1.23 N"
+    run = SimpleNamespace(folder=folder, figure=lambda name: folder / "figures" / f"{name}.png")
+    pages.training(run, panda)  # type: ignore[arg-type]
+    assert "/learning/RMS\\ force\\ error/press" in entities(folder / "recording.rrd")
+    print_measures(console, measures_of(folder), {"mujoco": row}, "pressing")
+    assert "force, N" in printed(console)
+    assert list(diagnostic_rows(table, {"arm": row | {"limited": 0.012}})) == ["filter active, %"]
+    config = {"algo": {"name": "tqc"}, "task": {"name": "press"}, "dr": {"name": "none"}, "friction": {}}
+    contract = {"rates": {"policy_hz": 50, "cycle_hz": 1000}, "robot": "panda", "goal": {"kind": "point"}}
+    sections = card(folder, config, {}, contract | {"torque": {"convention": "without gravity"}}, folder, ["twin"])
+    assert "It presses on a surface." in sections["tqc for panda, press"][1]
+    assert sections["Measured"][0]["held, %"].to_list() == ["97.0"]
 
 
 PROGRESS = """
@@ -526,8 +561,8 @@ def test_the_html_report_is_one_file_that_loads_nothing(tmp_path, panda, identif
 
 
 @pytest.mark.parametrize("torque", ["commanded", "measured"])
-def test_identification_tells_everything_at_once(tmp_path, panda, identified, recording, torque):
-    """Figures, both reports and the recording; the torque shown misses by what summary.json says."""
+def test_the_page_of_an_identification_is_complete(tmp_path, panda, identified, recording, torque):
+    """Figures, both reports and the recording; the RMSE of the torque shown is that of summary.json."""
     recording, nominal = replace(recording, torque=torque), identified.space.nominal
     how = {"window_s": 0.2, "cutoff_hz": 10.0}
     errors = prediction_errors(panda, nominal, identified.dynamics, recording, nthread=1, **how)
@@ -537,7 +572,7 @@ def test_identification_tells_everything_at_once(tmp_path, panda, identified, re
 
     run = SimpleNamespace(folder=tmp_path, figure=figure)
     summary = {"train": errors, "validation": errors}
-    pages.identification(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
+    identification_page(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
     with np.load(tmp_path / "torque.npz") as saved:
         for name, key in (("identified", "torque_rmse_Nm"), ("nominal", "nominal_torque_rmse_Nm")):
             assert np.sqrt(((saved[name] - saved["measured"]) ** 2).mean(0)) == pytest.approx(errors[key])
@@ -547,14 +582,14 @@ def test_identification_tells_everything_at_once(tmp_path, panda, identified, re
     html, text = ((tmp_path / f"report.{end}").read_text(encoding="utf-8") for end in ("html", "md"))
     assert html.count("<img ") == text.count("![") == len(drawn)
     assert "sway" in html
-    for title in ("Table I:", "Table II:", "Table III:", "Table IV:", "What the data cannot tell"):
+    for title in ("Table I:", "Table II:", "Table III:", "Table IV:", "Identifiability"):
         assert title in html
         assert f"## {title}" in text
 
 
-def test_the_reach_table_shows_percent_and_dashes_for_what_is_missing(console):
-    full = dict.fromkeys(SUCCESS, 0.5) | {"distance_median_m": 0.0123, "return_paper": -31.25}
-    reach_table(console, {"[mujoco]": full, "arm": {"success_5cm": 1.0}}, "reaching")
+def test_the_table_of_measures_shows_percent_and_dashes_for_missing_values(console):
+    full = dict.fromkeys(REACH.rows[:4], 0.5) | {"distance_median_m": 0.0123, "return_smooth": -31.25}
+    print_measures(console, REACH, {"[mujoco]": full, "arm": {"success_5cm": 1.0}}, "reaching")
     lines = printed(console).splitlines()
     mujoco_line = next(line for line in lines if "[mujoco]" in line).split()
     arm_line = next(line for line in lines if " arm " in line).split()

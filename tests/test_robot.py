@@ -1,4 +1,4 @@
-"""The embedded Panda is a Panda, any other serial arm loads as well, and what is no arm says so in one line."""
+"""Robot files: the embedded Panda, other serial arms, and one-line errors."""
 
 import mujoco
 import numpy as np
@@ -7,10 +7,10 @@ from conftest import conf
 
 from r2s.errors import UserError
 from r2s.excitation.fourier import fourier
-from r2s.excitation.safety import check_limits
+from r2s.excitation.motion_checks import check_limits
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import parameter_space
-from r2s.identification.torque_residual import TorqueResidual
+from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.learning.env import TaskEnv
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
@@ -154,10 +154,10 @@ def test_another_arm_goes_through_environment_and_identification(arm):
     motion = fourier(arm, duration=3.0, seed=0)
     check_limits(arm, motion)
     recording = Recording(t=motion.t, q=motion.q, dq=motion.dq, tau=np.zeros_like(motion.q), torque="measured")
-    bounds = conf("config")["identify"]["bounds"]
+    bounds = conf("identify/default")["bounds"]
     space = parameter_space(arm, nominal, {k: bounds[k] for k in ("phi1", "phi2", "offset", *LINK, "delay")})
     assert len(space.names) == 13 * 3 + 1
-    residual = TorqueResidual(arm, space, recording)
+    residual = TorqueResidual(space, recording)
     assert np.isfinite(residual(np.stack([space.start, space.lower, space.upper]))).all()
 
 
@@ -181,19 +181,19 @@ EMPTY = '<mujoco model="rock"><worldbody><body name="b"><geom size="1"/></body><
     [
         (ARM[:-20], {}, ["robot.mjcf", "arm.xml", "not a valid MJCF"]),
         (ARM.replace('mass="2"', 'mass="two"'), {}, ["robot.mjcf", "mass"]),
-        (SLIDE, {}, ["elbow", "mjJNT_SLIDE", "only hinges"]),
+        (SLIDE, {}, ["elbow", "mjJNT_SLIDE", "expected hinges"]),
         (TREE, {"ee": "tip"}, ["not a serial arm", "'right'", "'left'"]),
         (EMPTY, {}, ["arm.xml", "no joints"]),
         (ARM, {"ee": "toool"}, ["robot.ee", "toool", "tool, wrist", "did you mean 'tool'?"]),
         (ARM, {"ee": None}, ["robot.ee", "tool, wrist"]),
         (WEAK, {}, ["robot.tau_max", "elbow"]),
-        (ARM, {"q_min": [0.0, 0.0]}, ["robot.q_min", "2 values", "3 joints"]),
-        (ARM, {"dq_max": [1.0] * 4}, ["robot.dq_max", "4 values", "3 joints"]),
+        (ARM, {"q_min": [0.0, 0.0]}, ["robot.q_min", "got 2", "3 joints"]),
+        (ARM, {"dq_max": [1.0] * 4}, ["robot.dq_max", "got 4", "3 joints"]),
         (ARM, {"q_home": [0.0, 1.6, 0.0]}, ["robot.q_home", "joint 2", "1.600", "-1.571 to 1.571"]),
         (ARM, {"tau_max": [1.0, 0.0, 1.0]}, ["robot.tau_max", "pitch"]),
     ],
 )
-def test_what_is_wrong_with_a_file_is_said_in_one_line(write, text, change, words):
+def test_a_wrong_file_gets_one_line(write, text, change, words):
     """Every mistake raises a UserError of one line that names it."""
     with pytest.raises(UserError) as caught:
         load_robot(write(text), **({"ee": "tool"} | change))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r2s.identification.sliding_motion import LONGEST, RATE_HZ, SHORTEST, STEADY, SlidingMotion
+from r2s.identification.residuals.modulating_functions import LONGEST, RATE_HZ, SHORTEST, STEADY, SlidingMotion
 from r2s.physics.friction import PRESLIDING
 from r2s.recordings.recording import Recording
 
@@ -71,4 +71,4 @@ def test_a_command_is_felt_held_late_and_behind_a_lag(motion, delay, lag):
     wave = np.exp(1j * (w * t[:, None] + [0.0, 1.0]))
     expected = motion.filtered((gain * wave).imag)
     seen = motion.seen & (motion.t > 0.5)[:, None] & (motion.t < 7.5)[:, None]
-    np.testing.assert_allclose(motion.felt(delay, lag)[seen], expected[seen], atol=1e-3)
+    np.testing.assert_allclose(motion.command(delay, lag)[seen], expected[seen], atol=1e-3)

@@ -1,4 +1,4 @@
-"""The noise of an arm's speeds is identified, and shown to policies in simulation as on the arm."""
+"""Velocity noise is estimated from recordings and added to the observations of a simulated arm."""
 
 import json
 from dataclasses import replace
@@ -9,14 +9,14 @@ import torch
 from conftest import ROOT, conf
 
 from r2s.errors import UserError
-from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
+from r2s.learning.vector_arms import VectorArms
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.recordings.recording import Recording
 from r2s.recordings.speed_noise import speed_noise
-from r2s.tasks.episode import rollout
-from r2s.tasks.reach import CALM, ReachTask
+from r2s.tasks.reach import SPEED_NOISE, ReachTask
+from r2s.tasks.rollout import rollout
 
 PANDA = load_robot(**conf("robot/panda"))
 NEW = nominal_dynamics(PANDA, **conf("friction/paper"))
@@ -35,7 +35,7 @@ def swinging(noise, step=1e-3, seconds=20.0):
     return Recording(t, q, dq, np.zeros_like(q), "commanded")
 
 
-def test_what_was_added_to_the_speeds_is_found():
+def test_added_noise_is_estimated():
     """White noise of 1 to 30 mrad/s. A tenth of 20,000 rows: the median of 40 pieces of 50 is within 7 %, at 3 sigma.
 
     (One piece's mean square has a deviation of sqrt(2 / 50), a median 1.25 times that of a mean, a root half of it:
@@ -46,7 +46,7 @@ def test_what_was_added_to_the_speeds_is_found():
 
 
 def test_two_recordings_are_one():
-    """Half of the rows in each of two say as much as all in one."""
+    """Two halves of a recording give the same noise as the whole."""
     whole = swinging(np.full(3, 2e-3))
     half = len(whole.t) // 2
     halves = slice(0, half), slice(half, None)
@@ -54,20 +54,20 @@ def test_two_recordings_are_one():
     np.testing.assert_allclose(speed_noise(parts), speed_noise([whole]), rtol=0.05)
 
 
-def test_a_coarse_recording_says_nothing():
-    """At 100 Hz five angles are no cubic's worth."""
+def test_a_coarse_recording_gives_no_estimate():
+    """At 100 Hz a window has too few samples for a cubic, and the estimate is 0."""
     assert not speed_noise([swinging(np.full(3, 2e-3), step=0.01)]).any()
 
 
-def test_speeds_that_are_no_speeds_are_refused():
-    """What identification would write no training would take: said where the recording is read, with the joint."""
+def test_wrong_velocities_are_an_error():
+    """A noise above the limit of training is an error with the joint, raised when the recording is read."""
     with pytest.raises(UserError, match=r"^dq of joint 2 is .* rad/s off the slope of its q .*at most 1 is allowed"):
         speed_noise([swinging(np.array([1e-3, 2.0, 1e-3]))])
 
 
 @pytest.mark.parametrize("name", ["coulomb", "lugre", "paper", "sigmoid", "stribeck"])
-def test_the_sensors_of_independent_arms_are_told(name):
-    """Another simulator's recordings, in free motion: white, as its truth says."""
+def test_the_noise_of_independent_arms(name):
+    """Recordings of another simulator in free motion have the white noise of its parameters."""
     folder = ROOT.parent / "shared" / "data" / "independent_arms" / name
     if not folder.is_dir():
         pytest.skip("the independent arms are not part of the project")
@@ -77,24 +77,24 @@ def test_the_sensors_of_independent_arms_are_told(name):
     np.testing.assert_allclose(speed_noise([recording]), truth, rtol=0.09)
 
 
-class Listens:
-    """A policy that does nothing and keeps what it was shown."""
+class Recorder:
+    """A policy with zero action that records its observations."""
 
     def __init__(self):
         self.shown = []
 
     def action(self, observation):
-        """Return nothing to do."""
+        """Record the observation and return zero."""
         self.shown.append(observation.numpy().copy())
         return torch.zeros(len(observation), PANDA.n)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_a_policy_is_shown_noise_and_judged_without(noise):
-    """Arms at rest that nothing asks to move: speeds shown are white noise, episodes rest."""
-    arms = ArmBatch(PANDA, TASK, replace(NEW, speed_noise=np.full(PANDA.n, noise)), 3, 1)
+def test_noise_is_in_the_observation_and_not_in_the_measures(noise):
+    """Arms at rest without a command: observed velocities are white noise, recorded states are at rest."""
+    arms = VectorArms(PANDA, TASK, replace(NEW, speed_noise=np.full(PANDA.n, noise)), 3, 1)
     starts = np.tile(PANDA.q_home, (3, 1))
-    policy, again = Listens(), Listens()
+    policy, again = Recorder(), Recorder()
     done = rollout(policy, arms, TASK, starts, TASK.goals(PANDA, np.random.default_rng(0), 3))
     rollout(again, arms, TASK, starts, TASK.goals(PANDA, np.random.default_rng(0), 3))
     everything = np.array(policy.shown[1:])  # the first is asked for to compile
@@ -106,7 +106,7 @@ def test_a_policy_is_shown_noise_and_judged_without(noise):
     assert abs(shown.mean()) <= 5 * noise / np.sqrt(count)
 
 
-def test_a_training_shows_noise_up_to_the_tasks():
+def test_training_draws_noise_up_to_the_tasks():
     """Each arm has a draw of its own, or its own noise where that is more; the reward is of the true motion.
 
     Over draws the mean square is a third of the largest; of 200 arms it is known to 6 %, a root to 3 %.
@@ -123,7 +123,7 @@ def test_a_training_shows_noise_up_to_the_tasks():
 def test_an_identified_arm_gets_noise_and_the_papers_model_none():
     """By default; what is typed stands."""
     default = ReachTask(**SETTINGS)
-    heard = replace(NEW, speed_noise=np.full(PANDA.n, 2e-3))
-    assert default.believing(PANDA, heard).speed_noise == CALM
-    assert default.believing(PANDA, NEW).speed_noise == 0.0
-    assert replace(default, speed_noise=0.01).believing(PANDA, heard).speed_noise == 0.01
+    identified = replace(NEW, speed_noise=np.full(PANDA.n, 2e-3))
+    assert default.with_model(PANDA, identified).speed_noise == SPEED_NOISE
+    assert default.with_model(PANDA, NEW).speed_noise == 0.0
+    assert replace(default, speed_noise=0.01).with_model(PANDA, identified).speed_noise == 0.01

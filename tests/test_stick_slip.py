@@ -1,4 +1,4 @@
-"""Stiction within a step: held by the net torque, coupling included; stops, turns and releases where they happen."""
+"""Stick and slip within a step: net torque with coupling, and exact times of stops, reversals and breakaway."""
 
 from dataclasses import replace
 
@@ -22,15 +22,15 @@ from test_physics import (
 
 from r2s.errors import UserError
 from r2s.identification.parameter_file import load_parameters, save_parameters
-from r2s.identification.parameters import Estimate, parameter_space
+from r2s.identification.parameters import ParameterEstimate, parameter_space
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import BRISTLE, COULOMB, SIGMOID, STRIBECK
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
-from r2s.physics.stick_slip import TINY, coming_velocity
+from r2s.physics.stick_slip import TINY, JointForces, coming_velocity
 
 __all__ = ["light"]  # a fixture
-REST = 1e-12  # rad/s: what a joint that is held may show, of a thousandth of which its angle knows nothing
+REST = 1e-12  # rad/s, velocity of a sticking joint from round-off
 
 
 def by_events(mass, damping, v, drive, friction, rest, edges, dq_min):
@@ -100,9 +100,9 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
 @pytest.mark.parametrize("law", THREE, ids=named)
 @pytest.mark.parametrize("everything", [False, True])
 def test_native_stiction_is_that_of_dense_algebra(panda, everything, law):
-    """Each of 60 steps agrees to round-off: family, load, drag, links, all that is held, and what stops and turns."""
+    """Each of 60 steps agrees to round-off: family, load, drag, links, sticking joints, stops and reversals."""
     nsim, steps = 4, 60
-    dynamics = replace(some_dynamics(panda, nsim, law=law), hold="net", dq_min=2e-3)
+    dynamics = replace(some_dynamics(panda, nsim, law=law), stiction_model="net", dq_min=2e-3)
     dynamics = with_everything(panda, dynamics) if everything else dynamics
     q, dq, tau = some_motion(panda, nsim, steps)
     sim = Simulator(panda, dynamics, nsim, 1)
@@ -117,7 +117,7 @@ def test_native_stiction_is_that_of_dense_algebra(panda, everything, law):
 def one_joint(light, **change):
     """Return the light joint with exact Coulomb friction of 0.1 Nm, held up to 0.13 Nm."""
     d = Dynamics.of(light, np.array([[0.1, 0.0, 0.0]]), COULOMB, dq_min=0.0)
-    return replace(d, breakaway=np.array([[-0.13, 0.13]]), hold="net", **change)
+    return replace(d, breakaway=np.array([[-0.13, 0.13]]), stiction_model="net", **change)
 
 
 def exactly(tau, inertia, level, edge):
@@ -139,7 +139,7 @@ def exactly(tau, inertia, level, edge):
     return np.array(out)
 
 
-def test_one_joint_stops_turns_and_lets_go_where_it_does_so(light):
+def test_events_of_one_joint_are_exact(light):
     """Without viscous friction a joint has constant accelerations between events: velocities are exact to round-off.
 
     What round-off adds up to in 3000 steps of velocities up to 10 rad/s: eps each.
@@ -159,7 +159,7 @@ def test_one_joint_stops_turns_and_lets_go_where_it_does_so(light):
 
 def test_a_ramped_joint_lets_go_at_its_edge(panda):
     """At rest to the bit before the net torque passes the edge, moving after the first step in which it has."""
-    d = replace(some_dynamics(panda, 1, law=STRIBECK), hold="net", offset=np.zeros((1, 7)))
+    d = replace(some_dynamics(panda, 1, law=STRIBECK), stiction_model="net", offset=np.zeros((1, 7)))
     d = replace(d, breakaway=np.stack([np.full((1, 7), -9.0), np.full((1, 7), 9.0)], -1))
     rest = STRIBECK.at_rest(d.phi)[0]
     for joint, sign in ((1, 1.0), (4, -1.0), (6, 1.0)):
@@ -199,12 +199,12 @@ def test_a_joint_is_held_against_the_motion_of_the_others(panda, law):
     d = Dynamics.of(panda, np.tile([0.4, 8.0, 0.0] if law is SIGMOID else [0.1, 0.1, 0.1], (n, 1)), law)
     edges = np.zeros((n, 2))
     edges[still] = [-8.0, 8.0]
-    d = replace(d, breakaway=edges, hold="net")
+    d = replace(d, breakaway=edges, stiction_model="net")
     tau = np.zeros((1, steps, n))
     tau[0, :, 1::2] = np.array([6.0, 3.0, 0.5]) * np.sin(0.02 * np.arange(steps))[:, None]
     out = {}
     for hold in ("net", "command"):
-        sim = Simulator(panda, replace(d, hold=hold), 1, 1)
+        sim = Simulator(panda, replace(d, stiction_model=hold), 1, 1)
         sim.reset(panda.q_home[None], np.zeros((1, n)))
         out[hold] = sim.rollout(tau, record=("qpos", "qvel"))
     q, dq = (out["net"][k][0] for k in ("qpos", "qvel"))
@@ -229,7 +229,7 @@ def test_a_joint_is_held_against_the_motion_of_the_others(panda, law):
 @pytest.mark.parametrize("law", THREE, ids=named)
 def test_friction_never_gives_energy(panda, law):
     """Without command and offset kinetic energy never rises, stops included, and in the end all joints are held."""
-    d = replace(some_dynamics(panda, 3, law=law), hold="net", dq_min=5e-3, offset=np.zeros((3, 7)))
+    d = replace(some_dynamics(panda, 3, law=law), stiction_model="net", dq_min=5e-3, offset=np.zeros((3, 7)))
     q, dq, _ = some_motion(panda, 3, 1)
     sim = Simulator(panda, d, 3, 1)
     sim.reset(q, dq)
@@ -281,7 +281,8 @@ def test_events_are_where_time_stepping_puts_them():
         out, work = np.empty(n), np.empty((n + 4, n))
         friction = np.where(v > 0, level[1], np.where(v < 0, level[0], 0.0))
         packed = mass[np.tril_indices(n)]
-        coming_velocity(packed, np.zeros(n), SIM_DT, v, drive, friction, level, level, TINY, work, out)
+        forces = JointForces(v, drive, friction, level, level)
+        coming_velocity(packed, np.zeros(n), SIM_DT, forces, TINY, work, out)
         expected = moreau(inverse, level, drive, v, SIM_DT / parts, parts, 60)
         late = SIM_DT / parts * np.abs(inverse) @ np.ptp(level, axis=0)
         np.testing.assert_allclose(out, expected, rtol=0, atol=12 * late.max())
@@ -295,7 +296,7 @@ def test_a_slow_joint_within_its_edges_comes_to_rest(panda, law):
     phi = {"sigmoid": [0.4, 8.0, 0.0], "coulomb": [0.2, 0.0, 0.1], "stribeck": [0.2, 0.0, 0.1, 0.5, 0.1]}[law.name]
     edges = np.tile([-5.0, 5.0], (7, 1))
     edges[5] = -0.5, 0.5
-    d = replace(Dynamics.of(panda, np.tile(phi, (7, 1)), law, dq_min=2e-3), breakaway=edges, hold="net")
+    d = replace(Dynamics.of(panda, np.tile(phi, (7, 1)), law, dq_min=2e-3), breakaway=edges, stiction_model="net")
     slow = np.array([[1.9e-3, -1.9e-3, 2.1e-3, 0.0, 0.5, 1e-3, 0.0]])
     tau = np.zeros((1, 1, 7))
     tau[0, 0, 5] = 0.8
@@ -310,7 +311,7 @@ def test_a_slow_joint_within_its_edges_comes_to_rest(panda, law):
 def test_threads_and_states_do_not_change_a_bit(panda):
     """One thread and two give the same bits, and so does an arm that is put back to where it was."""
     nsim = 9
-    dynamics = replace(some_dynamics(panda, nsim, law=STRIBECK), hold="net", dq_min=1e-3)
+    dynamics = replace(some_dynamics(panda, nsim, law=STRIBECK), stiction_model="net", dq_min=1e-3)
     q, dq, tau = some_motion(panda, nsim, 120)
     results = []
     for nthread in (1, 2):
@@ -326,7 +327,7 @@ def test_threads_and_states_do_not_change_a_bit(panda):
 
 
 def test_what_has_no_edges_and_no_jump_is_the_same_by_either_rule(panda):
-    """A sigmoid without breakaway, and bristles, do not care for `hold`."""
+    """A sigmoid without breakaway, and bristles, do not depend on `stiction_model`."""
     nsim = 3
     q, dq, tau = some_motion(panda, nsim, 100)
     for law in (SIGMOID, BRISTLE):
@@ -334,7 +335,7 @@ def test_what_has_no_edges_and_no_jump_is_the_same_by_either_rule(panda):
         d = replace(d, breakaway=0 * d.breakaway if law is SIGMOID else d.breakaway)
         paths = []
         for hold in ("command", "net"):
-            sim = Simulator(panda, replace(d, hold=hold), nsim, 1)
+            sim = Simulator(panda, replace(d, stiction_model=hold), nsim, 1)
             sim.reset(q, dq)
             paths.append(sim.rollout(tau)["qpos"])
         assert np.array_equal(*paths)
@@ -343,12 +344,16 @@ def test_what_has_no_edges_and_no_jump_is_the_same_by_either_rule(panda):
 def test_the_rule_is_named(panda, tmp_path):
     """The published arm keeps the paper's rule; another is named in yaml, kept by parameters.yaml, or refused."""
     paper = nominal_dynamics(panda, **conf("friction/paper"))
-    assert paper.hold == "command"
-    net = nominal_dynamics(panda, **conf("friction/paper") | {"hold": "net"})
+    assert paper.stiction_model == "command"
+    net = nominal_dynamics(panda, **conf("friction/paper") | {"stiction_model": "net"})
     space = parameter_space(panda, net, {"offset": [-1.0, 1.0]})
     x = space.start
-    save_parameters(tmp_path / "parameters.yaml", space, Estimate(x, x, x, np.ones(len(x), bool), x[None]), {})
+    save_parameters(
+        tmp_path / "parameters.yaml", space, ParameterEstimate(x, x, x, np.ones(len(x), bool), x[None]), {}
+    )
     again, x = load_parameters(tmp_path, panda)
-    assert again.dynamics(x).hold == "net"
-    with pytest.raises(UserError, match=r"^friction\.hold: 'nett'; allowed: command, net; did you mean 'net'\?$"):
-        nominal_dynamics(panda, **conf("friction/paper") | {"hold": "nett"})
+    assert again.dynamics(x).stiction_model == "net"
+    with pytest.raises(
+        UserError, match=r"^friction\.stiction_model: 'nett'; allowed: command, net; did you mean 'net'\?$"
+    ):
+        nominal_dynamics(panda, **conf("friction/paper") | {"stiction_model": "nett"})

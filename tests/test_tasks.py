@@ -8,29 +8,30 @@ import pytest
 import torch
 from conftest import conf
 
-from r2s.arm.deploy import DrivenArm
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
-from r2s.learning.batch import ArmBatch
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.policy import make_policy
-from r2s.physics.contacts import touching
+from r2s.learning.vector_arms import VectorArms
+from r2s.physics.collision import CollisionCheck
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
-from r2s.tasks.episode import measures, rollout
-from r2s.tasks.task import Task, Usual
+from r2s.tasks.rollout import measures, rollout
+from r2s.tasks.task import BaseTask, Task
 
 PANDA = load_robot(**conf("robot/panda"))
 NEW = nominal_dynamics(PANDA, **conf("friction/paper"))
 
 
-class Line(Usual):
+class Line(BaseTask):
     """Follow a point that moves on a line; its place 0.2 s ahead is in the observation. Goals are (m, 2, 3), ends."""
 
     ctrl_hz, cutoff_hz, steps, substeps = 50, 100.0, 10, 20
-    observed, paper_weights = "q dq error ahead; rad, rad/s, m", np.array([-1.0, -0.01])
+    observation_summary, paper_weights = "q dq error ahead; rad, rad/s, m", np.array([-1.0, -0.01])
+    reward_terms = ("distance", "acceleration")
 
-    def torque(self, robot):
+    def torque_limit(self, robot):
         return 0.1 * robot.tau_max
 
     def starts(self, robot, rng, count):
@@ -51,7 +52,7 @@ class Line(Usual):
         parts = [state.q, state.dq, self.point(goals, state.t) - state.ee, ahead]
         return np.concatenate(parts, 1).astype(np.float32)
 
-    def reference(self, state, goals):
+    def distance_scale(self, state, goals):
         return np.ones(len(goals))
 
     def judge(self, state, ddq, goals, reference):
@@ -86,7 +87,7 @@ def quiet(dynamics):
 
 
 @pytest.mark.parametrize(
-    "make", [lambda task: ArmBatch(PANDA, task, NEW, 1, 1), lambda task: DrivenArm(quiet(NEW), task, NEW.level)]
+    "make", [lambda task: VectorArms(PANDA, task, NEW, 1, 1), lambda task: PolicyRunner(quiet(NEW), task, NEW.level)]
 )
 def test_time_begins_with_the_episode(make):
     """A state says how long its episode has run, in the batch and on an arm; a second episode starts at 0."""
@@ -113,13 +114,13 @@ def test_an_arm_that_touches_something_has_ended_its_episode():
             return torch.tensor([[0.0] * 7, [0.0, 1.0, 0, 0, 0, 0, 0], [0.0] * 7])[: len(observation)]
 
     done = rollout(
-        Down(), ArmBatch(PANDA, task, NEW, 3, 1), task, starts, task.goals(PANDA, np.random.default_rng(0), 3)
+        Down(), VectorArms(PANDA, task, NEW, 3, 1), task, starts, task.goals(PANDA, np.random.default_rng(0), 3)
     )
     when, what = done.collision[1].split(" s: ")
     assert what.endswith("and the table")
     assert list(done.collision[[0, 2]]) == ["", ""]
     k = round(float(when) * task.ctrl_hz) - 1
-    touches = touching(PANDA)
+    touches = CollisionCheck(PANDA)
     assert not touches(done.q[1, :k]).any()
     assert touches(done.q[1, k:]).all()
     assert np.array_equal(done.q[1, k:], np.broadcast_to(done.q[1, k], done.q[1, k:].shape))
@@ -127,7 +128,7 @@ def test_an_arm_that_touches_something_has_ended_its_episode():
     assert measures(done)["collision"] == pytest.approx(1 / 3)
 
 
-class Still:
+class ZeroAction:
     """Asks for nothing."""
 
     def action(self, observation):
@@ -139,8 +140,8 @@ def test_an_episode_that_stops_keeps_its_last_state():
     """An arm that stops at once: the state of the stop lasts, its distance is worth nothing at the end."""
     task, starts = Line(), np.tile(PANDA.q_home, (2, 1))
     starts[1, 1] = PANDA.q_max[1] - 0.01  # within what a driver brings to rest
-    arms = DrivenArm(quiet(replace(NEW, offset=0 * NEW.offset)), task, NEW.level)
-    done = rollout(Still(), arms, task, starts, task.goals(PANDA, np.random.default_rng(0), 2))
+    arms = PolicyRunner(quiet(replace(NEW, offset=0 * NEW.offset)), task, NEW.level)
+    done = rollout(ZeroAction(), arms, task, starts, task.goals(PANDA, np.random.default_rng(0), 2))
     assert [stop.episode for stop in arms.stops] == [1]
     assert np.array_equal(done.q[1], np.broadcast_to(done.q[1, 0], done.q[1].shape))
     assert np.isinf(done.distance[1, -1])

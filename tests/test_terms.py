@@ -10,22 +10,22 @@ from test_identify import BOUNDS, NOISE, SETTINGS, TORQUE, arm, recorded, run  #
 
 from r2s.arm.ramp import ramp
 from r2s.arm.simulated import SimulatedArm
-from r2s.identification.family_selection import left_out
-from r2s.identification.identify import with_terms
-from r2s.identification.static_friction import SURE
+from r2s.identification.friction.static_friction import SIGMA
+from r2s.identification.structure.cross_validation import held_out
+from r2s.identification.terms import add_terms
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, STRIBECK
-from r2s.physics.rigid_body import put_links
+from r2s.physics.rigid_body import set_links
 from r2s.physics.robot import SIM_DT
 
-EXTRA = conf("config")["identify"]["extra"]["commanded"]
+EXTRA = conf("identify/default")["candidate_terms"]["commanded"]
 PHI = np.array([[1.2, 0.05, 0.3], [0.9, -0.05, 0.2], [0.5, 0.1, 0.1]])
 
 
 def coulomb_arm(robot) -> Dynamics:
     """Return an arm of hard stiction: it breaks away well above its Coulomb level."""
     edges = np.stack([-1.3 * PHI[:, 0], 1.25 * PHI[:, 0]], -1)
-    hard = replace(Dynamics.of(robot, PHI, COULOMB, 1e-3), breakaway=edges, hold="net")
+    hard = replace(Dynamics.of(robot, PHI, COULOMB, 1e-3), breakaway=edges, stiction_model="net")
     return replace(hard, offset=np.array([0.2, -0.1, 0.05]), delay=2e-3)
 
 
@@ -36,7 +36,7 @@ def hard(arm):  # noqa: F811
     ramps = ramp(SimulatedArm(arm, truth, **NOISE, seed=5), [arm.q_home, arm.q_home + 0.3])
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
     motion = recorded(arm, truth, 12.0, seed=0)
-    how = {"family": "coulomb", "extra": EXTRA, "ramps": ramps}
+    how = {"family": "coulomb", "candidate_terms": EXTRA, "ramps": ramps}
     return run(arm, start, motion, [TORQUE], **how), truth, motion
 
 
@@ -57,7 +57,7 @@ def test_no_term_enters_that_is_not_there(hard):
 def test_stiction_is_found_to_be_of_the_net_torque(hard):
     """The rule that replays its stops better, and edges as commands within 30 mNm."""
     found, truth, _ = hard
-    assert found.dynamics.hold == "net"
+    assert found.dynamics.stiction_model == "net"
     edges = found.dynamics.breakaway - found.dynamics.offset[:, None]
     np.testing.assert_allclose(edges, truth.breakaway - truth.offset[:, None], rtol=0, atol=0.03)
 
@@ -66,7 +66,7 @@ def test_a_term_that_is_there_enters(arm):  # noqa: F811
     """Cable drag of a fifth of the friction is asked for by motion left out."""
     truth = replace(coulomb_arm(arm), drag=np.array([[0.25, 0.1], [0.2, -0.2], [0.1, 0.1]]))
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
-    found = run(arm, start, recorded(arm, truth, 12.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
+    found = run(arm, start, recorded(arm, truth, 12.0, seed=0), [TORQUE], family="coulomb", candidate_terms=EXTRA)
     assert "drag_sin" in found.space.blocks
 
 
@@ -80,14 +80,14 @@ def test_rotors_that_are_there_enter_and_leave_the_links_alone(arm):  # noqa: F8
     rotors = np.array([0.15, 0.1, 0.03])
     truth = replace(coulomb_arm(arm), armature=rotors)
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "coulomb"})
-    found = run(arm, start, recorded(arm, truth, 8.0, seed=0), [TORQUE], family="coulomb", extra=EXTRA)
+    found = run(arm, start, recorded(arm, truth, 8.0, seed=0), [TORQUE], family="coulomb", candidate_terms=EXTRA)
     at = found.space.where("armature")
     assert np.all(np.abs(found.x[at] - rotors) < 4 * found.found.samples[:, at].std(0) + SIM_DT * PHI[:, 2])
     np.testing.assert_allclose(found.x[at][1:], rotors[1:], rtol=0.2)
     moved = []
     for d in (found.dynamics, truth):
         model = arm.model(gravity=False)
-        put_links(model, d.mass, d.com, d.inertia, d.armature)
+        set_links(model, d.mass, d.com, d.inertia, d.armature)
         moved.append(np.diag(whole_mass(model, arm.q_home)))
     np.testing.assert_allclose(*moved, rtol=0.02)
 
@@ -102,16 +102,16 @@ def whole_mass(model, q) -> np.ndarray:
 
 
 def test_ramps_tell_the_rise_towards_standstill(arm):  # noqa: F811
-    """Friction as sliding begins is the breakaway's, in either direction, within three times SURE."""
+    """Friction as sliding begins is the breakaway's, in either direction, within three times SIGMA."""
     phi = np.concatenate([PHI, np.tile([0.4, 0.03, 0.3], (3, 1))], 1)
-    truth = replace(Dynamics.of(arm, phi, STRIBECK, 1e-3), hold="net", delay=2e-3)
+    truth = replace(Dynamics.of(arm, phi, STRIBECK, 1e-3), stiction_model="net", delay=2e-3)
     truth = replace(truth, breakaway=STRIBECK.at_rest(phi))
     ramps = ramp(SimulatedArm(arm, truth, **NOISE, seed=5), [arm.q_home, arm.q_home + 0.3])
     start = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "stribeck"})
     terms = ["offset", "inertia_scale", "delay", "rise_asymmetry"]
     found = run(arm, start, recorded(arm, truth, 12.0, seed=1), [TORQUE], family="stribeck", terms=terms, ramps=ramps)
     net = [d.family.at_rest(d.phi) - d.offset[:, None] for d in (found.dynamics, truth)]
-    np.testing.assert_allclose(*net, rtol=3 * SURE)
+    np.testing.assert_allclose(*net, rtol=3 * SIGMA)
 
 
 def test_replays_that_disagree_with_torque_are_refused(hard, arm):  # noqa: F811
@@ -135,14 +135,14 @@ def test_replays_that_disagree_with_torque_are_refused(hard, arm):  # noqa: F811
 
 
 def test_a_link_takes_the_place_of_its_tensor():
-    assert with_terms(["offset", "inertia_scale", "delay"], ["link", "drag"]) == ["offset", "delay", "link", "drag"]
-    assert with_terms(["offset", "inertia_scale"], ["load"]) == ["offset", "inertia_scale", "load"]
+    assert add_terms(["offset", "inertia_scale", "delay"], ["link", "drag"]) == ["offset", "delay", "link", "drag"]
+    assert add_terms(["offset", "inertia_scale"], ["load"]) == ["offset", "inertia_scale", "load"]
 
 
 def test_what_is_left_out_is_spread_over_the_recording(hard):
     """With several blocks a fold, each holds motion of all parts, and every row is left out once."""
     motion = hard[2]
-    pairs = left_out(motion, 4, 3)
+    pairs = held_out(motion, 4, 3)
     assert sum(len(out.t) for _, out in pairs) >= len(motion.t)
     for rest, out in pairs:
         assert len(np.unique(out.trajectory)) == 3

@@ -8,30 +8,30 @@ import torch
 from conftest import ROOT, conf
 
 from r2s.errors import UserError
-from r2s.learning.batch import ArmBatch
-from r2s.learning.computed_torque import Oracle, Still, computed_torque
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
+from r2s.learning.model_based import Oracle, ZeroAction, computed_torque
 from r2s.learning.policy import make_policy
-from r2s.learning.randomization import Forces
+from r2s.learning.randomization import ForceRandomization
+from r2s.learning.vector_arms import VectorArms
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
-from r2s.physics.limits import RATE
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import load_robot
+from r2s.physics.safety_filter import RATE
 from r2s.physics.simulator import Simulator
-from r2s.tasks.episode import rollout
-from r2s.tasks.model_torque import ModelTorque
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import rollout
 from r2s.tasks.task import State
-from r2s.tasks.timed_path import KINDS, PUSH, SPEED, TORQUE, Paths, clock, curve, smooth
 from r2s.tasks.track import TrackTask
+from r2s.tasks.trajectory import ACCELERATION, KINDS, SPEED, TORQUE, Paths, clock, curve, smooth
 
 PANDA = load_robot(**conf("robot/panda"))
 NEW = nominal_dynamics(PANDA, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
 # friction without a dead zone: what a model can know exactly
 SMOOTH = replace(NEW, breakaway=0 * NEW.breakaway)
 SETTINGS = {k: tuple(v) if isinstance(v, list) else v for k, v in conf("task/track").items()}
-TASK = TrackTask(**SETTINGS | {"pool": 4}).believing(PANDA, SMOOTH)
+TASK = TrackTask(**SETTINGS | {"pool": 4}).with_model(PANDA, SMOOTH)
 N = PANDA.n
 
 
@@ -78,7 +78,7 @@ def test_a_path_is_continuous_to_the_second_derivative(kind):
     Where an acceleration changes by at most j within h, a central difference of speeds over h is off by j.
     """
     h = 1e-3
-    paths = Paths(PANDA, TASK.torque(PANDA), 4.0, 0.6)
+    paths = Paths(PANDA, TASK.torque_limit(PANDA), 4.0, 0.6)
     shape = curve(kind, np.random.default_rng(5), 0.12)
     q, dq, ddq = joints(paths.plan(np.array([0.5, 0.0, 0.5]), shape, 0.7, np.arange(0, 4.0, h)))
     j = np.abs(np.diff(ddq, axis=0)).max()
@@ -101,17 +101,17 @@ def test_a_plan_begins_and_ends_at_rest_and_has_the_hands_motion(plans):
 
 def test_a_path_is_as_fast_as_the_limits_let_it():
     """A pace that is far too fast is made slower until torque, speed or acceleration is just at its share."""
-    paths = Paths(PANDA, TASK.torque(PANDA), 4.0, 0.6)
+    paths = Paths(PANDA, TASK.torque_limit(PANDA), 4.0, 0.6)
     t = np.arange(0, 4, 0.02)
     for seed in range(3):
         plan = paths.plan(np.array([0.5, 0.0, 0.5]), curve("circle", np.random.default_rng(seed), 0.08), 1.0, t)
         q, dq, ddq = joints(plan)
         assert 0.8 < paths.strain(q, dq, ddq) <= 1.0
-        rigid = ModelTorque(PANDA, Dynamics.of(PANDA, np.zeros((N, 3)))).rigid(q, dq, ddq)
-        assert np.all(np.abs(rigid) <= TORQUE * TASK.torque(PANDA) + 1e-9)
+        rigid = InverseDynamics(PANDA, Dynamics.of(PANDA, np.zeros((N, 3)))).rigid(q, dq, ddq)
+        assert np.all(np.abs(rigid) <= TORQUE * TASK.torque_limit(PANDA) + 1e-9)
         allowed = 0.66 * PANDA.dq_max
         assert np.all(np.abs(dq) <= SPEED * allowed)
-        assert np.all(ddq <= PUSH * RATE * (SPEED * allowed - dq) + 1e-9)
+        assert np.all(ddq <= ACCELERATION * RATE * (SPEED * allowed - dq) + 1e-9)
         assert np.all((q > PANDA.q_min) & (q < PANDA.q_max))
 
 
@@ -128,7 +128,7 @@ def test_inverse_dynamics_is_what_the_simulator_needs():
     ddq = rng.uniform(-3, 3, (4, N))
     sim = Simulator(PANDA, arm, 4, 1, dt=1e-6)
     sim.reset(q, dq)
-    sim.rollout(ModelTorque(PANDA, arm)(q, dq, ddq, dq)[:, None])
+    sim.rollout(InverseDynamics(PANDA, arm)(q, dq, ddq, dq)[:, None])
     np.testing.assert_allclose((sim.dq - dq) / 1e-6, ddq, atol=2e-2)
 
 
@@ -137,16 +137,16 @@ def test_a_right_model_follows_within_the_time_that_it_is_late(plans):
 
     A torque that is held for a period is right up to a shift in time of half of it; all else is compensated.
     """
-    arms = ArmBatch(PANDA, TASK, SMOOTH, len(plans), 1)
-    done = rollout(Still(N), arms, TASK, TASK.begin(np.zeros((len(plans), N)), plans), plans)
+    arms = VectorArms(PANDA, TASK, SMOOTH, len(plans), 1)
+    done = rollout(ZeroAction(N), arms, TASK, TASK.begin(np.zeros((len(plans), N)), plans), plans)
     fastest = np.linalg.norm(plans[:, :, 3:6], axis=-1).max(1)
     assert np.all(done.distance.max(1) < 0.5 / TASK.ctrl_hz * fastest + 1e-4)
     row = TASK.measures(done)
     assert row["within_5mm"] == 1.0
     assert row["stopped"] == 0.0
     assert row["path_rmse_mm"] == pytest.approx(1e3 * np.sqrt((done.distance**2).mean()))
-    wrong = TASK.believing(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019")))
-    off = rollout(Still(N), arms, wrong, TASK.begin(np.zeros((len(plans), N)), plans), plans)
+    wrong = TASK.with_model(PANDA, nominal_dynamics(PANDA, **conf("friction/gaz2019")))
+    off = rollout(ZeroAction(N), arms, wrong, TASK.begin(np.zeros((len(plans), N)), plans), plans)
     assert TASK.measures(off)["path_rmse_mm"] > 2 * row["path_rmse_mm"]
 
 
@@ -157,7 +157,7 @@ def test_the_preview_is_the_path(plans):
     m, rest = len(plans), np.zeros((len(plans), N))
     ee, none = rng.uniform(0, 1, (m, 3)), (np.zeros(m, dtype=bool), np.zeros(m))
     state = State(np.full(m, 1.23), q, rest, ee, np.zeros((m, 3, N)), rest, rest, *none)
-    seen = TASK.observe(state, plans, TASK.torque(PANDA))
+    seen = TASK.observe(state, plans, TASK.torque_limit(PANDA))
     assert seen.shape == (len(plans), len(TASK.observation_scale(PANDA)[0]))
     first = 6 * N + 12
     for j in range(TASK.preview):
@@ -187,7 +187,7 @@ def test_random_forces_push_and_repeat():
     short = replace(TASK, episode_s=1.5)
 
     def after(share):
-        env = TaskEnv(PANDA, short, Forces(PANDA, NEW, share), 2, nthread=1)
+        env = TaskEnv(PANDA, short, ForceRandomization(PANDA, NEW, share), 2, nthread=1)
         state = env.reset()
         for _ in range(20):
             state["action"] = torch.zeros(2, N)
@@ -207,12 +207,11 @@ def test_random_forces_push_and_repeat():
     ("change", "said"),
     [
         ({"preview": 500}, "task.preview: 500 samples are longer than the path, which has 400"),
-        ({"preview": 0}, "task.preview: 0"),
+        ({"preview": 0}, "task.preview: expected a whole number"),
         ({"ctrl_hz": 40}, "task.ctrl_hz: 40 is not allowed; 50, 100, 125 and 200 are"),
-        ({"base": "modle"}, "task.base: 'modle'; .*did you mean 'model'"),
         ({"speed": (1.0, 0.1)}, r"task.speed: \(1.0, 0.1\) is not allowed"),
         ({"kinds": ("circel",)}, "task.kinds: 'circel'; .*did you mean 'circle'"),
-        ({"ramp_s": 3.0}, "task.episode_s: 4"),
+        ({"ramp_s": 3.0}, "task.episode_s: expected a number in"),
     ],
 )
 def test_mistakes_are_said_in_a_line(change, said):
@@ -228,17 +227,15 @@ def test_a_path_out_of_reach_is_said_in_a_line():
     assert "\n" not in str(error.value)
 
 
-def test_computed_torque_is_the_base_or_the_oracle():
-    """Of tracking it is the task's base alone, of reaching a minimum-jerk motion; of neither it says so."""
-    assert isinstance(computed_torque(PANDA, TASK, NEW), Still)
+def test_computed_torque_needs_no_policy_or_is_the_oracle():
+    """Tracking leaves it to the controller, reaching gets a minimum-jerk motion; torque control has neither."""
+    assert isinstance(computed_torque(PANDA, TASK, NEW), ZeroAction)
     assert isinstance(computed_torque(PANDA, ReachTask(), NEW), Oracle)
-    with pytest.raises(UserError, match=r"task.base: none leaves algo=computed_torque nothing"):
-        computed_torque(PANDA, replace(TASK, base="none"), NEW)
-    pure = TrackTask(**SETTINGS | {"base": "none"}).believing(PANDA, NEW)
-    assert pure.share == 1.0
-    assert pure.model is None
-    asked = pure.target(np.ones((1, N)), State.still(PANDA), np.zeros((1, 404, 27)), pure.torque(PANDA))
-    np.testing.assert_allclose(asked[0], pure.torque(PANDA))
+    pure = TrackTask(**SETTINGS)
+    with pytest.raises(UserError, match=r"algo: computed_torque cannot do TrackTask under control=torque"):
+        computed_torque(PANDA, pure, NEW)
+    command = pure.control(PANDA).command(np.ones((1, N)), pure, np.zeros(1), np.zeros((1, 404, 27)))
+    np.testing.assert_allclose(command[0], pure.torque_limit(PANDA))
 
 
 @pytest.mark.slow

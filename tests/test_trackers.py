@@ -1,4 +1,4 @@
-"""Trackers: what each holds of a run, read back with its own library; and that none of them can end a run."""
+"""Trackers: the run read back with each library, and no tracker can end a run."""
 
 import json
 import sqlite3
@@ -14,11 +14,12 @@ from hydra import compose, initialize_config_dir
 from PIL import Image
 
 from r2s.errors import UserError
-from r2s.reporting.trackers import behind
-from r2s.reporting.trackers.behind import Trackers, finite
+from r2s.override_checks import check_overrides
+from r2s.reporting.trackers import async_tracker
+from r2s.reporting.trackers.async_tracker import Trackers, finite
 from r2s.reporting.trackers.tracker import Tracked, needs
 from r2s.stages.build import GROUP, open_run
-from r2s.typed import check_overrides
+from r2s.tasks.measures import Measure, MeasureTable, write_measures
 
 PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow", "wandb": "wandb", "trackio": "trackio"}
 INSTALLED = [name for name, package in PACKAGES.items() if find_spec(package)]
@@ -38,11 +39,13 @@ def needed(name: str):
 def root(tmp_path_factory) -> Path:
     """A root with a job of a sweep, shown by all trackers that are installed: stopped after 2000, resumed at 1000."""
     root = tmp_path_factory.mktemp("runs")
+    held = MeasureTable((Measure("held", "held", "time in contact", "%", 100),), ("held",))
     cfg = composed(f"tracker=[{','.join(['csv', *INSTALLED])}]", f"root={root}", "name=job", "algo.lr=1e-3")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(GROUP, "sweep of today")
         patch.delenv("TRACKIO_DIR", raising=False)
         with suppress(KeyboardInterrupt), open_run(cfg, ["algo.lr=1e-3"]) as run:
+            write_measures(run.folder, held)
             for step in (1000, 2000):
                 run.log("evaluations", {"env_steps": step, "return_paper": RETURNS[step]})
             raise KeyboardInterrupt
@@ -52,7 +55,7 @@ def root(tmp_path_factory) -> Path:
             run.rewind("evaluations", "env_steps", 1000)
             for step in (2000, 3000):
                 run.log("evaluations", {"env_steps": step, "return_paper": RETURNS[step]})
-            run.summary({"best": {"success_1cm": 0.75, "none": None}, "rows": [1, 2]})
+            run.summary({"best": {"held": 0.75, "none": None}, "rows": [1, 2]})
             Image.new("RGB", (8, 4), "red").save(run.figure("learning"))
             (run.folder / "recording.rrd").write_bytes(b"looks")
     return root
@@ -68,9 +71,12 @@ def test_tensorboard_holds_it(root):
     curve = events.Scalars("evaluations/return_paper")
     assert {e.step: e.value for e in curve} == RETURNS
     assert len(curve) == len(RETURNS)
-    assert events.Scalars("summary/best/success_1cm")[0].value == 0.75
+    assert events.Scalars("summary/best/held")[0].value == 0.75
     assert "figures/learning" in events.Tags()["images"]
     data = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    experiment = events.SummaryMetadata("_hparams_/experiment").plugin_data.content
+    metrics = HParamsPluginData.FromString(experiment).experiment.metric_infos
+    assert [m.name.tag for m in metrics] == ["summary/best/held"]  # of the task, which is not of r2s
     settings = HParamsPluginData.FromString(data).session_start_info.hparams
     assert settings["algo.lr"].number_value == 1e-3
     assert settings["git_commit"].string_value == commit(root)
@@ -92,11 +98,11 @@ def test_mlflow_holds_it(root):
     assert found.info.status == "FINISHED"
     curve = client.get_metric_history(found.info.run_id, "evaluations/return_paper")
     assert {m.step: m.value for m in curve} == RETURNS
-    assert found.data.metrics["summary/best/success_1cm"] == 0.75
+    assert found.data.metrics["summary/best/held"] == 0.75
     assert float(found.data.params["algo.lr"]) == 1e-3
     assert found.data.params["git_commit"] == commit(root)
     assert found.data.tags["group"] == "sweep of today"
-    assert {a.path for a in client.list_artifacts(found.info.run_id)} == {"figures", "recording.rrd"}
+    assert {a.path for a in client.list_artifacts(found.info.run_id)} == {"figures", "recording.rrd", "measures.json"}
 
 
 def blocks(log: bytes) -> Iterator[bytes]:
@@ -155,12 +161,12 @@ def test_trackio_holds_it(root):
     assert config["algo.lr"] == 1e-3
     assert config["git_commit"] == commit(root)
     assert config["_Group"] == "sweep of today"
-    assert artifacts == [("recording.rrd",)]
+    assert sorted(artifacts) == [("measures.json",), ("recording.rrd",)]
     assert list((root / "trackio" / "media").rglob("*.png"))
 
 
 def test_csv_is_the_run_folder(root):
-    """tracker=csv, the default, is what every run folder has; a run without others keeps nothing for them."""
+    """tracker=csv, the default, adds nothing to the run folder."""
     assert (root / "train" / "job" / "evaluations.csv").read_text().split() == [
         "env_steps,return_paper",
         *(f"{step},{value:g}" for step, value in RETURNS.items()),
@@ -168,7 +174,7 @@ def test_csv_is_the_run_folder(root):
     cfg = composed(f"root={root}", "name=plain")
     assert cfg.tracker == {"csv": None}
     with open_run(cfg, []) as run:
-        assert run.watcher is None
+        assert run.tracker is None
     assert not (run.folder / "trackers.json").exists()
 
 
@@ -187,13 +193,13 @@ class Broken:
     """Fails from one call on."""
 
     def __init__(self, call: str):
-        self.call, self.heard = call, []
+        self.call, self.calls = call, []
 
     def __getattr__(self, name: str):
         def called(*given):
-            self.heard.append(name)
+            self.calls.append(name)
             if name == self.call:
-                raise ConnectionError("nobody\nis there")
+                raise ConnectionError("connection\nrefused")
 
         return called
 
@@ -203,8 +209,8 @@ def tracked(folder: Path) -> Tracked:
 
 
 @pytest.mark.parametrize("call", ["start", "log", "summary", "finish"])
-def test_a_tracker_that_fails_says_so_once(call, tmp_path, capsys):
-    """One warning in one line, then silence; the other trackers hear everything."""
+def test_a_tracker_that_fails_warns_once(call, tmp_path, capsys):
+    """One warning in one line, then no more; the other trackers get all calls."""
     broken, well = Broken(call), Broken("")
     both = Trackers({"broken": broken, "well": well}, tracked(tmp_path))
     for k in range(3):
@@ -212,17 +218,17 @@ def test_a_tracker_that_fails_says_so_once(call, tmp_path, capsys):
     both.summary({})
     both.finish("done")
     assert capsys.readouterr().err.splitlines() == [
-        "warning: tracker=broken: ConnectionError: nobody is there; the run goes on without it"
+        "warning: tracker=broken: ConnectionError: connection refused; the run continues without it"
     ]
-    assert well.heard == ["start", "log", "log", "log", "summary", "finish"]
-    assert broken.heard[-1] == call
-    assert broken.heard.count(call) == 1
+    assert well.calls == ["start", "log", "log", "log", "summary", "finish"]
+    assert broken.calls[-1] == call
+    assert broken.calls.count(call) == 1
 
 
 def test_a_tracker_that_hangs_holds_nothing_up(tmp_path, capsys, monkeypatch):
-    """Calls return at once, the end waits only so long, and a long queue is let go of."""
-    monkeypatch.setattr(behind, "LAST_S", 0.2)
-    monkeypatch.setattr(behind, "WAITING", 5)
+    """Calls return at once, the end of the run waits for LAST_S, and a full queue ends the tracker."""
+    monkeypatch.setattr(async_tracker, "LAST_S", 0.2)
+    monkeypatch.setattr(async_tracker, "MOST_WAITING", 5)
     slow = Broken("")
     slow.start = lambda run: time.sleep(3.0)
     both = Trackers({"slow": slow}, tracked(tmp_path))
@@ -235,11 +241,13 @@ def test_a_tracker_that_hangs_holds_nothing_up(tmp_path, capsys, monkeypatch):
 
 
 def test_only_finite_numbers_are_shown():
-    """Words, gaps and numbers that are not finite stay in the CSV."""
+    """Strings, missing and infinite values stay in the CSV."""
     assert finite({"a": 1, "b": "word", "c": float("nan"), "d": None, "e": True, "f": [1]}) == {"a": 1.0, "e": 1.0}
 
 
 def test_a_missing_package_is_one_line():
-    """What to install is said before there is a run folder."""
-    with pytest.raises(UserError, match=r"tracker=wandb: no_such_package .* pip install 'r2s\[wandb\]'"):
+    """The message has the pip command, before there is a run folder."""
+    with pytest.raises(
+        UserError, match=r"tracker=wandb: cannot import no_such_package .* pip install 'r2s\[wandb\]'"
+    ):
         needs("no_such_package", "wandb")

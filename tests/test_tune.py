@@ -1,4 +1,4 @@
-"""Settings are asked for, tried and told; a search that was killed goes on with the trials that it had begun."""
+"""A search suggests settings, trains and reports; a killed search continues with its unfinished trials."""
 
 import json
 import os
@@ -15,7 +15,8 @@ from conftest import ROOT
 
 from r2s.errors import UserError
 from r2s.reporting.tuning import against_table, best_so_far
-from r2s.stages.tune import Training, Tune, corners, span, suggested
+from r2s.runs import Job, Run
+from r2s.stages.tune import TrialRun, Tune, corners, follow, parse_range, suggest
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
 TOY = ["+experiment=[tune,toy]", "budget.env_steps=4000", "evaluation.env_steps=800", "algo.learning_starts=320"]
@@ -23,43 +24,91 @@ TOY += ["tune.trials=3", "tune.startup=1", "tune.workers=2", "evaluation.episode
 TOY += ["tune.space={algo: [td3], algo.batch_size: [16, 32], algo.lr: 'log(1e-4, 1e-2)'}"]
 
 
-def test_an_axis_is_what_was_typed():
-    """Numbers, spaces and kind; the file's own space is one."""
-    assert span("x", "log(2e-4, 1e-3)") == (2e-4, 1e-3, True)
-    assert span("x", "interval( -1,2)") == (-1.0, 2.0, False)
+def test_a_range_is_parsed():
+    """Numbers, spaces and kind; the space of conf/stage/tune.yaml is valid."""
+    assert parse_range("x", "log(2e-4, 1e-3)") == (2e-4, 1e-3, True)
+    assert parse_range("x", "interval( -1,2)") == (-1.0, 2.0, False)
     assert set(Tune(**TUNE).space) == {"algo", "algo.lr", "algo.batch_size", "algo.gamma"}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
-        ({"space": {"algo.lr": "log(0, 1)"}}, r"tune.space.algo.lr: 0.0 is not allowed; a number in \(0, inf\) is"),
-        ({"space": {"algo.lr": "log(1, 0.1)"}}, r"tune.space.algo.lr: 0.1 is not allowed; a number in \(1.0, inf\)"),
-        ({"space": {"algo.lr": "lg(1, 2)"}}, r"tune.space.algo.lr: 'lg\(1, 2\)' is not allowed; \[values\], log"),
-        ({"space": {"algo.lr": "interval(nan, 2)"}}, r"nan is not allowed"),
-        ({"space": {"algo": []}}, r"tune.space.algo: \[\] is not allowed"),
-        ({"space": {}}, r"tune.space: \{\} is no space"),
-        ({"measure": "retrn_paper"}, r"tune.measure: 'retrn_paper' .*did you mean 'return_paper'"),
-        ({"trials": 0}, r"tune.trials: 0 is not allowed"),
-        ({"workers": 0.5}, r"tune.workers: 0.5 is not allowed"),
-        ({"against": "/nowhere/grid_*"}, r"tune.against: '/nowhere/grid_\*' finds nothing"),
-        ({"against": 5}, r"tune.against: 5 finds nothing"),
+        ({"space": {"algo.lr": "log(0, 1)"}}, r"tune.space.algo.lr: expected a number in \(0, inf\), got 0.0"),
+        ({"space": {"algo.lr": "log(1, 0.1)"}}, r"tune.space.algo.lr: expected a number in \(1.0, inf\), got 0.1"),
+        ({"space": {"algo.lr": "lg(1, 2)"}}, r"tune.space.algo.lr: expected \[values\], log.*got 'lg\(1, 2\)'"),
+        ({"space": {"algo.lr": "interval(nan, 2)"}}, r"got nan"),
+        ({"space": {"algo": []}}, r"tune.space.algo: expected a list of values such as \[128, 256\], got \[\]"),
+        ({"space": {}}, r"tune.space: expected \{option.*got \{\}"),
+        ({"trials": 0}, r"tune.trials: expected .*, got 0"),
+        ({"workers": 0.5}, r"tune.workers: expected .*, got 0.5"),
+        ({"against": "/nowhere/grid_*"}, r"tune.against: '/nowhere/grid_\*' matches no folder"),
+        ({"against": 5}, r"tune.against: 5 matches no folder"),
     ],
 )
-def test_a_space_that_is_none_is_one_line(change, said):
-    with pytest.raises(UserError, match=said):
+def test_a_wrong_setting_gets_one_line(change, message):
+    with pytest.raises(UserError, match=message):
         Tune(**TUNE | change)
 
 
-def test_a_training_that_was_left_running_does_not_speak_for_another(tmp_path):
-    """A killed tune's training tells its progress on; how another one ended is what that one said."""
+def training(root, name, status, values=()):
+    """Write the run folder of a training with this status; return it open if it is running."""
+    run = Run(root, Job("train", name, "stage: train\n", [], 0, 1))
+    for k, value in enumerate(values):
+        run.log("evaluations", {"env_steps": k, "return_paper": value})
+    if status == "failed":
+        run.__exit__(FloatingPointError, FloatingPointError("the loss of update 1 is nan"), None)
+    elif status == "done":
+        run.__exit__(None, None, None)
+    return run
+
+
+def make_trial(study, root, number=0):
+    command = [sys.executable, "-c", "import sys; sys.exit('out of memory')"]
+    return TrialRun(study.ask(), root / "train" / f"t_{number}", command, root / "logs" / "t.txt")
+
+
+def test_a_trial_follows_the_files_of_its_run_folder(tmp_path):
+    """Values come from evaluations.csv, the end from meta.json, also of a training that another process writes."""
     optuna = pytest.importorskip("optuna")
-    trial = optuna.create_study().ask()
-    talks = "import sys, time; time.sleep({}); print({!r}, file=sys.stderr)"
-    left = Training(trial, tmp_path / "tune_0", [sys.executable, "-c", talks.format(1.0, "train 50 %")])
-    again = Training(trial, tmp_path / "tune_0", [sys.executable, "-c", talks.format(0.0, "it is taken")])
-    assert (again.process.wait(), left.process.wait()) == (0, 0)
-    assert (again.ended(), left.ended()) == ("it is taken", "train 50 %")
+    study = optuna.create_study(direction="maximize", pruner=optuna.pruners.NopPruner())
+    one = make_trial(study, tmp_path)
+    assert one.status() == "none"
+    run = training(tmp_path, "t_0", "running", [1.0, 2.0])
+    with open(run.folder / "evaluations.csv", "a") as file:
+        file.write("3,3")  # the training is writing this row
+    assert one.status() == "left"
+    assert not follow(study, one, "return_paper")
+    assert study.trials[0].intermediate_values == {0: 1.0, 1: 2.0}
+    run.__exit__(None, None, None)
+    assert follow(study, one, "return_paper")
+    assert study.trials[0].value == 2.0
+    assert one.starts == 0
+
+
+def test_a_failed_training_is_a_failed_trial(tmp_path):
+    """After evaluations the search continues; before the first one it stops with the training's error."""
+    optuna = pytest.importorskip("optuna")
+    study = optuna.create_study()
+    training(tmp_path, "t_0", "failed", [1.0])
+    assert follow(study, make_trial(study, tmp_path), "return_paper")
+    training(tmp_path, "t_1", "failed")
+    with pytest.raises(UserError, match=r"training t_1 failed: FloatingPointError: the loss of update 1 is nan"):
+        follow(study, make_trial(study, tmp_path, 1), "return_paper")
+    assert [t.state.name for t in study.trials] == ["FAIL", "FAIL"]
+
+
+def test_a_training_that_never_begins_ends_the_search(tmp_path):
+    """After MOST_STARTS attempts; the error names the file with its output."""
+    optuna = pytest.importorskip("optuna")
+    study = optuna.create_study()
+    one = make_trial(study, tmp_path)
+    for _ in range(3):
+        assert not follow(study, one, "return_paper")
+        one._process.wait()  # type: ignore[union-attr]
+    with pytest.raises(UserError, match=r"training t_0 ended 3 times before its end; see .*logs/t.txt"):
+        follow(study, one, "return_paper")
+    assert one.log.read_text() == "out of memory\n" * 3
 
 
 def test_corners_hold_every_value_and_both_ends():
@@ -69,22 +118,22 @@ def test_corners_hold_every_value_and_both_ends():
     assert corners(space) == [first, first | {"algo": "sac"}, first | {"algo.lr": 1e-2}]
 
 
-def test_what_is_drawn_lies_in_the_space():
-    """And is the same again where a trial that was begun goes on."""
+def test_suggestions_lie_in_the_space():
+    """An unfinished trial gets the same settings again."""
     optuna = pytest.importorskip("optuna")
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(50):
         trial = study.ask()
-        drawn = suggested(trial, TUNE["space"])
+        drawn = suggest(trial, TUNE["space"])
         assert drawn["algo"] in ("ddpg", "sac", "td3", "tqc")
         assert 2e-4 <= drawn["algo.lr"] <= 1e-3
         assert 0.95 <= drawn["algo.gamma"] <= 0.98
-        assert suggested(optuna.trial.Trial(study, trial._trial_id), TUNE["space"]) == drawn
+        assert suggest(optuna.trial.Trial(study, trial._trial_id), TUNE["space"]) == drawn
 
 
 def test_the_best_so_far_counts_what_was_spent():
-    """A trial counts once it has ended; one that was pruned costs and brings nothing."""
+    """A trial counts from its end; a pruned one takes compute only."""
     at = np.array([5.0, 10.0, 25.0, 30.0, 100.0])
     best = best_so_far([10, 10, 10], [1.0, np.nan, 3.0], at, 1.0)
     np.testing.assert_array_equal(best, [np.nan, 1.0, 1.0, 3.0, 3.0])
@@ -97,8 +146,8 @@ def test_without_a_grid_nothing_is_compared():
 
 
 @pytest.mark.slow
-def test_a_search_that_was_killed_goes_on(tmp_path):
-    """Its trials end in the folders that they were begun in, once; the study is one file; a grid is beside."""
+def test_a_killed_search_continues(tmp_path):
+    """Each trial ends once, in the folder that it began in; the report compares with a grid."""
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
@@ -125,7 +174,7 @@ def test_a_search_that_was_killed_goes_on(tmp_path):
     for k, row in trials.iterrows():
         steps = pd.read_csv(tmp_path / "train" / f"t_{k}" / "evaluations.csv")["env_steps"].tolist()
         assert steps == sorted(steps)
-        again = len(steps) - len(set(steps))  # the end is evaluated once more; who is pruned there has that, too
+        again = len(steps) - len(set(steps))  # the end is evaluated twice, also of a trial that is pruned there
         assert again == 1 if row["state"] == "complete" else again in (0, 1)
     assert (folder / "study.db").is_file()
     assert "Against the grid" in (folder / "report.md").read_text()

@@ -1,4 +1,4 @@
-"""A URDF is read as the arm that it is: the same as MJCF says it, and what is wrong in it is named."""
+"""URDF reader: the arm equals that of an equivalent MJCF, and errors name link or joint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from r2s.physics.robot import load_robot
 FRICTIONLESS = {"phi1": 0.0, "phi2": 10.0, "phi3": 0.0}
 
 # What people's files hold: a world, a base with inertia, meshes that are not there, a tool fixed to the last link at
-# an angle, a camera without inertia, a joint that turns without end, one that lost its range, and gaps for defaults.
+# an angle, a camera without inertia, a continuous joint, one that lost its range, and gaps for defaults.
 URDF = """<?xml version="1.0"?>
 <robot name="lamp">
   <link name="world"/>
@@ -111,22 +111,22 @@ def turned_tensor():
     tensor = np.array([[0.03, 0.001, 0.002], [0.001, 0.02, -0.003], [0.002, -0.003, 0.015]])
     (a, b, c), (i, j, k) = np.cos([0.2, -0.4, 0.7]), np.sin([0.2, -0.4, 0.7])
     about_x, about_y = np.array([[1, 0, 0], [0, a, -i], [0, i, a]]), np.array([[b, 0, j], [0, 1, 0], [-j, 0, b]])
-    turn = np.array([[c, -k, 0], [k, c, 0], [0, 0, 1]]) @ about_y @ about_x
-    x = turn @ tensor @ turn.T
+    axes = np.array([[c, -k, 0], [k, c, 0], [0, 0, 1]]) @ about_y @ about_x
+    x = axes @ tensor @ axes.T
     return " ".join(repr(float(v)) for v in (x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]))
 
 
 def behaviour(robot, seed=0, samples=20):
-    """Return inverse dynamics under gravity (T, n) Nm, where the hand is (T, 3) m, and which way it points (T, 9)."""
+    """Return inverse dynamics under gravity (T, n) Nm, end-effector position (T, 3) m and rotation (T, 9)."""
     model, rng = robot.model(gravity=True), np.random.default_rng(seed)
     data, site = mujoco.MjData(model), model.site(robot.ee_site).id
-    torque, hand, turn = np.empty((samples, robot.n)), np.empty((samples, 3)), np.empty((samples, 9))
+    torque, hand, axes = np.empty((samples, robot.n)), np.empty((samples, 3)), np.empty((samples, 9))
     for k in range(samples):
         data.qpos[:] = rng.uniform(*robot.q_range)
         data.qvel[:], data.qacc[:] = rng.normal(size=(2, robot.n))
         mujoco.mj_inverse(model, data)
-        torque[k], hand[k], turn[k] = data.qfrc_inverse, data.site_xpos[site], data.site_xmat[site]
-    return torque, hand, turn
+        torque[k], hand[k], axes[k] = data.qfrc_inverse, data.site_xpos[site], data.site_xmat[site]
+    return torque, hand, axes
 
 
 def assert_same(a, b):
@@ -154,7 +154,7 @@ def test_a_urdf_is_the_mjcf_of_the_same_arm(write):
     assert names == ["yaw", "pitch", "roll"]
 
 
-def test_the_shapes_that_a_urdf_holds_are_there_for_clearances(write):
+def test_shapes_of_a_urdf_become_geoms(write):
     """A cylinder of the base and a box of the upper arm, both for contacts; a mesh is left out."""
     model = load_robot(write(URDF), ee="tip").model(gravity=False)
     assert model.ngeom == 2
@@ -164,7 +164,7 @@ def test_the_shapes_that_a_urdf_holds_are_there_for_clearances(write):
 
 
 @pytest.mark.parametrize("name", ["panda", "kinova_gen3", "ur10e", "iiwa14", "xarm7"])
-def test_what_we_write_as_urdf_comes_back(name, tmp_path):
+def test_a_written_urdf_is_restored(name, tmp_path):
     """Written without friction and read again: masses, centres, tensors, rotors and how it moves, to 1e-9."""
     robot = load_robot(**conf(f"robot/{name}"))
     write_urdf(tmp_path / "arm.urdf", robot, nominal_dynamics(robot, **FRICTIONLESS))
@@ -198,25 +198,25 @@ FORK = """
   <joint name="fork" type="revolute"><parent link="upper"/><child link="other"/></joint>
 """
 MISTAKES = {
-    "cut off": (URDF[:-30], ["it is not XML", "line"]),
+    "cut off": (URDF[:-30], ["expected XML", "line"]),
     "another format": ("<sdf/>", ["<sdf>", "<robot>"]),
     "xacro": (beside_the_world('<arm xmlns="http://ros.org/wiki/xacro"/>'), ["xacro FILE > arm.urdf"]),
     "a slide": (change('"pitch" type="revolute"', '"pitch" type="prismatic"'), ["'pitch'", "prismatic", "revolute"]),
     "free": (change('name="mount" type="fixed"', 'name="mount" type="floating"'), ["'mount'", "floating"]),
-    "mimic": (change('<axis xyz="0 0 1"/>', '<mimic joint="yaw"/>'), ["'roll'", "mimics"]),
-    "no mass": (change(LOWER, ""), ["link 'lower'", "no <inertial>"]),
+    "mimic": (change('<axis xyz="0 0 1"/>', '<mimic joint="yaw"/>'), ["'roll'", "mimic"]),
+    "no mass": (change(LOWER, ""), ["link 'lower'", "expected an <inertial>"]),
     "a word": (change('mass value="1.5"', 'mass value="heavy"'), ["link 'lower'", "value", "'heavy'"]),
     "two numbers": (change('xyz="0 0 0.3"', 'xyz="0 0.3"'), ["joint 'roll'", "3 numbers", "'0 0.3'"]),
-    "no body": (change('izz="0.015"', 'izz="0.15"'), ["link 'upper'", "moments of inertia"]),
+    "no body": (change('izz="0.015"', 'izz="0.15"'), ["link 'upper'", "none above the sum of the others"]),
     "no axis": (change('xyz="0 0 2"', 'xyz="0 0 0"'), ["joint 'yaw'", "axis"]),
     "limits": (change('lower="-1.5"', 'lower="3"'), ["joint 'pitch'", "3", "2 rad"]),
     "a link": (change('child link="lower"', 'child link="lover"'), ["'pitch'", "'lover'", "did you mean 'lower'"]),
-    "twice": (change('<link name="tip"/>', '<link name="hand"/>'), ["two elements are link 'hand'"]),
+    "twice": (change('<link name="tip"/>', '<link name="hand"/>'), ["two elements link 'hand'"]),
     "two roots": (beside_the_world('<link name="moon"/>'), ["world, moon"]),
     "two parents": (beside_the_camera(fixed("j", "tool", "camera")), ["'camera'", "'camera_fixed'", "'j'"]),
-    "a ring": (
+    "a loop": (
         beside_the_camera('<link name="a"/><link name="b"/>' + fixed("j", "a", "b") + fixed("k", "b", "a")),
-        ["link 'a'", "ring"],
+        ["link 'a'", "loop"],
     ),
     "two branches": (change("</robot>", FORK + "</robot>"), ["not a serial arm", "'other'", "'hand'"]),
     "no torque": (change('effort="20"', ""), ["robot.tau_max", "pitch"]),
@@ -224,7 +224,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_what_is_wrong_with_a_urdf_is_said_in_one_line(mistake, write):
+def test_a_wrong_urdf_gets_one_line(mistake, write):
     """The file, the element by its name, and what is allowed."""
     text, words = MISTAKES[mistake]
     with pytest.raises(UserError) as caught:
@@ -246,9 +246,9 @@ def test_an_end_effector_is_a_site_a_body_or_a_link(write):
     xml = write(MJCF.replace("TENSOR", turned_tensor()), "lamp.xml")
     assert load_robot(xml, ee="tool").ee_site == "tool"
     assert load_robot(xml).ee_site == "tip"
-    with pytest.raises(UserError, match=r"^robot\.ee: name one of lamp\.urdf: .*tip.*camera"):
+    with pytest.raises(UserError, match=r"^robot\.ee: choose the end effector of lamp\.urdf: .*tip.*camera"):
         load_robot(path)
-    with pytest.raises(UserError, match=r"no site, body or link 'camra' in lamp\.urdf; .*did you mean 'camera'\?$"):
+    with pytest.raises(UserError, match=r"expected one of .* in lamp\.urdf, got 'camra'; did you mean 'camera'\?$"):
         load_robot(path, ee="camra")
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from r2s.cli import CONF
-from r2s.physics import native_friction
+from r2s.physics import mujoco_callback as native_friction
 
 native_friction.install()
 with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):

@@ -1,6 +1,6 @@
-// The driver's law of a bundle in plain C++17, once per cycle, beside what a policy observes. Of the standard library
-// alone; contract.hpp lies in the bundle. It is a third writing of r2s/physics/limits.py, and a test compares them.
-// Compile it without -ffast-math, which takes NaN for a number.
+// Driver, safety filter and observation of a bundle in plain C++17, once per cycle, with the standard library alone.
+// contract.hpp lies in the bundle. This is a third implementation of r2s/physics/safety_filter.py; a test compares them.
+// Compile it without -ffast-math, which breaks the tests for NaN.
 #pragma once
 #include <algorithm>
 #include <array>
@@ -16,6 +16,7 @@ using Vec = std::array<double, 3>;
 using Mat = std::array<double, 9>;  // row by row
 using Joints = std::array<double, n>;
 using Square = std::array<Joints, n>;
+using Command = std::array<double, c::actions>;
 
 inline Vec operator+(const Vec& a, const Vec& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
 inline Vec operator-(const Vec& a, const Vec& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
@@ -42,7 +43,8 @@ inline Mat turned(const double* axis, double angle) {  // Rodrigues
           d * x * y + s * z,       1 - d * (x * x + z * z),   d * y * z - s * x,
           d * x * z - s * y,       d * y * z + s * x,         1 - d * (x * x + y * y)};
 }
-inline bool finite(const Joints& x) {
+template <std::size_t size>
+bool finite(const std::array<double, size>& x) {
   return std::all_of(x.begin(), x.end(), [](double v) { return std::isfinite(v); });
 }
 
@@ -123,34 +125,41 @@ inline void solve(Square& a, Joints& b, int k) {
 
 class Driver {
  public:
-  enum Why { runs, silent, not_finite, outside };
+  enum Why { runs, silent, not_finite, outside, law_not_finite };
   Model model;
-  Joints effort{};  // Nm, the target as it has come through the low-pass
+  Joints effort{};  // Nm, the target torque after the low-pass
   Why why = runs;   // why the arm is being brought to rest
 
   explicit Driver(double soft_start_s = 0.0) : fade_(std::lround(soft_start_s / c::cycle_s)) {}
 
-  // Whether a motion that is being stopped is at rest, or has had its time.
+  // Whether a motion that is being stopped is at rest, or its time is over.
   bool done() const { return why != runs && (rests_ || damped_ * c::cycle_s >= c::damp_s); }
 
-  // The command of this cycle; target: null where the policy has said nothing. The model must have been placed at q.
-  Joints operator()(const Joints& q, const Joints& dq, const Joints& tau_J_d, const Joints* target) {
+  // The torque of this cycle; command: null without a new one. The model must be at q already.
+  Joints operator()(const Joints& q, const Joints& dq, const Joints& tau_J_d, const Command* command) {
     const bool seen = finite(q) && finite(dq);
-    silent_ = target && finite(*target) ? 0 : silent_ + 1;
-    if (!silent_)
-      for (int j = 0; j < n; ++j) target_[j] = std::clamp((*target)[j], -c::asked[j], c::asked[j]);
+    silent_ = command && finite(*command) ? 0 : silent_ + 1;
+    if (!silent_) command_ = *command, commanded_ = true;
     if (why == runs) why = reason(q, dq, seen);
-    damped_ += why != runs;
+    const bool stops = why != runs;
+    damped_ += stops;
     rests_ = seen;
     double fastest = 0.0;
     for (int j = 0; j < n; ++j) {
       rests_ = rests_ && std::abs(dq[j]) < c::still;
       fastest = std::max(fastest, std::abs(dq[j]) / c::most[j]);
     }
-    if (why != runs) {  // from the speed that there is, at once
+    if (stops) {  // brake from the present speed, at once
       target_ = {};
       if (seen && damped_ == 1) share_ = std::min(1.0, fastest);
       share_ = std::max(0.0, share_ - c::cycle_s / c::brake_s);
+    } else if (commanded_) {
+      Joints wanted;
+      c::control_law(q.data(), dq.data(), command_.data(), memory_.data(), wanted.data());
+      if (finite(wanted))
+        for (int j = 0; j < n; ++j) target_[j] = std::clamp(wanted[j], -c::asked[j], c::asked[j]);
+      else
+        why = law_not_finite, target_ = {};
     }
     ++cycle_;
     const double faded = cycle_ < fade_ ? static_cast<double>(cycle_) / fade_ : 1.0;
@@ -161,7 +170,7 @@ class Driver {
     const Joints last = finite(tau_J_d) ? tau_J_d : sent_;
     Joints out{};
     if (seen) out = guard(q, dq);
-    double part = 1.0;  // of the way from `last`, the same in all joints: what lies on it keeps to the law
+    double part = 1.0;  // of the way from `last`, the same in all joints: the safe torques are a convex set
     for (int j = 0; j < n && seen; ++j) {
       out[j] = std::clamp(out[j], -c::tau_max[j], c::tau_max[j]);
       part = std::min(part, c::step[j] / std::max(c::step[j], std::abs(out[j] - last[j])));
@@ -171,10 +180,12 @@ class Driver {
   }
 
  private:
+  Command command_{};
+  std::array<double, c::memories + 1> memory_{};  // C++ has no empty array
   Joints target_{}, filtered_{}, sent_{};
   double share_ = 1.0;
   long fade_, cycle_ = 0, silent_ = 0, damped_ = 0;
-  bool rests_ = false;
+  bool rests_ = false, commanded_ = false;
 
   static double stepped(double wanted, double last, int j) {
     return last + std::clamp(std::clamp(wanted, -c::tau_max[j], c::tau_max[j]) - last, -c::step[j], c::step[j]);
@@ -271,7 +282,7 @@ class Driver {
   }
 };
 
-// What the policy sees; the model must have been placed at q.
+// The policy's observation; the model must be at q already.
 inline std::array<float, c::observations> observe(const Driver& driver, const Joints& q, const Joints& dq,
                                                   const Vec& goal) {
   std::array<float, c::observations> out{};

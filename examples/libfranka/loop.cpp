@@ -1,10 +1,10 @@
-// A policy of `r2s export` on an arm of Franka Robotics: observation, ONNX Runtime, the driver's law, once per cycle.
+// A policy of `r2s export` on an arm of Franka Robotics: observation, ONNX Runtime, driver and safety filter, each cycle.
 //
 //   g++ -std=c++17 -O2 -I BUNDLE loop.cpp -lfranka -lonnxruntime -o loop
 //   python BUNDLE/r2s_runtime.py BUNDLE && ./loop 172.16.0.2 BUNDLE/policy.onnx 0.5 0.1 0.4
 //
 // The contract is compiled in (contract.hpp), so a program is of one bundle. r2s_runtime.py says whether the files of
-// the bundle are what was exported. Read docs/safety.md before the first motion: a hand on the stop, nobody in reach.
+// the bundle are what was exported. Read docs/explanation/safety.md before the first motion: a hand on the stop, nobody in reach.
 #include <franka/exception.h>
 #include <franka/robot.h>
 #include <onnxruntime_cxx_api.h>
@@ -32,20 +32,20 @@ class Policy {
     std::string joints;
     for (const char* name : contract::joints) joints += joints.empty() ? name : std::string(" ") + name;
     expect(memory, "joints", joints);
-    law::Joints target;
+    law::Command command;
     std::array<float, contract::observations> seen{};
-    (*this)(seen, target);  // the first call allocates
+    (*this)(seen, command);  // the first call allocates
   }
 
-  // Write the torque that the policy wants.
-  void operator()(std::array<float, contract::observations>& seen, law::Joints& target) {
+  // Write the policy's action, in SI units.
+  void operator()(std::array<float, contract::observations>& seen, law::Command& command) {
     const std::array<int64_t, 2> shape{1, contract::observations};
     const char* in[] = {"observation"};
-    const char* out[] = {"torque"};
+    const char* out[] = {contract::action};
     Ort::Value tensor = Ort::Value::CreateTensor<float>(memory_, seen.data(), seen.size(), shape.data(), shape.size());
     const auto result = session_.Run(Ort::RunOptions{nullptr}, in, &tensor, 1, out, 1);
-    const float* torque = result.front().GetTensorData<float>();
-    std::copy(torque, torque + law::n, target.begin());
+    const float* action = result.front().GetTensorData<float>();
+    std::copy(action, action + contract::actions, command.begin());
   }
 
  private:
@@ -55,7 +55,7 @@ class Policy {
 
   static Ort::SessionOptions one_thread() {
     Ort::SessionOptions options;
-    options.SetIntraOpNumThreads(1);  // others would be waited for
+    options.SetIntraOpNumThreads(1);  // no waiting for other threads
     return options;
   }
 
@@ -86,20 +86,20 @@ int main(int argc, char** argv) {
                                  " rad; move it to " + std::to_string(contract::start[j]) + " first");
     constexpr long every = contract::cycle_hz / contract::policy_hz;
     long cycle = 0;
-    law::Joints target{};
+    law::Command command{};
     const auto callback = [&](const franka::RobotState& state, franka::Duration) -> franka::Torques {
       driver.model.place(state.q);
-      // where the time is over nothing is said, and the driver brings the arm to rest
+      // without further commands the driver brings the arm to rest
       const bool asked = cycle % every == 0 && cycle < seconds * contract::cycle_hz;
       if (asked) {
         auto seen = law::observe(driver, state.q, state.dq, goal);
-        policy(seen, target);
+        policy(seen, command);
       }
       ++cycle;
-      const law::Joints tau = driver(state.q, state.dq, state.tau_J_d, asked ? &target : nullptr);
+      const law::Joints tau = driver(state.q, state.dq, state.tau_J_d, asked ? &command : nullptr);
       return driver.done() ? franka::MotionFinished(franka::Torques(tau)) : franka::Torques(tau);
     };
-    // the law limits the rate and has its low-pass: libfranka's own would come on top
+    // the driver has its own rate limit and low-pass, so libfranka's are off
     robot.control(callback, false, franka::kMaxCutoffFrequency);
     const law::Vec left = goal - driver.model.ee;
     std::printf("at rest after %.2f s, %.1f mm from the goal\n", 1e-3 * cycle, 1e3 * std::sqrt(law::dot(left, left)));

@@ -1,1 +1,1 @@
-"""What is estimated while an arm works: what it carries, how its friction drifts, when that changes."""
+"""Adaptation of a working arm: estimates of payload, friction and offsets, and torque corrections from them."""

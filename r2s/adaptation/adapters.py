@@ -1,96 +1,57 @@
-"""What conf/adapt names: adapters, made of what is known of an arm.
+"""Adapters of conf/adapt, made from what an identification knows of the arm.
 
-One of your own is a function of `Known` and its settings, or a class, that a yaml in conf/adapt names.
+To add one, write a function of `AdapterContext` and its settings, or a class, and name it in a yaml of conf/adapt.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
-from r2s.adaptation.believed import Believed, believed
-from r2s.adaptation.compensation import Compensation
-from r2s.adaptation.history import History
+from r2s.adaptation.arm_model import ArmModel, make_arm_model
+from r2s.adaptation.feedforward import Feedforward
 from r2s.adaptation.kalman import Noise
-from r2s.adaptation.listen import learn
-from r2s.adaptation.network_file import NETWORK, load_network
+from r2s.adaptation.model_correction import apply_correction
 from r2s.adaptation.observer import Observer
-from r2s.adaptation.refinement import refined
-from r2s.adaptation.telling import Latent, Telling
-from r2s.errors import UserError
+from r2s.adaptation.offline_estimation import fit_correction
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import hand
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
-class Known:
-    """What an identification says of an arm.
+class AdapterContext:
+    """Result of an identification, for the adapters of one arm.
 
     Attributes:
-        robot, dynamics: what is believed of it.
-        posterior: the space and draws of its parameters. unloaded: its two recordings of commanded torque, without a
-            payload. None where they are not there, as of `r2s.adaptation.listen.estimator`.
-        policy: run folder of the policy that the adapter works under; None: of none.
+        robot, dynamics: the identified arm.
+        posterior: space and draws of its parameters, None if no posterior is available.
+        unloaded: two recordings of commanded torque without a payload, None if not available.
     """
 
     robot: Robot
     dynamics: Dynamics
     posterior: tuple[ParameterSpace, np.ndarray] | None = None
     unloaded: tuple[Recording, Recording] | None = None
-    policy: Path | None = None
 
     @cached_property
-    def arm(self) -> Believed:
-        """The arm as arrays."""
-        return believed(self.robot, self.dynamics)
+    def arm(self) -> ArmModel:
+        """The identified arm as arrays."""
+        return make_arm_model(self.robot, self.dynamics)
 
     @cached_property
-    def learnt(self) -> tuple[Believed, Noise]:
-        """The arm with what motion without a payload says of it, and how wrong that may be."""
-        more, noise = learn(self.robot, self.dynamics, self.posterior, self.unloaded)
-        return refined(self.arm, more), noise
+    def corrected(self) -> tuple[ArmModel, Noise]:
+        """The arm with the model correction of its recordings, and the noise that remains."""
+        correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
+        return apply_correction(self.arm, correction), noise
 
 
-def observer(known: Known, filter_s: float) -> Observer:
-    """Return a disturbance observer: `adapt=observer`; raises UserError as of `Observer`."""
-    return Observer(known.arm, filter_s)
+def observer(context: AdapterContext, filter_s: float) -> Observer:
+    """Return a disturbance observer, `adapt=observer`; raises UserError if filter_s is not above 0."""
+    return Observer(context.arm, filter_s)
 
 
-def rls(known: Known) -> Compensation:
-    """Return compensation by the recursive estimate: `adapt=rls`."""
-    return Compensation(*known.learnt)
-
-
-def osi(known: Known) -> Telling:
-    """Return what tells a policy the recursive estimate: `adapt=osi`."""
-    place, axes = hand(known.robot)
-    mass, moments = known.dynamics.told[0], known.dynamics.told[1:]
-    return Telling(*known.learnt, np.concatenate([[mass], (moments - mass * place) @ axes]))
-
-
-def rma(known: Known, network: str | Path | None) -> Latent:
-    """Return what tells a policy a latent of the history: `adapt=rma`; network: None is that of the policy.
-
-    Raises:
-        UserError: `network` is no run folder of stage=train adapt=rma, or one of another policy, arm or model.
-    """
-    folder = Path(network or known.policy or "")
-    if not (folder / NETWORK).is_file():
-        raise UserError(f"network: '{folder}' is no run folder of stage=train adapt=rma")
-    return Latent(known.arm, load_network(folder / NETWORK, known.arm, known.policy))
-
-
-def history(known: Known, network: str | Path | None) -> History:
-    """Return a torque that was learnt from history: `adapt=history`.
-
-    Raises:
-        UserError: `network` is no run folder of stage=train adapt=history, or one for another arm or model.
-    """
-    path = Path(network or "") / NETWORK
-    if not network or not path.is_file():
-        raise UserError(f"network: '{network}' is no run folder of stage=train adapt=history")
-    return History(known.arm, load_network(path, known.arm))
+def rls(context: AdapterContext) -> Feedforward:
+    """Return the feedforward of the recursive estimate, `adapt=rls`."""
+    return Feedforward(*context.corrected)

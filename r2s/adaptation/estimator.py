@@ -1,153 +1,134 @@
-"""What an arm carries and how its friction and offsets drift, told while it works, with 95 % intervals.
+"""Payload, friction and offset estimate of a working arm, with 95 % intervals.
 
-    estimator = Estimator(robot, dynamics, noise)
+    estimator = Estimator(arm, noise)
     for each millisecond: estimator(state.q, state.dq, command)
     estimator.now
 
-A cycle takes some ten microseconds, every SPAN-th some forty, without what is told of it. The numbers of a payload
-are reported as a body that exists: mass, centre, and a second moment about it that is not negative (Wensing, Kim and
-Slotine, RA-L 3(1), 2018).
+A cycle takes about 15 us, the last cycle of a span about 50 us, without `now`. The payload is reported as a physical
+body: mass, centre, and a non-negative second moment about the centre (Wensing, Kim, Slotine, RA-L 3(1), 2018).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
-from r2s.adaptation.balance import Balance, Kept, observe
-from r2s.adaptation.believed import Believed
-from r2s.adaptation.kalman import JUMP, RESTS, THRESHOLD, Filter, Noise, T, jump, update
+from r2s.adaptation.arm_model import ArmModel
+from r2s.adaptation.kalman import AT_REST, Filter, Noise, update
 from r2s.adaptation.momentum import BODY
+from r2s.adaptation.momentum_residual import MomentumResidual, ResidualState, update_residual
+from r2s.adaptation.payload_jump import JUMP, MEAN, apply_jump
+from r2s.adaptation.tuning import FRICTION_CURVE, LEAST_KG, REPLACED, REST_SPANS, SETTLING_SPANS, THRESHOLD
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
 Z = 1.96  # standard deviations of a 95 % interval
-LEAST_KG = 0.02  # below that nobody asks where its centre is
-AFTER = round(0.5 / T)  # spans of motion after a rest, in which what is carried now and before are compared
-# squared distance that two estimates of one thing have once in an hour of tests; twice, as errors of a model last
-OTHER = 2.0 * chi2.isf(T / 3600.0, JUMP)
-CURVE = 0.02  # of friction: it changes by more than one share says, as its curve over speed is not what was believed
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known at one moment; intervals are half widths at 95 %.
+    """The estimate at one moment; `_half` marks half widths of 95 % intervals."""
 
-    Attributes:
-        t: s. mass: kg. mass_half: kg.
-        centre, centre_half: (3,) m in the hand's frame; nan where the mass may as well be none.
-        tensor: (3, 3) kg m^2 about the centre, of a body that exists.
-        friction, friction_half: (n,), of what was believed: 1 is as believed.
-        offset, offset_half: (n,) Nm, beyond what was believed.
-        rests: whether no joint moves. odds: log odds that the payload has just changed.
-        changed: whether that was said at this moment.
-    """
-
-    t: float
-    mass: float
+    t: float  # s
+    mass: float  # kg
     mass_half: float
-    centre: np.ndarray
+    centre: np.ndarray  # (3,) m in the payload frame; nan if the mass may as well be zero
     centre_half: np.ndarray
-    tensor: np.ndarray
-    friction: np.ndarray
+    tensor: np.ndarray  # (3, 3) kg m^2 about the centre, of a physical body
+    friction: np.ndarray  # (n,), relative to the model
     friction_half: np.ndarray
-    offset: np.ndarray
+    offset: np.ndarray  # (n,) Nm, beyond the model
     offset_half: np.ndarray
-    rests: bool
-    odds: float
-    changed: bool
+    rests: bool  # no joint slides
+    odds: float  # log odds of a payload change
+    changed: bool  # a payload change was detected at this moment
 
 
 class Estimator:
-    """The estimate of one arm, cycle by cycle.
+    """Recursive estimate of one arm, cycle by cycle.
 
     Attributes:
-        changes: s, when a payload was put on or taken off.
+        changes: s, times of detected payload changes.
 
     Args:
-        arm: what is believed of it. noise: how wrong that may be.
+        arm: model of the arm. noise: its uncertainty.
     """
 
-    def __init__(self, arm: Believed, noise: Noise):
+    def __init__(self, arm: ArmModel, noise: Noise):
         self._arm, self._noise, self._n = arm, noise, len(arm.level)
         self.changes: list[float] = []
         self._filter = Filter.fresh(noise)
         self._cycle, self._changed = 0, False
-        self._before = self._carried()
-        self._moved = 0  # spans since a rest, as far as they count
+        self._before = self._payload()
+        self._moved = 0  # spans since a rest, up to SETTLING_SPANS
         self._now: Estimate | None = None
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest: nothing is under way, what was learnt stays."""
-        self._kept, self._balance = Kept.fresh(self._n), Balance.empty(self._n)
+        """Begin a motion from rest; the estimate stays."""
+        self._state, self._residual = ResidualState.fresh(self._n), MomentumResidual.empty(self._n)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
-        """Take one cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether `now` is new.
+        """Process one cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether `now` is new.
+
+        A cycle with values that are not finite begins a motion anew.
 
         Raises:
-            UserError: they are not of n joints; values that are not finite are passed over.
+            UserError: the arrays have another number of joints.
         """
         if q.shape != (self._n,) or dq.shape != (self._n,) or tau.shape != (self._n,):
-            raise UserError(f"an estimate of {self._n} joints was given {q.shape}, {dq.shape} and {tau.shape}")
+            raise UserError(f"expected q, dq and tau of {self._n} joints, got {q.shape}, {dq.shape} and {tau.shape}")
         self._cycle += 1
         if not (np.isfinite(q).all() and np.isfinite(dq).all() and np.isfinite(tau).all()):
             self.begin()
             return False
-        b = self._balance
-        if not observe(self._arm, self._kept, q, dq, tau, b):
+        if not update_residual(self._arm, self._state, q, dq, tau, self._residual):
             return False
-        update(self._filter, self._noise, b)
-        jumped, other = bool(self._filter.odds[0] > THRESHOLD), self._is_other()
-        self._changed, self._now = jumped or other, None
+        update(self._filter, self._noise, self._residual)
+        jumped, replaced = bool(self._filter.log_odds[MEAN] > THRESHOLD), self._replaced_at_rest()
+        self._changed, self._now = jumped or replaced, None
         if self._changed:
             self.changes.append(self._cycle * SIM_DT)
-            self._moved = AFTER
+            self._moved = SETTLING_SPANS
         if jumped:
-            jump(self._filter, self._noise)
+            apply_jump(self._filter, self._noise)
         return True
 
-    def _carried(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass and first moments of what is carried (4,), and their covariance (4, 4)."""
+    def _payload(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the payload's mass and first moments (4,), and their covariance (4, 4)."""
         return self._filter.x[:JUMP].copy(), self._filter.P[:JUMP, :JUMP].copy()
 
-    def _is_other(self) -> bool:
-        """Say whether what is carried after a rest is not what it was before.
+    def _replaced_at_rest(self) -> bool:
+        """Return whether the payload after a rest differs from the one before.
 
-        A rest lets the estimate go, as anything may be put on unseen, so that no sudden change has to explain it.
+        The payload's variance grows at rest, so a change at rest needs no jump.
         """
-        if self._filter.counts[2] >= RESTS:
+        if self._filter.counts[AT_REST] >= REST_SPANS:
             self._moved = 0
             return False
-        if self._moved >= AFTER:
-            self._before = self._carried()
+        if self._moved >= SETTLING_SPANS:
+            self._before = self._payload()
             return False
         self._moved += 1
-        now, before = self._carried(), self._before
-        off = now[0] - before[0]
-        return bool(off @ np.linalg.solve(now[1] + before[1], off) > OTHER)
+        (x, P), (x_before, P_before) = self._payload(), self._before
+        off = x - x_before
+        return bool(off @ np.linalg.solve(P + P_before, off) > REPLACED)
 
     @property
     def now(self) -> Estimate:
-        """What is known at the end of the last span; made when it is asked for, as that takes longer than a cycle."""
+        """The estimate at the end of the last span; computed on demand, because it takes longer than a cycle."""
         if self._now is None:
-            self._now = self._told(self._changed)
+            self._now = self._report(self._changed)
         return self._now
 
     @property
-    def inside(self) -> tuple[Filter, Kept, Balance]:
-        """The filter, what is kept from cycle to cycle, and the last span's balance; not to be written."""
-        return self._filter, self._kept, self._balance
+    def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
+        """The filter, the residual's state and the last span's residual; read only."""
+        return self._filter, self._state, self._residual
 
-    @property
-    def innovations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The last span's innovations (n,) Nm, their variances (n,) Nm^2, and whether each joint slid (n,)."""
-        return self._filter.seen[0], self._filter.seen[1], self._balance.slides > 0
-
-    def _told(self, changed: bool) -> Estimate:
+    def _report(self, changed: bool) -> Estimate:
         x, P, n = self._filter.x, self._filter.P, self._n
         half = Z * np.sqrt(np.maximum(np.diag(P), 0.0))
-        mass, centre, tensor = body(x[:BODY])
+        mass, centre, tensor = nearest_body(x[:BODY])
         of_centre = np.column_stack([-centre, np.eye(3)]) / max(mass, LEAST_KG)
         spread = Z * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", of_centre, P[:4, :4], of_centre), 0.0))
         heavy = mass > max(half[0], LEAST_KG)
@@ -159,20 +140,20 @@ class Estimator:
             centre_half=spread if heavy else np.full(3, np.nan),
             tensor=tensor,
             friction=1.0 + x[BODY : BODY + n],
-            friction_half=np.hypot(half[BODY : BODY + n], Z * CURVE),
+            friction_half=np.hypot(half[BODY : BODY + n], Z * FRICTION_CURVE),
             offset=-(x[BODY + n : BODY + 2 * n]),
             offset_half=half[BODY + n : BODY + 2 * n],
-            rests=not (self._balance.slides > 0).any(),
-            odds=float(self._filter.odds[0]),
+            rests=not (self._residual.sliding > 0).any(),
+            odds=float(self._filter.log_odds[MEAN]),
             changed=changed,
         )
 
 
-def body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass kg, centre (3,) m and tensor (3, 3) kg m^2 about it of the nearest body that exists to x (10,).
+def nearest_body(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass kg, centre (3,) m and tensor (3, 3) kg m^2 about it of the physical body nearest to x (10,).
 
-    Mass and first moments are kept, which the data see well; the second moment about the centre is the nearest that
-    is not negative. Its pseudo-inertia [[Sigma, h], [h, m]] is then positive semi-definite.
+    Mass and first moments are kept, because data determine them well. The second moment about the centre becomes the
+    nearest one that is not negative, so the pseudo-inertia [[Sigma, h], [h, m]] is positive semi-definite.
     """
     m = float(x[0])
     if m <= 0.0:

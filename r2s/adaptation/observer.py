@@ -1,59 +1,60 @@
-"""A disturbance observer: what commands, friction and links do not explain is added, through one low-pass.
+"""Disturbance observer: the momentum residual, added to the policy's torque through a first-order low-pass.
 
-With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum tells the lacking torque d without
-accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006), here as
-a mean over three spans (balance.py), which a low-pass of first order follows: filter_s dd^/dt = d - d^. Commands go
-through the identified delay and lag first.
+With p = M(q) dq and dp/dt = tau + C^T dq - g - friction - d, generalised momentum gives the disturbance torque d
+without accelerations (De Luca and Mattone, ICRA 2003; De Luca, Albu-Schaeffer, Haddadin and Hirzinger, IROS 2006).
+Here d is the mean over three spans (momentum_residual.py), and the estimate d^ follows filter_s dd^/dt = d - d^.
+Commands pass the identified delay and lag first.
 
-A joint that does not slide all the time may be held by anything within its edges: d is somewhere between two bounds
-then, and d^ changes no more than it has to. So stiction is left to hold the arm, as the policy has learnt it.
+Stiction may carry any torque within breakaway while a joint does not slide all the time. d then lies between two
+bounds, and d^ changes as little as they allow: stiction holds the arm, as it did in the policy's training.
 """
 
 import numpy as np
 
-from r2s.adaptation.balance import Balance, Kept, observe
-from r2s.adaptation.believed import Believed
+from r2s.adaptation.arm_model import ArmModel
+from r2s.adaptation.momentum_residual import MomentumResidual, ResidualState, update_residual
 from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.physics.robot import SIM_DT
 
 
 class Observer:
-    """The `Adapter` that adds all that is lacking, whatever its cause.
+    """The `Adapter` that adds the whole disturbance torque, whatever its cause.
 
     Args:
-        arm: what is believed of it. filter_s: s, the constant of the low-pass.
+        arm: identified model. filter_s: s, time constant of the low-pass.
 
     Raises:
-        UserError: a constant that is not above 0.
+        UserError: filter_s is not above 0.
     """
 
-    def __init__(self, arm: Believed, filter_s: float):
+    def __init__(self, arm: ArmModel, filter_s: float):
         check_number("filter_s", filter_s, "(0, inf)")
         self._arm, self._share = arm, -np.expm1(-SIM_DT / filter_s)
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest: nothing lacks."""
+        """Begin a motion from rest with a disturbance of zero."""
         n = len(self._arm.level)
-        self._kept, self._balance = Kept.fresh(n), Balance.empty(n)
-        self._aim, self._lacks = np.zeros(n), np.zeros(n)
+        self._state, self._residual = ResidualState.fresh(n), MomentumResidual.empty(n)
+        self._disturbance = np.zeros((2, n))  # of the last span, and low-passed
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Hear a cycle and return (n,) Nm to add; arguments as of `Adapter`."""
-        _hear(self._arm, self._kept, self._balance, q, dq, tau, self._share, self._aim, self._lacks)
-        return self._lacks
+        """Process a cycle and return (n,) Nm to add; see `Adapter`."""
+        _observe(self._arm, self._state, self._residual, q, dq, tau, self._share, self._disturbance)
+        return self._disturbance[1]
 
 
 @njit(cache=True, error_model="numpy")
-def _hear(arm, kept, balance, q, dq, tau, share, aim, lacks):
-    """Take one cycle into `lacks` (n,) Nm; aim: (n,) Nm, what the last span said of it."""
-    n = len(q)
-    if observe(arm, kept, q, dq, tau, balance):
-        for j in range(n):
-            aim[j] = balance.y[j]
-            if balance.slides[j] == 0.0:
-                free, edge = balance.y[j] + balance.rub[j], max(arm.edge[j], abs(balance.rub[j]))
-                aim[j] = min(max(lacks[j], free - edge), free + edge)
-    for j in range(n):
-        lacks[j] += share * (aim[j] - lacks[j])
+def _observe(arm, state, residual, q, dq, tau, share, disturbance):
+    """Process a cycle into disturbance (2, n) Nm: of the last span, and low-passed by `share` of the difference."""
+    measured, filtered = disturbance[0], disturbance[1]
+    if update_residual(arm, state, q, dq, tau, residual):
+        for j in range(len(q)):
+            measured[j] = residual.y[j]
+            if residual.sliding[j] == 0.0:  # stiction bounds the disturbance: take the nearest to `filtered`
+                total = residual.y[j] + residual.friction[j]
+                breakaway = max(arm.breakaway[j], abs(residual.friction[j]))
+                measured[j] = min(max(filtered[j], total - breakaway), total + breakaway)
+    for j in range(len(q)):
+        filtered[j] += share * (measured[j] - filtered[j])

@@ -1,1 +1,1 @@
-"""The arm itself or its twin behind one interface, the driver between policy and arm, and the real clients."""
+"""Arms behind one interface: driver, policy runners, recorder, hidden twins, and clients of real arms."""

@@ -1,6 +1,6 @@
-"""Ramp the torque of one joint after the other, both ways, until it moves: the paper's breakaway protocol.
+"""The paper's breakaway protocol: ramp the torque of one joint after the other, both ways, until it moves.
 
-It runs on any arm behind the arm interface; r2s/identification/breakaway.py makes torques of what it records.
+It runs on any `Arm`; r2s/identification/breakaway.py estimates breakaway torques from the recording.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,45 +9,49 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 
-from r2s.arm.driven import Driven
+from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState
 from r2s.errors import UserError
+from r2s.excitation.motion_checks import TABLE_M, TOOL_M, Space
 from r2s.excitation.paths import approach
-from r2s.excitation.safety import TABLE_M, TOOL_M, Space
-from r2s.identification.breakaway import MOVED
+from r2s.identification.friction.breakaway import MOVED
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-BIG = 40.0  # Nm of tau_max: joints with so much inertia that they move late, and are to be ramped slowly
-KEPT = 5  # cycles recorded after the joint has moved
-QUIET = 10  # cycles of letting go, as many at rest before each ramp, and of each mean that a speed is told from
-BANDWIDTH = 20.0  # rad/s, three poles of the stop: well damped with 5 ms of delay and 3 of lag
-DAMPED = 20  # cycles of a stop without spring, which would bring back, slowly, what a joint goes until it stops
-BRAKE_S, STOPS = 1.0, 4  # after which the next ramp comes whatever the arm does
-SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3  # rad/s: to let go, of the joint to be ramped next, after letting go
-STRAY = 0.05  # rad: a joint that goes so far in a ramp ends it, whichever it is; so far off, the arm is placed anew
-MARGIN = 0.15  # rad that a pose keeps from the position limits: no joint gets there in one ramp
-BRAKE_SHARE = 0.1  # of tau_max: so little that the rate limit never adds to the delay of the stop
-UNFILTERED_HZ = 1e30  # of the driver's low-pass: a ramp has no steps, and joints at rest are to have no command
-LARGEST = 0.2  # of tau_max, at which a ramp gives up by default
+# The ramp
+SLOW_TAU_MAX = 40.0  # Nm: joints of at least this tau_max have a large inertia, move late, and get a slower ramp
+SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; light links reach visible motion within ms at 4 Nm/s
+MAX_SHARE = 0.2  # of tau_max, default torque at which a ramp gives up
+AFTER_MOTION = 5  # cycles recorded after the joint has moved
+STRAY = 0.05  # rad: a joint that moves so far ends the ramp; an arm so far from its pose is placed anew
+POSE_MARGIN = 0.15  # rad inside the position limits, which no joint crosses in one ramp
+UNFILTERED_HZ = 1e30  # cutoff of the driver's low-pass: a ramp has no steps, and resting joints need a command of 0
+# The stop after a ramp: each joint brakes with three equal real poles, then its torque is released
+BANDWIDTH = 20.0  # rad/s, of the poles: well damped with 5 ms of delay and 3 ms of lag
+DAMPED_CYCLES = 20  # without the spring, which would slowly pull a joint back to where braking began
+BRAKE_SHARE = 0.1  # of tau_max: small enough that the rate limit adds no delay
+BRAKE_S, STOP_ATTEMPTS = 1.0, 4  # longest braking, and attempts before the next ramp starts anyway
+RELEASE_CYCLES = 10  # of release, of rest before a ramp, and of each mean from which a speed is computed
+# rad/s, largest mean speed: to release the torque, of the next ramp's joint, and after the release
+SLOW, STILL, SLIDING = 7e-3, 3e-3, 12e-3
 
 
 def poses_about(robot: Robot, count: int) -> np.ndarray:
-    """Return (count, n) rad: postures at and about home, a turn of 0.3 rad of every joint apart."""
-    turn = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
-    poses = robot.q_home + np.arange(count)[:, None] * turn
+    """Return (count, n) rad: home, and postures that differ by 0.3 rad in every joint."""
+    change = np.where(np.arange(robot.n) % 2, -0.3, 0.3)
+    poses = robot.q_home + np.arange(count)[:, None] * change
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
 
 
-def check_ways(
+def check_paths(
     robot: Robot, poses: np.ndarray, *, what: str = "ramp.poses", table: float = TABLE_M, z_min: float = TOOL_M
 ) -> None:
-    """Raise UserError where from home, or from the pose before, there is no way to one of the poses (P, n) rad."""
+    """Raise UserError if no path leads from home to the first pose of (P, n) rad, or from a pose to the next."""
     space = Space(robot, table=table, z_min=z_min)
     for k, (a, b) in enumerate(pairwise([robot.q_home, *poses]), 1):
-        approach(robot, a, b, what=f"{what}: the way to pose {k}", space=space)
+        approach(robot, a, b, what=f"{what}: the path to pose {k}", space=space)
 
 
 def ramp(
@@ -61,49 +65,50 @@ def ramp(
     z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
 ) -> Ramps:
-    """Ramp every joint both ways at every pose and return one trajectory for each ramp.
+    """Ramp every joint both ways at every pose and return one trajectory per ramp.
 
-    A ramp is a short rest without command, then a command of one joint that rises from 0 at `rate`, the others at
-    0, until the joint is `moved` away (or the command is `largest`, or another joint strays). Then all joints are
-    stopped, and let go once at rest; that is not recorded. Rows are as in `r2s.arm.tracking`: the state read in a
-    cycle and the command sent in it. A joint that slides without command, because what gravity compensation leaves
-    is more than its friction holds, rests and is ramped from the command that stopped it instead.
+    A ramp is a short rest without command, then a command of one joint that rises from 0 at `rate`, the others at 0,
+    until the joint has moved by `moved` (or the command reaches `largest`, or another joint strays). The stop after
+    each ramp is not recorded. Rows are as in `r2s.arm.recorder`: the state and the command of one cycle. If gravity
+    compensation leaves more torque than friction holds, a joint slides without command. It then rests at
+    the command that stopped it, and its ramp starts there.
 
     Args:
-        arm: moved to each pose, and stopped at the end whatever happens.
-        poses: (P, n) rad, at least 0.15 rad inside the position limits, and away from table and arm, as the ways
-            to them are (r2s/excitation/paths.py), or nothing moves.
-        rate: (n,) or one, Nm/s; 2.2 for joints of tau_max from 40 Nm, 4 below, where light links are seen to move
-            within milliseconds; in proportion to tau_max below 12 Nm.
-        largest: (n,) or one, Nm, at which a ramp gives up; 20 % of tau_max.
-        moved: rad, well beyond what bristles bend before they let go.
-        table, z_min: m, as in `r2s.excitation.safety.check_motion`.
-        progress: called after every ramp with (ramps done, ramps in all).
+        arm: moved to each pose, and always stopped at the end.
+        poses: (P, n) rad, at least 0.15 rad inside the position limits; poses and the paths between them
+            (r2s/excitation/paths.py) must be clear of table and arm, otherwise nothing moves.
+        rate: (n,) or one number, Nm/s; default 2.2 for joints of tau_max from 40 Nm, 4 below, and in proportion to
+            tau_max below 12 Nm.
+        largest: (n,) or one number, Nm, at which a ramp gives up; default 20 % of tau_max.
+        moved: rad, well beyond the presliding displacement.
+        table, z_min: m, see `r2s.excitation.motion_checks.check_motion`.
+        progress: called after every ramp with (ramps done, total).
 
     Raises:
-        ArmStopped: the arm ended the motion, or the driver did; nothing is returned of it.
-        UserError: an argument out of range, or no way to a pose.
+        ArmStopped: the arm or the driver ended the motion; no recording is returned.
+        UserError: an argument is out of range, or a pose has no path.
     """
     robot = arm.robot
     places = _poses(robot, poses)
-    check_ways(robot, places, table=table, z_min=z_min)
+    check_paths(robot, places, table=table, z_min=z_min)
     small = np.minimum(1.0, robot.tau_max / 12)
-    rising = _positive("rate", rate, np.where(robot.tau_max >= BIG, 2.2, 4.0 * small), 0.1 * robot.dtau_max)
-    limit = _positive("largest", largest, LARGEST * robot.tau_max, robot.tau_max)
+    default = np.where(robot.tau_max >= SLOW_TAU_MAX, SLOW_RATE, FAST_RATE * small)
+    rising = _positive("rate", rate, default, 0.1 * robot.dtau_max)
+    limit = _positive("largest", largest, MAX_SHARE * robot.tau_max, robot.tau_max)
     if not 1e-4 <= moved <= 0.02:
-        raise UserError(f"ramp.moved={moved} rad, allowed 0.0001 to 0.02")
-    # a joint rests while the others are ramped one way, before its turn comes the other way
+        raise UserError(f"ramp.moved: {moved} rad; allowed: 0.0001 to 0.02")
+    # all joints one way, then all the other way: each rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
-    most = limit + BRAKE_SHARE * robot.tau_max  # an arm that slides is ramped from the command that held it
-    most = np.minimum(most, robot.tau_max)  # which friction may hold, as far as one knows
-    drive, recorded = _Drive(Driven(arm, Driver(robot, most, 2 * most, cutoff_hz=UNFILTERED_HZ))), []
+    # the ramp of a sliding joint starts at the command that holds it; friction is unknown, this bounds it
+    most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
+    drive, recorded = _Drive(CommandLoop(arm, Driver(robot, most, 2 * most, cutoff_hz=UNFILTERED_HZ))), []
     try:
         for place in places:
             drive.place(place)
             for i, (j, sign) in enumerate(each):
                 recorded.append(drive.push(j, sign * rising[j], limit[j], moved))
-                drive.stop(coming=each[(i + 1) % len(each)][0])
+                drive.stop(next_joint=each[(i + 1) % len(each)][0])
                 if np.abs(drive.state.q - place).max() > STRAY:
                     drive.end()
                     drive.place(place)
@@ -112,117 +117,121 @@ def ramp(
             drive.end()
     finally:
         drive.end()
-    t, q, dq, tau = (np.concatenate([np.array([row[i] for row in rows]) for rows in recorded]) for i in range(4))
-    trajectory = np.repeat(np.arange(len(which)), [len(rows) for rows in recorded])
-    motion = Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=trajectory, name=robot.name)
     pose, joint, sign = np.array(which).T
-    return Ramps(motion, joint, sign, pose)
+    return Ramps(_recording(recorded, robot.name), joint, sign, pose)
+
+
+def _recording(ramps: list[list], name: str) -> Recording:
+    t, q, dq, tau = (np.concatenate([np.array([row[i] for row in rows]) for rows in ramps]) for i in range(4))
+    trajectory = np.repeat(np.arange(len(ramps)), [len(rows) for rows in ramps])
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=trajectory, name=name)
 
 
 class _Drive:
     """An arm at a pose, cycle by cycle.
 
-    `rows` holds t, q, dq and command of every cycle since it was emptied, `base` (n,) Nm the command to rest with,
-    `held` (n,) Nm what kept the arm from sliding in the last stop.
+    Attributes:
+        rows: t, q, dq and command of every cycle since the list was emptied.
+        base: (n,) Nm, the command at rest. held: (n,) Nm, mean command that held the arm in the last stop.
     """
 
-    def __init__(self, driven: Driven):
-        robot = driven.arm.robot
-        self._driven, self._tau_max = driven, robot.tau_max
+    def __init__(self, loop: CommandLoop):
+        robot = loop.arm.robot
+        self._loop, self._tau_max = loop, robot.tau_max
         self.rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
         self._model = robot.model(gravity=False)
         self._mass = np.zeros((robot.n, robot.n))
 
     @property
     def state(self) -> ArmState:
-        """What was read last."""
-        return self._driven.state
+        """The latest state."""
+        return self._loop.state
 
     def end(self) -> None:
         """Stop the arm."""
-        self._driven.end()
+        self._loop.end()
 
     def place(self, q: np.ndarray) -> None:
-        """Bring the arm to q (n,) rad and let it go there."""
+        """Bring the arm to q (n,) rad and release it there."""
         data = mujoco.MjData(self._model)
         data.qpos[:] = q
         mujoco.mj_forward(self._model, data)
         mujoco.mj_fullM(self._model, data, self._mass)
-        self._driven.place(q)
+        self._loop.place(q)
         self.held, self.base = np.zeros(len(q)), np.zeros(len(q))
         if not self.rest().all():
-            self.stop(coming=0)
+            self.stop(next_joint=0)
 
     def send(self, tau: np.ndarray) -> ArmState:
-        """Ask for tau (n,) Nm in this cycle, and return the state after it; `rows` has what the driver made of it."""
+        """Run one cycle with the target tau (n,) Nm and return the state after it; `rows` gets the command sent."""
         s = self.state
-        after = self._driven(tau)
-        self.rows.append((s.t, s.q, s.dq, self._driven.sent))
+        after = self._loop(tau)
+        self.rows.append((s.t, s.q, s.dq, self._loop.sent))
         return after
 
     def push(self, joint: int, rate: float, largest: float, moved: float) -> list:
-        """Ramp one joint at `rate` Nm/s (signed); return all rows since the arm was let go."""
-        tau, start, left = self.base.copy(), self.rows[0][1], KEPT
+        """Ramp one joint at `rate` Nm/s (signed); return all rows since the release."""
+        tau, start, left = self.base.copy(), self.rows[0][1], AFTER_MOTION
         while left and abs(tau[joint]) < largest:
-            away = np.abs(self.send(tau).q - start)
-            if left < KEPT or away[joint] >= moved or away.max() > STRAY:
+            distance = np.abs(self.send(tau).q - start)
+            if left < AFTER_MOTION or distance[joint] >= moved or distance.max() > STRAY:
                 left -= 1
             tau[joint] += rate * SIM_DT
         return self.rows
 
-    def stop(self, coming: int) -> None:
-        """Stop all joints and let them go, again where one slides on; `coming` is to be quieter than the others."""
-        for attempt in range(STOPS):
-            self._brake(coming)
+    def stop(self, next_joint: int) -> None:
+        """Brake all joints and release them, repeatedly if one slides on; `next_joint` must rest best."""
+        for attempt in range(STOP_ATTEMPTS):
+            self._brake(next_joint)
             last = self.state.tau_J_d
-            for k in range(QUIET):
-                self.send(self.base + (last - self.base) * (1 - (k + 1) / QUIET))
+            for k in range(RELEASE_CYCLES):
+                self.send(self.base + (last - self.base) * (1 - (k + 1) / RELEASE_CYCLES))
             still = self.rest()
             if still.all():
                 return
-            if attempt:  # once, it may be bristles that spring back
+            if attempt:  # the first time it may be bristles that spring back
                 self.base = np.where(still, self.base, self.held)
 
     def rest(self) -> np.ndarray:
-        """Send what the arm should rest with, for the first cycles of new rows; return which joints do, (n,)."""
+        """Send `base` for the first cycles of new rows; return which joints rest, (n,)."""
         self.rows = []
-        for _ in range(QUIET):
+        for _ in range(RELEASE_CYCLES):
             self.send(self.base)
-        return self._speed(QUIET // 2) < SLIDING
+        return self._speed(RELEASE_CYCLES // 2) < SLIDING
 
     def _speed(self, cycles: int) -> np.ndarray:
-        """Return (n,) rad/s, from the means of so many cycles and of as many before."""
+        """Return (n,) rad/s, from the mean angles of the last `cycles` and of as many before."""
         q = np.array([row[1] for row in self.rows[-2 * cycles :]]).reshape(2, cycles, -1).mean(1)
         return np.abs(q[1] - q[0]) / (cycles * SIM_DT)
 
-    def _brake(self, coming: int) -> None:
-        """Bring all joints to rest where they are."""
+    def _brake(self, next_joint: int) -> None:
+        """Bring all joints to rest at their present angles (PID with three equal poles)."""
         self.rows = []
-        q, total, w = self.state.q, np.zeros(len(self._tau_max)), BANDWIDTH
-        most = BRAKE_SHARE * self._tau_max
+        q, integral, w = self.state.q, np.zeros(len(self._tau_max)), BANDWIDTH
+        limit = BRAKE_SHARE * self._tau_max
         for k in range(round(BRAKE_S / SIM_DT)):
-            if k <= DAMPED:
+            if k <= DAMPED_CYCLES:
                 q = self.state.q
-            lag = q - self.state.q
-            total += lag * SIM_DT
-            pull = self.held + self._mass @ (w**3 * total + 3 * w**2 * lag - 3 * w * self.state.dq)
-            self.send(np.clip(pull, -most, most))
-            if k % QUIET == 0 and k >= DAMPED + QUIET:
-                speed = self._speed(QUIET)
-                if speed.max() < SLOW and speed[coming] < STILL:
+            error = q - self.state.q
+            integral += error * SIM_DT
+            tau = self.held + self._mass @ (w**3 * integral + 3 * w**2 * error - 3 * w * self.state.dq)
+            self.send(np.clip(tau, -limit, limit))
+            if k % RELEASE_CYCLES == 0 and k >= DAMPED_CYCLES + RELEASE_CYCLES:
+                speed = self._speed(RELEASE_CYCLES)
+                if speed.max() < SLOW and speed[next_joint] < STILL:
                     break
-        self.held = np.mean([row[3] for row in self.rows[-QUIET:]], axis=0)
+        self.held = np.mean([row[3] for row in self.rows[-RELEASE_CYCLES:]], axis=0)
 
 
 def _poses(robot: Robot, poses: np.ndarray | Sequence[Sequence[float]]) -> np.ndarray:
-    """Return (P, n) rad if every pose keeps away from the limits."""
+    """Return (P, n) rad if every pose keeps its distance from the limits."""
     try:
         places = np.atleast_2d(np.array(poses, dtype=float))
     except (TypeError, ValueError):
-        raise UserError(f"ramp.poses are not rows of {robot.n} joint angles") from None
+        raise UserError(f"ramp.poses: expected rows of {robot.n} joint angles") from None
     if places.ndim != 2 or not len(places) or places.shape[1] != robot.n:
-        raise UserError(f"ramp.poses have shape {places.shape}; {robot.name} has {robot.n} joints")
-    low, high = robot.q_min + MARGIN, robot.q_max - MARGIN
+        raise UserError(f"ramp.poses: expected {robot.n} joints, got shape {places.shape} ({robot.name})")
+    low, high = robot.q_min + POSE_MARGIN, robot.q_max - POSE_MARGIN
     bad = np.argwhere(~((places >= low) & (places <= high)))
     if len(bad):
         p, i = bad[0]

@@ -5,22 +5,22 @@ import numpy as np
 from r2s.arm.interface import ArmState, Reflexes
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import Payload, loaded
+from r2s.physics.payload import Payload, dynamics_with_payload
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.simulator import Simulator
 
 
 class SimulatedArm:
-    """MuJoCo with the friction law of r2s/physics/friction.py, for identification against a known truth.
+    """MuJoCo with the friction model of r2s/physics/friction.py, for identification against a known truth.
 
     Attributes:
-        external: (n,) Nm, with which the world pushes the joints in the next cycle; zero by default.
+        external: (n,) Nm, external joint torque from the next cycle on; zero by default.
 
     Args:
-        robot, dynamics: the arm and its truth.
-        position_noise, velocity_noise: standard deviation of q, rad, and dq, rad/s, white.
+        robot, dynamics: the arm and its true dynamics.
+        position_noise, velocity_noise: standard deviations of white noise on q, rad, and dq, rad/s.
         seed: of the noise.
-        payload: what is in the hand, and when. load: what the arm's gravity compensation was told of it.
+        payload: the carried body and when it is carried. declared_payload: what gravity compensation assumes of it.
     """
 
     def __init__(
@@ -32,12 +32,13 @@ class SimulatedArm:
         velocity_noise: float,
         seed: int = 0,
         payload: Payload | None = None,
-        load: Payload | None = None,
+        declared_payload: Payload | None = None,
     ):
         self.robot = robot
-        bare, full = loaded(robot, dynamics, None, load), loaded(robot, dynamics, payload, load)
-        self._payload, self._holds, self._hands = payload, False, {False: bare, True: full}
-        self._sim = Simulator(robot, bare, 1, 1)
+        without = dynamics_with_payload(robot, dynamics, None, declared_payload)
+        self._dynamics = {False: without, True: dynamics_with_payload(robot, dynamics, payload, declared_payload)}
+        self._payload, self._carries = payload, False
+        self._sim = Simulator(robot, without, 1, 1)
         self._motors = Motors(1, robot.n, dynamics.delay, dynamics.lag)
         self._noise = position_noise, velocity_noise
         self._rng = np.random.default_rng(seed)
@@ -47,11 +48,11 @@ class SimulatedArm:
         self._state = self.move_to(robot.q_home)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; the clock starts again."""
+        """Place the arm at rest at q (n,) rad; the clock restarts."""
         self._sim.reset(np.asarray(q, dtype=float)[None], np.zeros((1, self.robot.n)))
         self._motors.reset()
         self._cycle, self._last = 0, np.zeros(self.robot.n)
-        self._grasp()
+        self._update_payload()
         return self._sense()
 
     def read(self) -> ArmState:
@@ -59,9 +60,9 @@ class SimulatedArm:
         return self._state
 
     def command(self, tau: np.ndarray) -> None:
-        """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as the real arm's reflexes would."""
+        """Apply tau (n,) Nm, without gravity, for 1 ms; raises ArmStopped as a real arm's reflexes would."""
         self._reflexes.command(tau, self._last)
-        self._grasp()
+        self._update_payload()
         self._last = np.array(tau, dtype=float)
         self._sim.rollout(self._motors(self._last[None, None]) + self.external)
         self._reflexes.state(self._sim.q[0], self._sim.dq[0])
@@ -69,23 +70,23 @@ class SimulatedArm:
         self._sense()
 
     def stop(self) -> None:
-        """End the motion: the arm stands where it is, without command."""
+        """End the motion: the arm rests at its posture, without command."""
         self._sim.reset(self._sim.q.copy(), np.zeros((1, self.robot.n)))
         self._motors.reset()
         self._last = np.zeros(self.robot.n)
         self._sense()
 
-    def _grasp(self) -> None:
-        """Put the payload on or take it off where it is time."""
-        now = self._payload is not None and bool(self._payload.there(self._cycle * SIM_DT))
-        if now != self._holds:
-            self._sim.set_dynamics(self._hands[now])
-            self._holds = now
+    def _update_payload(self) -> None:
+        """Attach or detach the payload at its time."""
+        now = self._payload is not None and bool(self._payload.attached(self._cycle * SIM_DT))
+        if now != self._carries:
+            self._sim.set_dynamics(self._dynamics[now])
+            self._carries = now
 
     def _sense(self) -> ArmState:
         n = self.robot.n
         q = self._sim.q[0] + self._noise[0] * self._rng.normal(size=n)
         dq = self._sim.dq[0] + self._noise[1] * self._rng.normal(size=n)
-        # gravity is not simulated here, so this "sensor" has only what the command says: do not record it as measured
+        # the simulation excludes gravity, so this tau_J only equals the command: do not record it as 'measured'
         self._state = ArmState(t=self._cycle * SIM_DT, q=q, dq=dq, tau_J=self._last.copy(), tau_J_d=self._last.copy())
         return self._state

@@ -1,1 +1,1 @@
-"""Other physics engines than the one trained in, behind one small interface."""
+"""Physics engines other than the training engine, behind one small interface."""

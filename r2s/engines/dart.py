@@ -1,7 +1,7 @@
-"""The arm in DART, set up as Gazebo's physics plugin does: the second engine of Sim2Sim, the twin's body.
+"""The arm in DART with the settings of Gazebo's physics plugin: second engine of Sim2Sim, engine of the rigid twin.
 
-Semi-implicit Euler, joint damping implicit, position limits hard, Coulomb friction exact. With the settings
-below DART and Gazebo's own plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
+Semi-implicit Euler, implicit joint damping, hard position limits, exact Coulomb friction. With the settings below
+DART and Gazebo's plugin agree to round-off, and both agree with MuJoCo to 1e-15 rad over 0.1 s.
 """
 
 from collections.abc import Callable
@@ -21,17 +21,16 @@ class DartEngine:
     """One arm without contacts. A command lasts one step and is clipped to the torque limits.
 
     Args:
-        robot: the arm; its MJCF is the one description of kinematics, inertia, damping and limits.
+        robot: the arm; its MJCF defines kinematics, inertia, damping and limits.
         gravity: False is libfranka's convention (the arm compensates it).
-        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in
-            link axes; each replaces the file's values for the n moving links.
-        armature: (n,) kg m^2 of the joints, in place of the file's.
+        masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
+            axes; each replaces the MJCF's values of the n moving links.
+        armature: (n,) kg m^2 of the joints, replaces the MJCF's.
         dt: time step, s.
-        stop_margin: rad, how far outside the position limits the hard stops are.
+        stop_margin: rad, distance of the hard stops outside the position limits.
 
-    Velocity limits are left to whoever watches the arm: MuJoCo has none, and an engine that silently enforces
-    them hides that a policy breaks them.
-
+    The engine does not enforce velocity limits: MuJoCo has none either, and enforcing them would hide that a policy
+    violates them.
     """
 
     def __init__(
@@ -53,8 +52,8 @@ class DartEngine:
         links = Bodies(model)
         links.override(bodies, shaped("masses", masses, (n,)), shaped("coms", coms, (n, 3)), inertias, n)
         self.robot = robot
-        # DART has no armature. Damping A/h with the torque (A/h) v put back is the same thing exactly: the
-        # implicit step solves (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
+        # DART has no armature A. Damping A/h plus the torque (A/h) v is exactly equivalent: the implicit step solves
+        # (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
         self._armature = np.array(robot.armature if armature is None else armature, dtype=float)
         self._damping = model.dof_damping + self._armature / dt
         self._counter = self._armature / dt if self._armature.any() else None
@@ -70,7 +69,7 @@ class DartEngine:
         site = model.site(robot.ee_site).id
         anchor, pose = links.moving_parent(model.site_bodyid[site])
         if anchor != bodies[-1]:
-            raise UserError(f"robot.ee: '{robot.ee_site}' does not sit on the arm's last link")
+            raise UserError(f"robot.ee: expected a site on the arm's last link, got '{robot.ee_site}'")
         self._tip, self._links, self._last = parent, links, int(bodies[-1])
         self._ee = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
         self._world = dart.simulation.World()
@@ -83,9 +82,9 @@ class DartEngine:
         body = int(model.jnt_bodyid[i])
         anchor, pose = links.moving_parent(model.body_parentid[body])
         if parent is None and anchor != 0:
-            raise UserError(f"robot.mjcf: link '{model.body(body).name}' does not hang on a fixed base")
+            raise UserError(f"robot.mjcf: link '{model.body(body).name}' has no fixed base")
         to_joint = make_pose(model.jnt_pos[i], None)
-        zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))  # the file's pose is the one at qpos0
+        zero = make_pose(None, about(model.jnt_axis[i], -model.qpos0[i]))  # the MJCF's pose is at qpos0
         properties = dart.dynamics.RevoluteJointProperties()
         properties.mName = model.joint(i).name or f"joint{i + 1}"
         properties.mAxis = model.jnt_axis[i]
@@ -101,17 +100,17 @@ class DartEngine:
         joint.setCoulombFriction(0, float(model.dof_frictionloss[i]))
         joint.setSpringStiffness(0, float(model.jnt_stiffness[i]))
         joint.setRestPosition(0, float(model.qpos_spring[i]))
-        joint.setLimitEnforcement(True)  # dartpy leaves it off
+        joint.setLimitEnforcement(True)  # off by default in dartpy
         return joint, link
 
     def relink(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        """Give the last link another mass kg, centre (3,) m and tensor about it (3, 3) kg m^2, now; it moves on."""
+        """Replace the last link's mass kg, centre (3,) m and tensor about it (3, 3) kg m^2; its motion continues."""
         at = self._last
         self._links.mass[at], self._links.com[at], self._links.inertia[at] = mass, com, inertia
         self._tip.setInertia(_dartpy().dynamics.Inertia(*self._links.lumped(at)))
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Put the arm at q, dq (n,) rad, rad/s."""
+        """Set q, dq (n,) rad, rad/s."""
         self._skeleton.resetCommands()
         self._skeleton.clearInternalForces()
         self._skeleton.setPositions(q)
@@ -124,9 +123,8 @@ class DartEngine:
 
         Args:
             tau: (n,) Nm, the command; clipped to the torque limits.
-            passive: (n,) Nm, a joint torque that no limit clips: friction, offsets.
-            damping: (n,) Nm s/rad, implicit damping for this step, beside the file's.
-
+            passive: (n,) Nm, joint torque that is not clipped: friction, offsets.
+            damping: (n,) Nm s/rad, implicit damping of this step in addition to the MJCF's.
         """
         drive = np.minimum(np.maximum(tau, self._low), self._high)
         if passive is not None:
@@ -141,20 +139,20 @@ class DartEngine:
         return self._skeleton.getPositions(), self._skeleton.getVelocities()
 
     def ee(self) -> np.ndarray:
-        """Return (3,) m, the end effector in the base frame."""
+        """Return the end effector's position (3,) m in the base frame."""
         pose = self._tip.getWorldTransform()
         return pose.rotation() @ self._ee + pose.translation()
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return (n, n) kg m^2 at q (n,), armature included; the arm stays where it is."""
+        """Return the mass matrix (n, n) kg m^2 with armature at q (n,); the arm's state does not change."""
         return self._at(q, self._skeleton.getMassMatrix) + np.diag(self._armature)
 
     def gravity_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that holds the arm against gravity at q (n,); the arm stays where it is."""
+        """Return (n,) Nm that holds the arm against gravity at q (n,); the arm's state does not change."""
         return self._at(q, self._skeleton.getGravityForces)
 
     def gravity_torque_there(self, q: np.ndarray) -> np.ndarray:
-        """Return (n,) Nm that holds the arm against gravity at q (n,) rad, and leave it there: it never steps."""
+        """Return (n,) Nm that holds the arm against gravity at q (n,) rad, which becomes the state."""
         self._skeleton.setPositions(q)
         return self._skeleton.getGravityForces()
 
@@ -169,7 +167,7 @@ class DartEngine:
 
 
 def dart(robot: Robot) -> Callable[[Dynamics], DartEngine]:
-    """Return what makes the engine of simulator=dart: of an arm with these links, without gravity."""
+    """Return the function that creates the engine of simulator=dart from dynamics, without gravity."""
     _dartpy()
     return lambda d: DartEngine(
         robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia, armature=d.armature
@@ -185,8 +183,8 @@ def _dartpy() -> ModuleType:
 
 
 def _as_gazebo(dart: ModuleType, world) -> None:
-    """Set what dartpy 6.20 does otherwise than Gazebo's plugin."""
-    # process-wide: else a joint beyond its limit is pushed back at up to 10 rad/s
+    """Change the settings in which dartpy 6.20 differs from Gazebo's plugin."""
+    # process-wide; by default a joint beyond its limit is pushed back at up to 10 rad/s
     dart.constraint.JointConstraint.setMaxErrorReductionVelocity(0.0)
     options = dart.simulation.DeactivationOptions()
     options.mEnabled = False

@@ -4,13 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from r2s.engines.interface import Engine, Law
+from r2s.engines.interface import Engine, FrictionTorque
 from r2s.learning.evaluate import fixed_draws
 from r2s.physics.actuation import Actuation, Motors
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.limits import Guard
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
+from r2s.physics.safety_filter import SafetyFilter
 from r2s.physics.simulator import single_arm
 from r2s.tasks.task import State, Task
 
@@ -18,7 +18,7 @@ NONE = np.zeros(1, dtype=bool)  # has stopped
 
 
 class EngineArms:
-    """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.episode.rollout`.
+    """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.rollout.rollout`.
 
     Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`, and a stream of its sensors' noise.
 
@@ -39,7 +39,8 @@ class EngineArms:
         draw: Callable[[np.random.Generator, int], Dynamics],
         count: int,
     ):
-        self.robot, self._make, self._torque = robot, make, task.torque(robot)
+        self.robot, self._make, self._torque = robot, make, task.torque_limit(robot)
+        self._control = task.control(robot)
         self._substeps, self._period = task.substeps, 1 / task.ctrl_hz
         self._drawn = fixed_draws(draw, count)
         self._kinematics, self._command = Kinematics(robot), np.zeros(robot.n)
@@ -48,21 +49,25 @@ class EngineArms:
     def place(self, starts: np.ndarray, first: int) -> State:
         """Make the arm of episode `first` and put it at rest at starts (1, n) rad."""
         dynamics = self._drawn.one(first)
-        self._engine, self._law = self._make(dynamics), Law(self.robot, dynamics)
-        self._guard = Guard(single_arm(self.robot, dynamics), self.robot, self._torque, dynamics.level)
+        self._engine, self._law = self._make(dynamics), FrictionTorque(self.robot, dynamics)
+        self._guard = SafetyFilter(single_arm(self.robot, dynamics), self.robot, self._torque, dynamics.level)
         self._motors = Motors(1, self.robot.n, dynamics.delay, dynamics.lag)
         self._sigma, self._rng = dynamics.speed_noise, np.random.default_rng(first)
         self._actuation.reset()
-        self._limited = 0
+        self._limited, self._memory = 0, np.zeros(self._control.memory_size)
         self._command = np.zeros(self.robot.n)
         self._now, self._steps = (starts[0], np.zeros(self.robot.n)), 0
         self._engine.reset(*self._now)
         return self._read()
 
-    def step(self, target: np.ndarray) -> State:
-        """Go on for one control period with the target torque (1, n) Nm."""
+    def step(self, command: np.ndarray) -> State:
+        """Run one control period with the command (1, c) of the controller."""
         self._limited = self._guard.changed
-        for effort in self._actuation(np.clip(target, -self._torque, self._torque), self._substeps)[0]:
+        control, target = self._control, np.empty(self.robot.n)
+        for _ in range(self._substeps):
+            q, dq = self._now
+            control.law(q, dq + self._noise, command[0], control.parameters, self._memory, target)
+            ((effort,),) = self._actuation(np.clip(target, -self._torque, self._torque)[None], 1)
             self._command = self._guard(*self._now, effort, self._command)
             applied = self._motors(self._command[None, None])[0, 0]
             self._now = self._engine.step(applied + self._law(*self._now, applied))
@@ -79,4 +84,5 @@ class EngineArms:
         tau, effort, t = self._command[None], self._actuation.last, np.array([self._steps * self._period])
         limited = np.array([(self._guard.changed - self._limited) / self._substeps])
         noise = self._sigma * self._rng.standard_normal((1, self.robot.n))
+        self._noise = noise[0]
         return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited, noise=noise)

@@ -1,8 +1,7 @@
 """Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
 
-One blocking `server.run` per millisecond. The world has physics and nothing else, and is written from the same
-description as the other engines' (r2s/physics/description.py). Gazebo is on no Python index: it comes from OSRF's
-packages or conda-forge, with bindings of its own.
+One blocking `server.run` per millisecond. The world contains physics only, from the same description as in the other
+engines (r2s/physics/description.py). Gazebo is not on PyPI; OSRF's packages and conda-forge contain the bindings.
 """
 
 import importlib
@@ -26,24 +25,23 @@ RELEASES = ("gz.sim", "gz.sim9", "gz.sim8")  # Jetty, Ionic, Harmonic
 class GazeboEngine:
     """One arm in a Gazebo server.
 
-    A command lasts one step. A reset is what the bindings can do: positions and velocities are set inside the next
-    update and integrated through it, so `reset` keeps them, and the first `step` after it applies both with its
-    torque: that step starts at q, dq exactly.
+    A command lasts one step. The bindings set positions and velocities only within an update, which integrates them.
+    Therefore `reset` stores them and the next `step` applies them with its torque: that step starts exactly at q, dq.
 
     Args:
-        robot, dynamics: masses, centres, tensors and rotors; friction is not Gazebo's (r2s/engines/interface.py).
-        sim: the bindings; None imports those that are installed.
+        robot, dynamics: masses, centres, tensors and rotors; `FrictionTorque` adds friction.
+        sim: the bindings; None imports the installed ones.
 
     Raises:
-        UserError: no bindings here, or they cannot load the world.
+        UserError: the bindings are not installed, or cannot load the world.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics, sim: ModuleType | None = None):
         self._sim = bindings() if sim is None else sim
         os.environ.setdefault("GZ_IP", "127.0.0.1")
-        os.environ.setdefault("GZ_PARTITION", f"r2s-{uuid.uuid4().hex}")  # no other server hears us
+        os.environ.setdefault("GZ_PARTITION", f"r2s-{uuid.uuid4().hex}")  # isolates this server
         self._robot = robot
-        # SDF has no rotors: they are damping A/h in the file, put back as a torque (r2s/engines/dart.py)
+        # SDF has no rotors: the file has damping A/h, and a torque cancels it (r2s/engines/dart.py)
         self._counter = dynamics.armature / SIM_DT
         self._names = [link.joint for link in chain(robot, dynamics)[0]]
         self._joints: list = []
@@ -59,12 +57,12 @@ class GazeboEngine:
             self._fixture.on_post_update(self._guarded(self._after))
             self._fixture.finalize()
             self._server = self._fixture.server()
-            self._run()  # the first update finds the joints and switches their readings on
+            self._run()  # the first update finds the joints and enables their measurements
         if not self._joints:
-            raise UserError("simulator=gazebo: the server runs but has not loaded the arm; see its messages above")
+            raise UserError("simulator=gazebo: the server did not load the arm; see its messages above")
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Let the next step start at q, dq (n,) rad, rad/s."""
+        """Start the next step at q, dq (n,) rad, rad/s."""
         self._start = np.array(q, dtype=float), np.array(dq, dtype=float)
         self._q, self._dq = self._start
 
@@ -80,7 +78,7 @@ class GazeboEngine:
             raise self._error
 
     def _guarded(self, update):
-        """Return `update` for the bindings: an exception must not cross them, it waits for `_run`."""
+        """Return `update` for the bindings; `_run` raises its exception, because the bindings cannot pass it on."""
 
         def call(info, ecm):
             try:
@@ -110,14 +108,14 @@ class GazeboEngine:
             joint.set_force(ecm, [float(torque)])
 
     def _after(self, ecm) -> None:
-        seen = [(joint.position(ecm), joint.velocity(ecm)) for joint in self._joints]
-        if all(q is not None and dq is not None for q, dq in seen):
-            self._q = np.array([q[0] for q, _ in seen])
-            self._dq = np.array([dq[0] for _, dq in seen])
+        measured = [(joint.position(ecm), joint.velocity(ecm)) for joint in self._joints]
+        if all(q is not None and dq is not None for q, dq in measured):
+            self._q = np.array([q[0] for q, _ in measured])
+            self._dq = np.array([dq[0] for _, dq in measured])
 
 
 def gazebo(robot: Robot) -> Callable[[Dynamics], GazeboEngine]:
-    """Return what makes the engine of simulator=gazebo: of an arm with these links.
+    """Return the function that creates the engine of simulator=gazebo from dynamics.
 
     Raises:
         UserError: Gazebo is not installed.
@@ -127,13 +125,13 @@ def gazebo(robot: Robot) -> Callable[[Dynamics], GazeboEngine]:
 
 
 def bindings() -> ModuleType:
-    """Return gz-sim's Python module, the newest release that is installed."""
+    """Return gz-sim's Python module of the newest installed release."""
     for name in RELEASES:
         try:
             return importlib.import_module(name)
         except ImportError:
             continue
     raise UserError(
-        "simulator=gazebo: gz-sim's Python bindings (gz.sim, gz.sim9 or gz.sim8) are not installed; Gazebo comes "
-        "from OSRF's apt repository or conda-forge, not from PyPI. simulator=dart is its physics engine"
+        "simulator=gazebo: gz-sim's Python bindings (gz.sim, gz.sim9 or gz.sim8) are not installed; install Gazebo "
+        "from OSRF's apt repository or conda-forge, or use simulator=dart, the same physics engine"
     )

@@ -1,7 +1,7 @@
-"""What r2s needs of a physics engine: be put somewhere, take one torque per millisecond, say where the joints are.
+"""The interface of a physics engine: set joint positions and velocities, apply one torque per millisecond, read them.
 
-An engine knows rigid bodies. Friction, breakaway and offsets are no engine's own law: `Law` works them out, and they
-enter as one more joint torque each step. So the same arm moves in every engine.
+An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway and offsets as one more joint
+torque per step, so that the same arm moves in every engine.
 """
 
 from typing import Protocol
@@ -15,10 +15,10 @@ from r2s.physics.simulator import single_arm
 
 
 class Engine(Protocol):
-    """One arm, without gravity, as libfranka has it: the arm compensates it."""
+    """One arm without gravity: as on a Franka, the arm compensates it."""
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Put the arm at q, dq (n,) rad, rad/s."""
+        """Set q, dq (n,) rad, rad/s."""
         ...
 
     def step(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,12 +26,12 @@ class Engine(Protocol):
         ...
 
 
-class Law:
-    """The joint torque of r2s/physics/friction.py beside a command, for engines that take nothing but torque.
+class FrictionTorque:
+    """The joint torque of r2s/physics/friction.py, for engines whose only input is torque.
 
-    That law is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
-    (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias does the same with F = P - h D a, where a
-    is what the implicit step will come to. Without that term real wrist joints chatter at 1 ms.
+    That friction is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
+    (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias gives the same with F = P - h D a, where
+    a is the result of the implicit step. Without that term real wrist joints chatter at 1 ms.
 
     Args:
         robot, dynamics: the arm.
@@ -39,35 +39,34 @@ class Law:
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
         self._model = single_arm(robot, dynamics)
-        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # stops are the engine's
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # the engine has its own stops
         self._file_damping = robot.model(gravity=False).dof_damping
         self._data = mujoco.MjData(self._model)
         self._mass = np.empty((robot.n, robot.n))
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return F (n,) Nm, to be added to the torque tau (n,) Nm of the coming step from q, dq (n,)."""
+        """Return F (n,) Nm to add to the torque tau (n,) Nm of the next step from q, dq (n,)."""
         m, d = self._model, self._data
         d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, dq, tau
         mujoco.mj_forward(m, d)
         mujoco.mj_fullM(m, d, self._mass)
         slope = m.opt.timestep * m.dof_damping
         drive = d.qfrc_applied + d.qfrc_passive - d.qfrc_bias
-        coming = np.linalg.solve(self._mass + np.diag(slope), drive)
-        # the file's own damping is the engine's: it does the same with it
-        own = m.opt.timestep * self._file_damping
-        return d.qfrc_passive + self._file_damping * dq - (slope - own) * coming
+        ddq = np.linalg.solve(self._mass + np.diag(slope), drive)
+        own = m.opt.timestep * self._file_damping  # the engine itself applies the file's damping
+        return d.qfrc_passive + self._file_damping * dq - (slope - own) * ddq
 
 
 class MujocoEngine:
-    """MuJoCo without the law: what the other engines are held against."""
+    """MuJoCo without r2s's friction: the reference in tests of the other engines."""
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
         self._model = single_arm(robot, dynamics)
-        self._model.jnt_user[:] = 0.0  # no friction of ours
+        self._model.jnt_user[:] = 0.0  # no friction from r2s
         self._data = mujoco.MjData(self._model)
 
     def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Put the arm at q, dq (n,) rad, rad/s."""
+        """Set q, dq (n,) rad, rad/s."""
         mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:], self._data.qvel[:] = q, dq
 

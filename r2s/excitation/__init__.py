@@ -1,1 +1,1 @@
-"""Motions worth recording, and whether a motion is safe to send."""
+"""Exciting trajectories for identification, and safety checks of a motion."""

@@ -1,4 +1,4 @@
-"""Minimum-jerk motion."""
+"""Minimum-jerk motion (Flash and Hogan, J. Neurosci. 5(7), 1985)."""
 
 import numpy as np
 
@@ -6,14 +6,13 @@ import numpy as np
 def minimum_jerk(
     start: np.ndarray, end: np.ndarray, seconds: float, t: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, velocity and acceleration of the motion of Flash and Hogan, J. Neurosci. 5(7), 1985.
+    """Return position, velocity and acceleration from `start` to `end` (n,) rad, at rest outside 0 to `seconds`.
 
-    Each is (n,) for start, end (n,) rad at one time t, s, and (T, n) for times (T, 1); before 0 and after `seconds`
-    the motion rests.
+    Each is (n,) for a time t, s, or (T, n) for times (T, 1).
     """
     s = np.clip(t / seconds, 0.0, 1.0)
-    away = end - start
-    place = 10 * s**3 - 15 * s**4 + 6 * s**5
-    speed = (30 * s**2 - 60 * s**3 + 30 * s**4) / seconds
-    push = (60 * s - 180 * s**2 + 120 * s**3) / seconds**2
-    return start + place * away, speed * away, push * away
+    distance = end - start
+    position = 10 * s**3 - 15 * s**4 + 6 * s**5
+    velocity = (30 * s**2 - 60 * s**3 + 30 * s**4) / seconds
+    acceleration = (60 * s - 180 * s**2 + 120 * s**3) / seconds**2
+    return start + position * distance, velocity * distance, acceleration * distance

@@ -1,4 +1,4 @@
-"""A reference motion on the arm's clock, and its file."""
+"""A reference motion at 1 kHz and its file format."""
 
 import os
 import warnings
@@ -8,23 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from r2s.errors import UserError, choices, nearest
-from r2s.excitation.safety import (
-    TABLE_M,
-    TOOL_M,
-    check_motion,
-)
-from r2s.files import whole
+from r2s.excitation.motion_checks import TABLE_M, TOOL_M, check_motion
+from r2s.files import atomic_write
 from r2s.physics.robot import Robot
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """A reference motion on a uniform clock, at rest at both ends.
-
-    Attributes:
-        t: (T,) s from 0. q, dq, ddq: (T, n) rad, rad/s, rad/s^2.
-
-    """
+    """A reference motion at 1 kHz, at rest at both ends: t (T,) s from 0; q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
 
     t: np.ndarray
     q: np.ndarray
@@ -32,22 +23,21 @@ class Excitation:
     ddq: np.ndarray
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write `path` (.csv): t, q1.., dq1.., ddq1.., SI units, one row per ms; any controller can replay it."""
+        """Write `path` (.csv): t, q1.., dq1.., ddq1.. in SI units, one row per ms."""
         path = Path(path)
         if path.suffix != ".csv":
-            raise UserError(f"an excitation is saved as .csv; '{path.name}' ends in '{path.suffix}'")
+            raise UserError(f"expected a file name ending in .csv, got '{path.name}'")
         table = np.column_stack([self.t, self.q, self.dq, self.ddq])
         header = ",".join(_columns(self.q.shape[1]))
-        with whole(path) as part:
+        with atomic_write(path) as part:
             np.savetxt(part, table, fmt="%.12g", delimiter=",", header=header, comments="")
 
 
 def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M) -> Excitation:
-    """Return the excitation of a file that `Excitation.save` wrote, or one like it, checked for this robot.
+    """Read an excitation in the format of `Excitation.save` and check it for this robot.
 
     Raises:
-        UserError: no such file, not such a file, or a motion that `motion_checks.check_motion` forbids.
-
+        UserError: no such file, another format, or a motion that fails `motion_checks.check_motion`.
     """
     path = Path(path)
     if not path.is_file():
@@ -56,25 +46,25 @@ def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min
     try:
         with open(path, encoding="utf-8") as file:
             header = [name.strip() for name in file.readline().split(",")]
-            with warnings.catch_warnings(action="ignore"):  # of no rows
+            with warnings.catch_warnings(action="ignore"):  # NumPy warns about a file without rows
                 rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    except ValueError as error:  # also what is no text
+    except ValueError as error:  # UnicodeDecodeError is one too
         raise UserError(f"data.excitation: {path} is not a table of numbers: {str(error).splitlines()[0]}") from None
-    wanted = _columns(robot.n)
-    for name in wanted:
+    expected, n = _columns(robot.n), robot.n
+    for name in expected:
         if name not in header:
-            strange = [h for h in header if h not in wanted]
+            others = [h for h in header if h not in expected]
             raise UserError(
-                f"data.excitation: {path} has no column '{name}'; for {robot.name} it must have t, q1..q{robot.n}, "
-                f"dq1..dq{robot.n}, ddq1..ddq{robot.n}; it has {choices(header[:30])}{nearest(name, strange)}"
+                f"data.excitation: expected the columns t, q1..q{n}, dq1..dq{n}, ddq1..ddq{n}, got no '{name}' in "
+                f"{path}; it has {choices(header[:30])}{nearest(name, others)}"
             )
-    if f"q{robot.n + 1}" in header:
-        raise UserError(f"data.excitation: {path} moves joint {robot.n + 1}; {robot.name} has {robot.n} joints")
+    if f"q{n + 1}" in header:
+        raise UserError(f"data.excitation: expected {n} joints, as {robot.name} has, got joint {n + 1} in {path}")
     if not rows.size:
         raise UserError(f"data.excitation: {path} has 0 rows")
     if rows.shape[1] != len(header):
-        raise UserError(f"data.excitation: {path} has {len(header)} names but {rows.shape[1]} columns")
-    columns = rows[:, [header.index(name) for name in wanted]]
+        raise UserError(f"data.excitation: expected {len(header)} columns, got {rows.shape[1]} in {path}")
+    columns = rows[:, [header.index(name) for name in expected]]
     e = Excitation(columns[:, 0], *np.split(columns[:, 1:], 3, axis=1))
     try:
         check_motion(robot, e, table=table, z_min=z_min)

@@ -1,7 +1,7 @@
-"""Ways from posture to posture, checked before an arm is driven along them: limits, the table, the arm itself.
+"""Joint-space paths to a posture, checked for limits and clearance before an arm moves along them.
 
-A path is a few postures (k, n) rad; from each to the next an arm goes straight in joint angles, however fast. The
-distances and clearances are those of motions (r2s/excitation/safety.py).
+A path is a list of postures (k, n) rad, connected by straight lines in joint space, at any speed. Distances and
+clearances are those of `motion_checks`.
 """
 
 from collections.abc import Iterator
@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.excitation.safety import CLEARANCE_M, TABLE_M, TOOL_M, Space
+from r2s.excitation.motion_checks import CLEARANCE_M, TABLE_M, TOOL_M, Space
 from r2s.physics.robot import Robot
 
-NEARER_M = 1e-3  # that an arm which is too near to something already may still come on its way off
-SAME = 1e-3  # rad: a joint nearer than this to where it is to go is there
+CLOSER_M = 1e-3  # m, an arm that starts too near may come closer by this on its way out
+SAME = 1e-3  # rad, a joint so near to its target need not move
 
 
 def check_path(
@@ -25,23 +25,19 @@ def check_path(
     z_min: float = TOOL_M,
     space: Space | None = None,
 ) -> None:
-    """Raise UserError where a path leaves the limits or comes too near to the table or to the arm itself.
+    """Raise UserError if a path leaves the limits or comes too near to the table or to the arm itself.
 
-    The first posture is where the arm is, whether that is allowed or not: from there, distances that are less than
-    allowed may not become less still.
+    The first posture is the arm's own and need not satisfy the clearances; smaller distances must not decrease.
 
     Args:
-        robot: its limits and links.
+        robot: limits and links.
         path: (k, n) rad, k >= 2.
-        what: it is, for the message.
-        table, z_min: m, as in `check_motion`. space: made of them before, which saves time.
-
-    Raises:
-        UserError: which joint or link, where on which leg, the value, and what is allowed.
+        what: name of the path for the message.
+        table, z_min: m, see `check_motion`. space: built from them before, to save time.
     """
     space = space or Space(robot, table=table, z_min=z_min)
-    if why := _forbids(robot, np.asarray(path, dtype=float), space):
-        raise UserError(f"{what}: {why}")
+    if violation := _violation(robot, np.asarray(path, dtype=float), space):
+        raise UserError(f"{what}: {violation}")
 
 
 def approach(
@@ -54,43 +50,43 @@ def approach(
     z_min: float = TOOL_M,
     space: Space | None = None,
 ) -> np.ndarray:
-    """Return a path (k, n) rad from where the arm is to q_to that `check_path` allows: the first of a few.
+    """Return the first path (k, n) rad from q_from to q_to that passes `check_path`.
 
-    Straight; by way of home; joint by joint, from the hand to the base or from the base to the hand; and so to home
-    first. The first posture of the path is q_from, the last one q_to.
+    The candidates are the straight line, a path through q_home, joint by joint (last or first joint first), and
+    joint by joint through q_home.
 
     Args:
-        robot: its limits and links.
+        robot: limits and links.
         q_from, q_to: (n,) rad.
-        what: it is, for the message.
-        table, z_min: m, as in `check_motion`. space: made of them before, which saves time.
+        what: name of the path for the message.
+        table, z_min: m, see `check_motion`. space: built from them before, to save time.
 
     Raises:
-        UserError: what forbids the straight way, where all others are forbidden, too.
+        UserError: no candidate is free; the message explains the straight line.
     """
     space = space or Space(robot, table=table, z_min=z_min)
     first = ""
-    for path in _ways(robot, np.asarray(q_from, dtype=float), np.asarray(q_to, dtype=float)):
-        why = _forbids(robot, path, space)
-        if not why:
+    for path in _candidates(robot, np.asarray(q_from, dtype=float), np.asarray(q_to, dtype=float)):
+        violation = _violation(robot, path, space)
+        if not violation:
             return path
-        first = first or why
-    raise UserError(f"{what}: {first}; by way of home and joint by joint there is no way, either")
+        first = first or violation
+    raise UserError(f"{what}: {first}; no path through q_home or joint by joint is free either")
 
 
-def _ways(robot: Robot, a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
+def _candidates(robot: Robot, a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
     """Yield paths (k, n) from a to b (n,), the simplest first."""
-    home, hand_first = robot.q_home, np.arange(robot.n)[::-1]
+    home, last_first = robot.q_home, np.arange(robot.n)[::-1]
     yield np.array([a, b])
     yield np.array([a, home, b])
-    for order in (hand_first, hand_first[::-1]):
+    for order in (last_first, last_first[::-1]):
         yield _one_by_one(a, b, order)
-    for order in (hand_first, hand_first[::-1]):  # away in this order, and there in the opposite one
+    for order in (last_first, last_first[::-1]):  # to q_home in this order, from q_home in the opposite one
         yield np.concatenate([_one_by_one(a, home, order), _one_by_one(home, b, order[::-1])[1:]])
 
 
 def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Return the path (k, n) on which one joint after the other goes from a to b (n,)."""
+    """Return the path (k, n) from a to b (n,) that moves one joint after the other."""
     path = [a]
     for joint in order:
         if abs(b[joint] - path[-1][joint]) > SAME:
@@ -98,10 +94,10 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.array([*path[: max(1, len(path) - 1)], b])
 
 
-def _forbids(robot: Robot, path: np.ndarray, space: Space) -> str:
-    """Return what forbids a path (k, n), "" where nothing does."""
+def _violation(robot: Robot, path: np.ndarray, space: Space) -> str:
+    """Return a description of the first violation on a path (k, n), or ""."""
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
-        return f"postures of shape {path.shape} are no path of {robot.name}; (2 or more, {robot.n}) are"
+        return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"
     if not np.isfinite(path).all():
         k, i = np.argwhere(~np.isfinite(path))[0]
         return f"joint {i + 1} of posture {k + 1} is {path[k, i]}"
@@ -113,9 +109,9 @@ def _forbids(robot: Robot, path: np.ndarray, space: Space) -> str:
             f"{robot.q_min[i]:g} to {robot.q_max[i]:g}"
         )
     here = space.gaps(path[:1])[0]
-    least = np.where(here < 0, here - NEARER_M, 0.0)
+    least = np.where(here < 0, here - CLOSER_M, 0.0)
     for k in range(len(path) - 1):
-        # no point of the arm goes farther between two samples than twice the clearance
+        # between two samples no point of the arm moves more than twice the clearance
         count = 1 + int(np.ceil(np.abs(path[k + 1] - path[k]).sum() * space.reach / (2 * CLEARANCE_M)))
         share = np.linspace(0, 1, count + 1)[1:]
         gaps = space.gaps(path[k] + share[:, None] * (path[k + 1] - path[k]))
@@ -127,6 +123,6 @@ def _forbids(robot: Robot, path: np.ndarray, space: Space) -> str:
 
 
 def _where(leg: int, count: int, share: float) -> str:
-    """Return in words where on a path of `count` postures this share of a leg is."""
+    """Return the description of a point on a path of `count` postures, at `share` of a leg."""
     which = "" if count == 2 else f", from posture {leg + 1} to {leg + 2} of {count}"
     return f" {100 * share:.0f} % of the way{which}"

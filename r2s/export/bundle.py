@@ -1,9 +1,12 @@
-"""`r2s export`: a folder that holds all that another program needs to run a policy, and that says so of itself."""
+"""`r2s export`: a folder with everything that another program needs to run a policy, described by a contract."""
 
 import ast
+import builtins
+import inspect
 import json
 import os
 import shutil
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,12 +15,14 @@ import numpy as np
 import torch
 
 from r2s import export
+from r2s.control.controller import Controller
 from r2s.errors import UserError
 from r2s.export.card import card
 from r2s.export.contract import make_contract
 from r2s.export.header import header
 from r2s.export.runtime import BundleError, agree, load, seal_of
 from r2s.learning.networks import Policy
+from r2s.physics.control_laws import BUILT_IN
 from r2s.physics.description import write_description
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -27,9 +32,10 @@ from r2s.runs import read_meta
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
-HERE, PARTS = "r2s.export.", ("law", "base", "plan")  # what the one file is made of beside runtime.py, in this order
-EXAMPLES = 4  # plans that a bundle has
-SAME = 1e-4  # of the torque that an action of 1 asks for: policy.onnx against policy.pt
+# modules that the one file of a bundle contains beside runtime.py, in this order
+HERE, PARTS = "r2s.export.", ("law", "control", "inverse_dynamics", "plan")
+EXAMPLES = 4  # plans in a bundle
+SAME = 1e-4  # of action_scale, largest difference between policy.onnx and policy.pt
 
 
 def write_bundle(
@@ -42,18 +48,18 @@ def write_bundle(
     config: Mapping[str, Any],
     places: Sequence[str],
 ) -> None:
-    """Write the bundle of a finished training into the new folder `to`; it has that name only once it is whole.
+    """Write the bundle of a finished training into the new folder `to`, atomically.
 
     Args:
-        to: where. source: the run folder of the training.
-        robot, task, dynamics, policy: of it; dynamics of one arm, the centre of what it was trained on.
-        config: of it. places: names of the simulators and arms there are, for what was not tried.
+        to: the new folder. source: the run folder of the training.
+        robot, task, dynamics, policy: of the training; dynamics of one arm, the centre of the randomization.
+        config: of the training. places: names of all simulators and arms, to list those that were not tried.
 
     Raises:
-        UserError: `to` is there already, the run has no policy.onnx, or one that is not its policy.pt.
+        UserError: `to` exists, or the run has no policy.onnx that equals its policy.pt.
     """
     if to.exists():
-        raise UserError(f"export: {to} is there already; remove it, or say another to=FOLDER")
+        raise UserError(f"export: {to} exists; remove it, or choose another to=FOLDER")
     contract = make_contract(robot, task, dynamics.level, dynamics.armature)
     meta = read_meta(source)
     part = to.with_name(f".{to.name}.{os.getpid()}.part")
@@ -64,12 +70,14 @@ def write_bundle(
             if (source / name).is_file():
                 shutil.copyfile(source / name, part / name)
         write_description(part / "model", robot, dynamics)
-        (part / "r2s_runtime.py").write_text(one_file())
+        (part / "r2s_runtime.py").write_text(one_file(task.control(robot)))
         if contract["goal"]["kind"] == "plan":
             plans = task.goals(robot, np.random.default_rng(0), EXAMPLES)
             np.savez_compressed(part / contract["goal"]["examples"], plans=plans)
-        else:
-            (part / "contract.hpp").write_text(header(contract, sha256(part / "policy.onnx")))
+        elif task.control(robot).cpp:
+            (part / "contract.hpp").write_text(
+                header(contract, sha256(part / "policy.onnx"), task.control(robot).cpp)
+            )
         report_markdown(part / "MODEL_CARD.md", card(source, config, meta, contract, part, places))
         contract["files"] = {
             p.relative_to(part).as_posix(): sha256(p) for p in sorted(part.rglob("*")) if p.is_file()
@@ -87,7 +95,7 @@ def write_bundle(
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx, which has to give what policy.pt gives, and to say what the contract says."""
+    """Copy policy.onnx; its actions have to equal those of policy.pt, and its metadata the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -99,21 +107,25 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
         agree(dict(contract), {p.key: p.value for p in model.metadata_props})
         mean, std = policy.normalizer.mean.numpy(), policy.normalizer.std.numpy()
         seen = (mean + std * np.random.default_rng(0).normal(size=(64, len(mean)))).astype(np.float32)
-        (said,) = ReferenceEvaluator(model).run(None, {"observation": seen})
+        (actions,) = ReferenceEvaluator(model).run(None, {"observation": seen})
         with torch.no_grad():
-            wanted = policy(torch.from_numpy(seen)).numpy()
-        off = np.abs(said - wanted).max(0) / np.array(contract["torque"]["action_Nm"])
+            expected = policy(torch.from_numpy(seen)).numpy()
+        off = np.abs(actions - expected).max(0) / np.array(contract["control"]["action_scale"])
     except BundleError:
         raise
-    except Exception as error:  # reading what is damaged may fail in any way
+    except Exception as error:  # a damaged file may fail in any way
         seen_ = " ".join(str(error).split())[:100]
         raise UserError(f"export: {source / 'policy.onnx'} is damaged ({seen_})") from None
     if not off.max() < SAME:
         raise UserError(f"export: policy.onnx of {source} is not its policy.pt: actions differ by {off.max():.2g}")
 
 
-def one_file() -> str:
-    """Return r2s_runtime.py: r2s/export/runtime.py, with what its parts define where it imports them."""
+def one_file(control: Controller) -> str:
+    """Return r2s_runtime.py: r2s/export/runtime.py, with its parts and the control laws in place of their imports.
+
+    Raises:
+        UserError: the law of the controller uses names that a bundle does not have.
+    """
     here = Path(export.__file__).parent
 
     def imports(text: str) -> list[ast.Import | ast.ImportFrom]:
@@ -121,12 +133,44 @@ def one_file() -> str:
 
     def own(name: str) -> str:
         text = (here / f"{name}.py").read_text()
-        return "".join(text.splitlines(keepends=True)[imports(text)[-1].end_lineno :]).strip()
+        body = "".join(text.splitlines(keepends=True)[imports(text)[-1].end_lineno :]).strip()
+        return f"{laws}\n\n\n{body}\n\n\n{extra}".strip() if name == "control" else body
 
+    laws = "\n\n\n".join(law_source(law) for law in BUILT_IN)
+    extra = (
+        ""
+        if control.law in BUILT_IN
+        else law_source(control.law) + f"\n\n\nLAWS[{control.name!r}] = {law_name(control.law)}"
+    )
     text = (here / "runtime.py").read_text()
     lines = text.splitlines(keepends=True)
     ours = [node for node in imports(text) if isinstance(node, ast.ImportFrom) and f"{node.module}".startswith(HERE)]
     for node in ours:
         lines[node.lineno - 1 : node.end_lineno] = [""] * (1 + (node.end_lineno or 0) - node.lineno)
-    lines[ours[0].lineno - 1] = "\n\n\n".join(map(own, PARTS)) + "\n\n\n"
+    lines[ours[0].lineno - 1] = (
+        "from collections.abc import Callable\n\n\n" + "\n\n\n".join(map(own, PARTS)) + "\n\n\n"
+    )
     return "".join(lines)
+
+
+def law_name(law: Any) -> str:
+    """Return the name of a control law's function."""
+    return getattr(law, "py_func", law).__name__
+
+
+def law_source(law: Any) -> str:
+    """Return the source of a control law as plain Python, without its decorator.
+
+    Raises:
+        UserError: it uses names other than its own, NumPy's `np` and builtins.
+    """
+    function = getattr(law, "py_func", law)
+    node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    assert isinstance(node, ast.FunctionDef)
+    node.decorator_list = []
+    foreign = set(function.__code__.co_names) & set(function.__globals__) - {"np", *dir(builtins)}
+    if foreign:
+        raise UserError(
+            f"export: control law {function.__name__} uses {', '.join(sorted(foreign))}; a bundle has np alone"
+        )
+    return ast.unparse(node)

@@ -1,4 +1,4 @@
-"""MODEL_CARD.md: what a policy was trained on, where it was measured, and where nobody has tried it."""
+"""MODEL_CARD.md: training, measured performance and limits of a policy."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -9,11 +9,12 @@ import numpy as np
 import yaml
 
 from r2s.reporting.document import Item
-from r2s.reporting.measures import shown
-from r2s.reporting.tables import reach_rows
+from r2s.reporting.measures import measures_of
+from r2s.reporting.tables import measure_rows
 
-LEFT_OUT = ("_target_", "name")
-NO_SDF = "Its rotors are in arm.xml and arm.urdf; SDF cannot say them, so there is no arm.sdf."
+NOT_SHOWN = ("_target_", "name")
+PHYSICAL = ("panda", "fr3")  # arms of conf/arm that are no simulation
+NO_SDF = "arm.xml and arm.urdf have rotor inertias, which SDF cannot express; there is no arm.sdf."
 
 
 def card(
@@ -27,108 +28,110 @@ def card(
     """Return the sections of the card.
 
     Args:
-        source: the run folder. config, meta: of it. contract: of the bundle. bundle: where it is being written.
-        places: names of the simulators and arms that there are.
+        source, config, meta: run folder of the training, its config.yaml and meta.json. contract: of the bundle.
+        bundle: folder being written. places: names of all simulators and arms.
     """
-    summary = json.loads((source / "summary.json").read_text())
-    best = summary["best"]
+    best, measures = json.loads((source / "summary.json").read_text())["best"], measures_of(source)
     rates, commit = contract["rates"], (meta.get("git") or {}).get("commit")
-    title = f"{config['algo']['name']} for {contract['robot']}, {source.name}"
-    head: list[Item] = [
-        f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}; the driver's law "
-        f"makes of it what an arm may be sent at {rates['cycle_hz']} Hz. contract.json says all of it in numbers.",
-        f"{shown(best).does} It knows nothing of what stands around the arm, of people, and of its own links: it may "
-        "reach through itself.",
-    ]
+    measured = transfers(source, measures.selection[0])
+    rows = {"MuJoCo, as trained, goals without selection": best} | measured
     trained: list[Item] = [
         [
             f"algorithm: {settings(config['algo'])}",
             f"task: {settings(config['task'])}",
             f"randomization: {settings(config['dr'])}",
-            f"{best['env_steps']:,} steps of the environment, {best['updates']:,} updates; seed {meta.get('seed')}; "
-            f"r2s commit {commit or 'unknown'}",
+            f"{best['env_steps']:,} env steps, {best['updates']:,} updates; seed {meta.get('seed')}; r2s commit "
+            f"{commit or 'unknown'}",
             model(source, config),
         ]
     ]
     if not (bundle / "model" / "arm.sdf").is_file():
         trained.append(NO_SDF)
-    rows = {"MuJoCo, as trained, goals on which nothing was chosen": best}
-    measured = transfers(source, shown(best).judged[0])
-    rows |= measured
-    done: list[Item] = [reach_rows({k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})]
     stops = [
         f"{place}: stopped in {row['stops']} of {row['asked']} episodes"
         for place, row in measured.items()
         if row.get("stops")
     ]
-    if stops:
-        done.append(stops)
-    names = {place.split(" ")[0] for place in measured}
-    missing = sorted(p for p in places if p not in names and p != "none" and p != "mujoco")
-    arms = [p for p in missing if p in ("panda", "fr3")]
-    untried: list[Item] = [f"Not tried: {', '.join(missing)}." if missing else "It was tried wherever r2s can."]
-    if arms:
-        untried.append(
-            "No arm of metal has run it: begin as docs/safety.md says, slowly and with a hand on the stop."
-        )
+    table = measure_rows(measures, {k: {"episodes": None, "asked": None} | dict(v) for k, v in rows.items()})
     return {
-        title: head,
+        f"{config['algo']['name']} for {contract['robot']}, {source.name}": [
+            f"Observation to torque at {rates['policy_hz']} Hz, {contract['torque']['convention']}. The safety "
+            f"filter turns it into a torque that the arm accepts at {rates['cycle_hz']} Hz. contract.json has all "
+            "numbers.",
+            f"{measures.description} It has no knowledge of obstacles, people or its own links: it may collide with "
+            "itself.",
+        ],
         "Trained on": trained,
-        "Measured": done,
-        "Not tried": untried,
+        "Measured": [table, *([stops] if stops else [])],
+        "Not tried": not_tried(measured, places),
         **({"Plans": plans(contract)} if contract["goal"]["kind"] == "plan" else {}),
         "Limits": [
-            "Goals outside of what contract.json calls `goal.trained`, payloads, contact and other hands were not "
-            "part of the training. The law holds the arm within its limits of torque, speed and position; it does "
-            "not make a motion sensible."
+            "The training had no goals outside `goal.trained` of contract.json, no payload, no contact and no other "
+            "end effector. The safety filter keeps torque, speed and position within the arm's limits; it does not "
+            "make a motion sensible."
         ],
     }
 
 
+def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
+    """Return the simulators and arms without a transfer."""
+    names = {place.split(" ")[0] for place in measured}
+    missing = sorted(p for p in places if p not in names and p not in ("none", "mujoco"))
+    items: list[Item] = [
+        f"Not tried: {', '.join(missing)}." if missing else "Tried in all simulators and on all arms."
+    ]
+    if any(p in PHYSICAL for p in missing):
+        items.append(
+            "No physical arm has run it. Begin slowly, a hand on the stop button: see docs/explanation/safety.md."
+        )
+    return items
+
+
 def plans(contract: Mapping[str, Any]) -> list[Item]:
-    """Return what a plan is, and how one is made."""
+    """Return what a plan is, and how to make one."""
     goal, n = contract["goal"], len(contract["joints"])
     rows, columns = goal["shape"]
     words = [
-        f"A goal is a plan, {rows} rows of {columns} numbers, one every {1e3 / goal['row_hz']:g} ms: where the hand "
-        f"is to be and its velocity, m and m/s in the arm's base, then angles, speeds and accelerations of the {n} "
-        f"joints, rad. {goal['steps'] / goal['row_hz']:g} s are the path; {contract['observation']['preview']} rows "
-        "more are what a policy sees ahead of its end. A path begins and ends at rest, and the arm at its first row.",
-        f"{goal['examples']} has some of the training's family. `runtime.plan(q, dq, ddq)` makes one of a motion of "
-        "the joints that any planner gave; `TrackTask.plan` of r2s/tasks/track.py makes one of a curve of the hand, "
-        "as slow as the arm's limits want it.",
+        f"A goal is a plan, {rows} rows of {columns} numbers, one per {1e3 / goal['row_hz']:g} ms: position and "
+        "velocity of the end effector, m and m/s in the arm's base, then positions, velocities and accelerations of "
+        f"the {n} joints, rad. {goal['steps'] / goal['row_hz']:g} s are the path; the policy observes "
+        f"{contract['observation']['preview']} more rows ahead. A path begins and ends at rest; the arm starts at "
+        "its first row.",
+        f"{goal['examples']} has plans of the training's family. `runtime.plan(q, dq, ddq)` makes a plan of a joint "
+        "motion; `TrackTask.plan` of r2s/tasks/track.py makes one of a curve of the end effector, slow enough for "
+        "the arm's limits.",
     ]
-    if contract["base"] is not None:
+    if contract["control"]["model"] is not None:
         words.append(
-            "The policy's torque is added to computed torque with the model that is `base` in contract.json. Neither "
-            "fits an arm that is another one, or that carries what the model does not know of."
+            "The policy's torque is added to computed torque with the model `control.model` of contract.json. Both "
+            "are wrong for another arm, and for a payload outside that model."
         )
     return [words]
 
 
 def settings(group: Mapping[str, Any]) -> str:
-    """Return a group of a config as words."""
+    """Return a config group as "name, key value, ..."."""
     name = group.get("name") or group.get("_target_", "").rsplit(".", 1)[-1]
-    own = (f"{k} {v}" for k, v in group.items() if k not in LEFT_OUT and v is not None)
+    own = (f"{k} {v}" for k, v in group.items() if k not in NOT_SHOWN and v is not None)
     return ", ".join([*([name] if name else []), *own])
 
 
 def model(source: Path, config: Mapping[str, Any]) -> str:
-    """Return where the model that it was trained on comes from."""
+    """Return the origin of the training's model."""
     path = source / "parameters.yaml"
     if not path.is_file():
-        return f"model: nominal, friction {settings(config['friction'])}; no recording of an arm is in it"
-    said = yaml.safe_load(path.read_text()).get("source", {})
-    return f"model: identified, from {', '.join(f'{k} {v}' for k, v in said.items())} (parameters.yaml)"
+        return f"model: nominal, friction {settings(config['friction'])}; not identified from a recording"
+    origin = yaml.safe_load(path.read_text()).get("source", {})
+    return f"model: identified, from {', '.join(f'{k} {v}' for k, v in origin.items())} (parameters.yaml)"
 
 
 def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
-    """Return what the finished transfers of a policy beside it measured, by place and run: rows with `measure`."""
+    """Return {"place (run)": row} of a policy's finished transfers in the same root, if the row has `measure`."""
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(source.resolve().parent.parent.glob("transfer/*/summary.json")):
         try:
             meta = json.loads((path.parent / "meta.json").read_text())
-            # a folder may have been moved with its root: the last two names tell
+            # the root may have been moved: compare the last two parts of a path
             parents = [Path(p).resolve().parts[-2:] for p in meta["parents"]]
             if meta["status"] not in ("done", "stopped") or source.resolve().parts[-2:] not in parents:
                 continue
@@ -136,5 +139,5 @@ def transfers(source: Path, measure: str) -> dict[str, dict[str, Any]]:
                 if place != "predicted" and np.isfinite(row.get(measure, np.nan)):
                     found[f"{place} ({path.parent.name})"] = row
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            continue  # not whole, or not ours
+            continue  # incomplete, or not a run of r2s
     return found

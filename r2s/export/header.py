@@ -1,4 +1,4 @@
-"""contract.hpp: what a C++ program needs of contract.json, as constants; examples/libfranka includes it."""
+"""contract.hpp: contract.json as C++ constants, with the control law; examples/libfranka includes it."""
 
 import json
 from collections.abc import Mapping
@@ -10,11 +10,16 @@ from r2s.export.runtime import MADE_OF
 LOWEST = ("q_low", "q_stop_low")  # where null is minus infinity
 
 
-def header(contract: Mapping[str, Any], policy_sha256: str) -> str:
-    """Return a C++17 header: arrays of the model and of the law, and how an observation is made."""
-    model, law, seen, rates = (contract[k] for k in ("model", "law", "observation", "rates"))
+def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
+    """Return a C++17 header: model, safety filter, control law and observation.
+
+    Args:
+        contract: see contract.py. policy_sha256: of policy.onnx. law: body of the control law, `Controller.cpp`.
+    """
+    model, filter_, seen, rates, control = (contract[k] for k in ("model", "law", "observation", "rates", "control"))
     joints = ", ".join(json.dumps(name) for name in contract["joints"])
     words = {"robot": contract["robot"], "torque": contract["torque"]["convention"], "policy_sha256": policy_sha256}
+    words["action"] = control["action"].replace(" ", "_")
     lines = ["// Written by r2s export from contract.json.", "#pragma once", "#include <cmath>", ""]
     lines += ["namespace contract {", "", f"constexpr int n = {len(contract['joints'])};"]
     lines += [f"constexpr const char* {name} = {json.dumps(word)};" for name, word in words.items()]
@@ -24,11 +29,19 @@ def header(contract: Mapping[str, Any], policy_sha256: str) -> str:
     lines += [_rows(name, [link[name] for link in model["links"]]) for name in LINK]
     lines += [f"constexpr double hand[3] = {_braced(model['hand_m'])};"]
     lines += [f"constexpr double rotors[n] = {_braced(model['rotors'])};", ""]
-    for name, values in law["joint"].items():
+    for name, values in filter_["joint"].items():
         none = "-INFINITY" if name in LOWEST else "INFINITY"
-        lines.append(f"constexpr double {name}[n] = {_braced(values, none)};  // {law['units'][name]}")
-    lines += [f"constexpr double {name} = {value!r};" for name, value in law["number"].items()]
-    lines += ["", "// an entry of an observation is tanh(of / divided_by), or without tanh"]
+        lines.append(f"constexpr double {name}[n] = {_braced(values, none)};  // {filter_['units'][name]}")
+    lines += [f"constexpr double {name} = {value!r};" for name, value in filter_["number"].items()]
+    sizes = {"actions": len(control["action_scale"]), "memories": control["memory_size"]}
+    lines += ["", f"// control={control['name']}: the command is the policy's action in {control['unit']}"]
+    lines += [f"constexpr int {name} = {size};" for name, size in sizes.items()]
+    parameters = control["parameters"] or [0.0]  # C++ has no empty array
+    lines += [f"constexpr double parameters[{len(parameters)}] = {_braced(parameters)};"]
+    lines += ["inline void control_law([[maybe_unused]] const double* q, [[maybe_unused]] const double* dq,"]
+    lines += ["                        const double* command, [[maybe_unused]] double* memory, double* out) {"]
+    lines += [f"  {line}" for line in law.splitlines()]
+    lines += ["}", "", "// a term of an observation is tanh(of / divided_by), or without tanh"]
     lines += [f"enum Of {{ {', '.join('of_' + word for word in MADE_OF)} }};"]
     lines += ["struct Entry { Of of; int begin, count; bool tanh; double divided_by[n > 3 ? n : 3]; };"]
     lines += [f"constexpr int observations = {seen['size']};", "constexpr Entry entries[] = {"]

@@ -1,4 +1,4 @@
-"""The driver's law in NumPy, of an arm that a contract describes: a second writing of r2s/physics/limits.py.
+"""Driver and safety filter in NumPy for the arm of a contract; the original is r2s/physics/safety_filter.py.
 
 It needs nothing of r2s. `r2s export` puts it and runtime.py together into r2s_runtime.py, the one file of a bundle.
 """
@@ -20,21 +20,21 @@ LAW_NUMBER = (
 
 
 class BundleError(ValueError):
-    """Why a bundle does not run here, in one line."""
+    """A bundle that does not run here; its message is one line."""
 
 
 def is_number(value: Any) -> bool:
-    """Return whether what a contract says is a finite number."""
+    """Return whether a value of a contract is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < np.inf
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return (n,) of what a contract lists, where null stands for `none`: JSON knows no infinity."""
+    """Return (n,) of a list of a contract, whose null stands for `none`: JSON has no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a x b (..., 3); np.cross takes thrice as long."""
+    """Return a x b (..., 3); np.cross takes three times as long."""
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
@@ -60,12 +60,12 @@ class Model:
 
     def place(self, q: np.ndarray) -> None:
         """Take the arm to q (n,) rad."""
-        turn = self._constant + np.sin(q)[:, None, None] * self._odd + np.cos(q)[:, None, None] * self._even
+        rotation = self._constant + np.sin(q)[:, None, None] * self._odd + np.cos(q)[:, None, None] * self._even
         self.frame, self.origin = np.empty((self.n, 3, 3)), np.empty((self.n, 3))
         R, p = np.eye(3), np.zeros(3)
         for i in range(self.n):
             p = p + R @ self._place[i]
-            R = R @ turn[i]
+            R = R @ rotation[i]
             self.frame[i], self.origin[i] = R, p
         self.axis = (self.frame @ self._axis[:, :, None])[..., 0]
 
@@ -96,13 +96,13 @@ class Model:
         force, moment = np.cumsum(force[::-1], 0)[::-1], np.cumsum(moment[::-1], 0)[::-1]
         bias = (z * (moment - cross(p, force))).sum(1)
         moves = self._before * cross(np.broadcast_to(z, (n, n, 3)), centre[:, None] - p)  # of link k by joint j
-        turns = self._before * np.broadcast_to(z, (n, n, 3))
+        rotates = self._before * np.broadcast_to(z, (n, n, 3))
         heavy = moves * self._mass[:, None, None]
 
         def flat(x: np.ndarray) -> np.ndarray:
             return x.transpose(1, 0, 2).reshape(n, -1)
 
-        mass = flat(heavy) @ flat(moves).T + flat(turns @ tensor) @ flat(turns).T
+        mass = flat(heavy) @ flat(moves).T + flat(rotates @ tensor) @ flat(rotates).T
         return mass + self._rotors, bias
 
     def weight(self, gravity: np.ndarray) -> np.ndarray:
@@ -115,18 +115,19 @@ class Model:
 
 
 class Driver:
-    """The driver's law, once per cycle: what is sent is within the arm's rules, whatever a policy says.
+    """The driver, once per cycle: control law, low-pass and safety filter. Its torque respects the arm's limits.
 
     Attributes:
-        effort: (n,) Nm, the target as it has come through the low-pass. stopping: why the arm is being brought to
-            rest, or None. limited: in how many cycles of the motion the law changed what was asked for.
+        effort: (n,) Nm, the target torque after the low-pass. stopping: why the arm is brought to rest, or None.
+        limited: number of cycles of the motion in which the safety filter changed the command.
 
     Args:
-        law: of a contract. model: of the same. soft_start_s: s, over which the torque of a motion fades in.
+        law: of a contract. model: of the same. soft_start_s: s over which the torque of a motion fades in.
+        control: `Control` of the contract; None: commands are torques.
     """
 
-    def __init__(self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0):
-        self._model, self._number = model, law["number"]
+    def __init__(self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0, control: Any = None):
+        self._model, self._number, self._control = model, law["number"], control
         none = {"q_low": -np.inf, "q_stop_low": -np.inf}
         self._j = {k: per_joint(v, none.get(k, np.inf)) for k, v in law["joint"].items()}
         self._fade = round(soft_start_s / self._number["cycle_s"])
@@ -139,27 +140,29 @@ class Driver:
         self.stopping: str | None = None
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
         self.limited = 0
+        self._command: np.ndarray | None = None
+        if self._control is not None:
+            self._control.reset()
 
     @property
     def done(self) -> bool:
-        """Whether a motion that is being stopped is at rest, or has had its time."""
+        """Whether a motion that is being stopped is at rest, or its time is over."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
         return self.stopping is not None and (self._rests or over)
 
     def __call__(
-        self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, target: np.ndarray | None, placed: bool = False
+        self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, command: np.ndarray | None, placed: bool = False
     ) -> np.ndarray:
-        """Return the command (n,) Nm of this cycle.
+        """Return the torque command (n,) Nm of this cycle.
 
         Args:
-            q, dq: (n,) rad, rad/s, of this cycle. tau_J_d: (n,) Nm, what the arm applied last.
-            target: (n,) Nm that the policy wants; None where it has said nothing.
-            placed: whether the model is at q already.
+            q, dq: (n,) rad, rad/s, of this cycle. tau_J_d: (n,) Nm, the torque that the arm applied last.
+            command: (c,) of the controller; None: no new one. placed: whether the model is at q already.
         """
         j, c = self._j, self._number
         seen = bool(np.isfinite(q).all() and np.isfinite(dq).all())
-        if target is not None and np.isfinite(target).all():
-            self._target, self._silent = np.clip(target, -j["asked"], j["asked"]), 0
+        if command is not None and np.isfinite(command).all():
+            self._command, self._silent = command, 0
         else:
             self._silent += 1
         if self.stopping is None:
@@ -167,14 +170,20 @@ class Driver:
         stopping = self.stopping is not None
         self._damped += stopping
         self._rests = seen and bool((np.abs(dq) < c["still"]).all())
-        if stopping:  # from the speed that there is, at once
+        if stopping:  # brake from the present speed, at once
             self._target = np.zeros_like(self._target)
             if seen and self._damped == 1:
                 self._share = min(1.0, float((np.abs(dq) / j["most"]).max()))
             self._share = max(0.0, self._share - c["cycle_s"] / c["brake_s"])
+        elif self._command is not None:
+            target = self._command if self._control is None else self._control(q, dq, self._command)
+            if np.isfinite(target).all():
+                self._target = np.clip(target, -j["asked"], j["asked"])
+            else:
+                self.stopping, self._target = "the controller's torque is not finite", np.zeros_like(self._target)
         self._cycle += 1
-        wanted = self._target * (self._cycle / self._fade if self._cycle < self._fade else 1.0)
-        self._filtered = self._filtered + c["low_pass"] * (wanted - self._filtered)
+        faded = self._target * (self._cycle / self._fade if self._cycle < self._fade else 1.0)
+        self._filtered = self._filtered + c["low_pass"] * (faded - self._filtered)
         self.effort = self.effort + np.clip(self._clipped(self._filtered) - self.effort, -j["step"], j["step"])
         last = tau_J_d if np.isfinite(tau_J_d).all() else self._sent
         if seen:
@@ -249,7 +258,7 @@ class Driver:
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))
         push = np.zeros_like(ddq)
-        for turn in range(c["rounds"]):
+        for iteration in range(c["rounds"]):
             at = np.flatnonzero(side)
             push = np.zeros_like(ddq)
             push[at] = np.linalg.solve(mobility[np.ix_(at, at)], np.where(side > 0, high, low)[at] - ddq[at])
@@ -259,6 +268,6 @@ class Driver:
             changed = np.flatnonzero(other != side)
             if not len(changed):
                 break
-            changed = changed if turn < c["pivots"] else changed[-1:]
+            changed = changed if iteration < c["pivots"] else changed[-1:]
             side[changed] = other[changed]
         return push

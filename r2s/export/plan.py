@@ -1,40 +1,40 @@
-"""What a policy that follows plans needs beside the law, in NumPy: a second writing of what r2s/tasks/track.py does.
+"""Plans of a policy that tracks a trajectory, in NumPy: a second implementation of r2s/tasks/track.py.
 
-A plan is a timed path, a row for each control step: the hand's place and velocity, the joints' angles, speeds and
-accelerations. It needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
+A plan is a timed path with a row per control step: position and velocity of the end effector, and angles, speeds and
+accelerations of the joints. It needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
 """
 
 from typing import Any
 
 import numpy as np
 
-from r2s.export.base import Base, check_base
+from r2s.export.control import Control
+from r2s.export.inverse_dynamics import InverseDynamics, check_model
 from r2s.export.law import BundleError, Model
 
 COLUMNS = ("place", "velocity", "q", "dq", "ddq")  # of a plan
-# what an entry of an observation may be made of where a goal is a plan, beside what it is of a point
-OF_PLAN = ("ahead", "velocity", "limited", "q_off", "dq_off", "base")
+# sources of observation terms if goals are plans, beside those with points
+OF_PLAN = ("ahead", "velocity", "limited", "q_off", "dq_off", "control")
 
 
 def width(of: str, joints: int, preview: int) -> int:
-    """Return how many numbers there are in an entry of an observation."""
+    """Return the size of an observation term."""
     return {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}.get(of, joints)
 
 
 def check_goal(contract: dict[str, Any]) -> None:
-    """Raise BundleError where what a contract says of goals, preview and base cannot be."""
-    n, goal, base, seen = len(contract["joints"]), contract["goal"], contract["base"], contract["observation"]
+    """Raise BundleError if goal, preview and controller of a contract are inconsistent."""
+    n, goal, seen = len(contract["joints"]), contract["goal"], contract["observation"]
+    model = contract["control"]["model"]
     preview, made = seen["preview"], {entry["of"] for entry in seen["entries"]}
     if goal["kind"] == "point":
         if preview:
-            raise BundleError(f"contract.json: observations of preview {preview}; a goal that is a point has none")
-        if base is not None:
-            raise BundleError("contract.json: a base, which a goal that is a point does not have")
+            raise BundleError(f"contract.json: observation.preview is {preview}; with point goals it is 0")
         if goal["shape"] != [3]:
-            raise BundleError(f"contract.json: a point of shape {goal['shape']}; [3] is allowed")
+            raise BundleError(f"contract.json: expected goal.shape [3], got {goal['shape']}")
         return
     if goal["kind"] != "plan":
-        raise BundleError(f"contract.json: goals are '{goal['kind']}'; this runtime takes 'point' and 'plan'")
+        raise BundleError(f"contract.json: goal.kind is '{goal['kind']}'; allowed: point, plan")
     if not isinstance(preview, int) or preview < 1 or not isinstance(goal["steps"], int) or goal["steps"] < 1:
         raise BundleError(f"contract.json: a preview of {preview} samples in {goal['steps']} steps")
     if goal["shape"] != [goal["steps"] + 1 + preview, 6 + 3 * n]:
@@ -50,64 +50,67 @@ def check_goal(contract: dict[str, Any]) -> None:
         raise BundleError(
             f"contract.json: plans of {goal['row_hz']} Hz and a policy of {contract['rates']['policy_hz']} Hz"
         )
-    if (base is None) == ("base" in made):
-        words = "a base that no observation has" if base else "observations of a base that is not there"
+    if (model is None) == ("control" in made):
+        words = (
+            "no observation term has the controller's torque" if model else "an observation term needs control.model"
+        )
         raise BundleError(f"contract.json: {words}")
-    if base is not None:
-        check_base(base, n)
+    if model is not None:
+        check_model(model, n)
 
 
 class Follower:
-    """Where in a plan a policy is, what it sees of it, and what its torque is added to.
+    """Position in a plan: what the policy observes of it, and the setpoints of the controller.
 
     Args:
-        contract: whose goals are plans.
+        contract: with plans as goals. control: its controller.
     """
 
-    def __init__(self, contract: dict[str, Any]):
+    def __init__(self, contract: dict[str, Any], control: Control):
         goal = contract["goal"]
         self._steps, self._hz, self._preview = goal["steps"], goal["row_hz"], contract["observation"]["preview"]
         self._at = {name: slice(*goal["columns"][name]) for name in COLUMNS}
-        self._base = None if contract["base"] is None else Base(contract)
+        self._control = control
+        self._dynamics = None if contract["control"]["model"] is None else InverseDynamics(contract)
+        self._setpoints = np.zeros((1, 0))
         self._shape, self._plan = tuple(goal["shape"]), np.zeros(0)
 
     def take(self, plan: Any) -> None:
-        """Take the plan of the next motion; raise BundleError where there is none, of the size and finite."""
+        """Take the plan of the next motion; raise BundleError if it is missing, of another size, or not finite."""
         if plan is None:
-            raise BundleError("the policy of this bundle follows plans: one is told to `reset`")
+            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
         plan = np.array(plan, dtype=float)
         if plan.shape != self._shape:
-            raise BundleError(f"the plan is of shape {plan.shape}; {self._shape} is allowed")
+            raise BundleError(f"expected a plan of shape {self._shape}, got {plan.shape}")
         if not (good := np.isfinite(plan)).all():
             row, column = np.argwhere(~good)[0]
-            raise BundleError(
-                f"the plan is {plan[row, column]} in row {row}, column {column}; finite ones are allowed"
-            )
-        if self._base is not None:
+            raise BundleError(f"expected a finite plan, got {plan[row, column]} in row {row}, column {column}")
+        if self._dynamics is not None:
             q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))
-            self._base.prepare(q, dq, ddq, self._hz, self._steps + 1)
+            self._setpoints = self._dynamics.setpoints(q, dq, ddq, self._hz, self._steps + 1)
         self._plan = plan
 
     def __call__(
         self, step: int, q: np.ndarray, dq: np.ndarray, ee: np.ndarray, limited: float
     ) -> dict[str, np.ndarray]:
-        """Return what there is to see of the plan in a control step: `goal`, where the hand is to be, and OF_PLAN.
+        """Return the observation sources of a control step: `goal`, the reference position, OF_PLAN, and `setpoint`.
 
-        Beyond the last step the plan's end is held.
+        After the last step the reference stays at the end of the plan.
 
         Args:
-            step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the hand.
-            limited: share of the last control period in which the law changed what was asked for.
+            step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the end effector.
+            limited: share of the last control period in which the safety filter changed the command.
         """
         if not self._plan.size:
-            raise BundleError("the policy of this bundle follows plans: one is told to `reset`")
+            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
         row, at, plan = min(step, self._steps), self._at, self._plan
         now = plan[row]
         made = {"goal": now[at["place"]], "velocity": now[at["velocity"]], "limited": np.array([limited])}
         made["ahead"] = (plan[row + 1 : row + 1 + self._preview, at["place"]] - ee).ravel()
         made |= {"q_off": now[at["q"]] - q, "dq_off": now[at["dq"]] - dq}
-        if self._base is not None:
-            made["base"] = self._base(row, q, dq)
+        if self._dynamics is not None:
+            made["setpoint"] = self._setpoints[row]
+            made["control"] = self._control.at_rest(q, dq, made["setpoint"])
         return made
 
 

@@ -1,14 +1,14 @@
-"""A bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, and nothing of r2s.
+"""Run a bundle of `r2s export` on an arm. This file needs NumPy and ONNX Runtime, and nothing of r2s.
 
-    python r2s_runtime.py BUNDLE         is it whole, and what does it want of an arm?
+    python r2s_runtime.py BUNDLE         check the bundle, and print what it requires of an arm
 
     runtime = Runtime("BUNDLE", Arm(joints=[...], cycle_hz=1000, torque="without gravity", ...))
     runtime.reset()                      # at rest, before a motion
     while not runtime.done:              # every millisecond
         tau = runtime(q, dq, tau_J_d, goal)
 
-Where a policy follows plans, its plan is told to `reset`, and no goal in a cycle; `plan` makes one of joint angles.
-What the bundle wants stands in its contract.json. What does not fit it is a BundleError of one line.
+A policy that follows plans takes its plan in `reset`, and no goal in a cycle; `plan` makes one of joint angles. The
+requirements of the bundle are in its contract.json. A mismatch raises a BundleError of one line.
 """
 
 import hashlib
@@ -21,23 +21,24 @@ from typing import Any
 
 import numpy as np
 
+from r2s.export.control import Control, check_control
 from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number, per_joint
 from r2s.export.plan import OF_PLAN, Follower, check_goal, plan_of, width
 
-FORMAT = 2
+FORMAT = 3
 CONVENTION = "without gravity"
-# what an entry of an observation may be made of; `pull` is J^T error
+# sources of observation terms; `pull` is J^T error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
 
 
 @dataclass(frozen=True)
 class Arm:
-    """What the arm is that a bundle is to run on; the bundle is refused where it was made for another.
+    """The arm that a bundle runs on; a bundle made for another arm is refused.
 
     Attributes:
-        joints: their names, from the base on. cycle_hz: of its torque commands.
-        torque: "without gravity" where the arm adds its own compensation of gravity, as libfranka's do.
-        q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. One for each joint: what the arm allows.
+        joints: names, from the base on. cycle_hz: rate of its torque commands.
+        torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
+        q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. Limits of the arm, one per joint.
     """
 
     joints: Sequence[str]
@@ -51,9 +52,9 @@ class Arm:
 
 
 def seal_of(contract: dict[str, Any]) -> str:
-    """Return the digest of all that a contract says."""
-    said = {k: v for k, v in contract.items() if k != "seal"}
-    return hashlib.sha256(json.dumps(said, sort_keys=True, allow_nan=False).encode()).hexdigest()
+    """Return the digest of a contract without its seal."""
+    sealed = {k: v for k, v in contract.items() if k != "seal"}
+    return hashlib.sha256(json.dumps(sealed, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def load(folder: str | Path) -> dict[str, Any]:
@@ -86,62 +87,58 @@ def load(folder: str | Path) -> dict[str, Any]:
 
 
 def _check(contract: dict[str, Any]) -> None:
-    """Raise BundleError where a contract says what cannot be, or what this runtime does not do."""
+    """Raise BundleError if a contract is inconsistent, or needs what this runtime does not have."""
     n, rates, torque, seen = len(contract["joints"]), contract["rates"], contract["torque"], contract["observation"]
     law, model = contract["law"], contract["model"]
     lists = {f"limits.{k}": v for k, v in contract["limits"].items()} | {"model.links": model["links"]}
-    lists |= {f"torque.{k}": torque[k] for k in ("max_Nm", "max_rate_Nm_per_s", "asked_for_Nm", "action_Nm")}
+    lists |= {f"torque.{k}": torque[k] for k in ("max_Nm", "max_rate_Nm_per_s", "limit_Nm")}
     lists |= {f"law.joint.{k}": law["joint"][k] for k in LAW_JOINT} | {"model.rotors": model["rotors"]}
     for name, values in lists.items():
         if len(values) != n:
-            raise BundleError(f"contract.json: {name} is of {len(values)} joints, the arm has {n}")
+            raise BundleError(f"contract.json: expected {n} joints, got {len(values)} ({name})")
     if missing := [k for k in LAW_NUMBER if not is_number(law["number"].get(k))]:
         raise BundleError(f"contract.json: law.number.{missing[0]} is missing")
     step = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
-    same = {"tau_max": torque["max_Nm"], "asked": torque["asked_for_Nm"], "step": step}
+    same = {"tau_max": torque["max_Nm"], "asked": torque["limit_Nm"], "step": step}
     same["dq_max"] = contract["limits"]["dq_max_rad_per_s"]
     for name, values in same.items():
         if law["joint"][name] != values:
-            raise BundleError(f"contract.json: law.joint.{name} is {law['joint'][name]}, elsewhere it is {values}")
+            raise BundleError(f"contract.json: law.joint.{name} is {law['joint'][name]}, expected {values}")
     if torque["convention"] != CONVENTION:
-        raise BundleError(f"contract.json: torque '{torque['convention']}'; this runtime sends it '{CONVENTION}'")
+        raise BundleError(f"contract.json: expected torque '{CONVENTION}', got '{torque['convention']}'")
     cycle, policy = rates["cycle_hz"], rates["policy_hz"]
     if cycle != round(1 / law["number"]["cycle_s"]) or policy <= 0 or cycle % policy:
-        raise BundleError(f"contract.json: a policy of {policy} Hz in a cycle of {cycle} Hz; the law's is of 1000 Hz")
+        raise BundleError(f"contract.json: a policy at {policy} Hz in a cycle at {cycle} Hz; the cycle is 1000 Hz")
     if seen["history"]:
-        raise BundleError(f"contract.json: observations of history {seen['history']}; this runtime has none to give")
+        raise BundleError(f"contract.json: observation.history is {seen['history']}; this runtime has no history")
     check_goal(contract)
-    asked, action = torque["asked_for_Nm"], torque["action_Nm"]
-    if any(x > most if contract["base"] else x != most for x, most in zip(action, asked, strict=True)):
-        raise BundleError(f"contract.json: an action of 1 is {action} Nm, the most that is asked for {asked}")
+    check_control(contract)
     at, known = 0, (*MADE_OF, *OF_PLAN) if contract["goal"]["kind"] == "plan" else MADE_OF
     for entry in seen["entries"]:
         wide = width(entry["of"], n, seen["preview"])
         if entry["of"] not in known or entry["slice"] != [at, at + wide]:
             raise BundleError(
-                f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; {at} is next"
+                f"contract.json: observation '{entry['name']}' is {entry['of']} at {entry['slice']}; {at} comes next"
             )
         at += wide
     if at != seen["size"]:
-        raise BundleError(f"contract.json: {at} observations in all, and {seen['size']} as it says")
+        raise BundleError(f"contract.json: expected {seen['size']} observations, got {at}")
 
 
 def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError where a bundle was made for another arm, or asks for more than this one allows."""
+    """Raise BundleError if a bundle was made for another arm, or exceeds the limits of this one."""
     own, n = contract["joints"], len(contract["joints"])
     if len(arm.joints) != n:
-        raise BundleError(f"the arm has {len(arm.joints)} joints, the bundle is of {n}")
+        raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")
     for j, (theirs, ours) in enumerate(zip(arm.joints, own, strict=True), 1):
         if theirs != ours:
-            raise BundleError(f"joint {j} of the arm is '{theirs}', of the bundle '{ours}'")
+            raise BundleError(f"expected joint {j} '{ours}', got '{theirs}' of the arm")
     if arm.cycle_hz != contract["rates"]["cycle_hz"]:
         raise BundleError(
-            f"the arm's cycle is of {arm.cycle_hz:g} Hz, the bundle's of {contract['rates']['cycle_hz']} Hz"
+            f"expected a cycle of {contract['rates']['cycle_hz']} Hz, got {arm.cycle_hz:g} Hz of the arm"
         )
     if arm.torque != contract["torque"]["convention"]:
-        raise BundleError(
-            f"the arm takes torque '{arm.torque}', the bundle gives '{contract['torque']['convention']}'"
-        )
+        raise BundleError(f"expected torque '{contract['torque']['convention']}', got '{arm.torque}' of the arm")
     limits, torque = contract["limits"], contract["torque"]
     asked = {"q_max": ("rad", limits["q_max_rad"]), "dq_max": ("rad/s", limits["dq_max_rad_per_s"])}
     asked |= {"tau_max": ("Nm", torque["max_Nm"]), "dtau_max": ("Nm/s", torque["max_rate_Nm_per_s"])}
@@ -149,27 +146,27 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
     for name, (unit, most) in asked.items():
         allowed = np.array(getattr(arm, name), dtype=float)
         sign = -1.0 if name == "q_min" else 1.0
-        wanted = per_joint(most, sign * np.inf)
+        needed = per_joint(most, sign * np.inf)
         if allowed.shape != (n,):
-            raise BundleError(f"{name} of the arm has {allowed.size} values, the bundle is of {n} joints")
-        if (beyond := ~(sign * allowed >= sign * wanted)).any():
+            raise BundleError(f"expected {n} values of {name}, got {allowed.size} of the arm")
+        if (beyond := ~(sign * allowed >= sign * needed)).any():
             j = int(beyond.argmax())
             raise BundleError(
-                f"{name} of joint {j + 1} is {allowed[j]:g} {unit} at the arm; the bundle goes to {wanted[j]:g}"
+                f"{name} of joint {j + 1}: the arm allows {allowed[j]:g} {unit}, the bundle needs {needed[j]:g}"
             )
 
 
 class Runtime:
-    """A policy and its driver: joint states in, the torque of each cycle out.
+    """A policy with its controller and driver: joint states in, the torque of each cycle out.
 
     Attributes:
-        contract: what the bundle says. driver: see there.
+        contract: of the bundle. driver: see `Driver`.
 
     Args:
-        folder: the bundle. arm: what it is to run on. soft_start_s: s, over which the torque of a motion fades in.
+        folder: the bundle. arm: the arm that it runs on. soft_start_s: s over which the torque of a motion fades in.
 
     Raises:
-        BundleError: the bundle is not whole, is of another arm, or its policy is not what its contract says.
+        BundleError: the bundle is damaged or made for another arm, or its policy does not match its contract.
     """
 
     def __init__(self, folder: str | Path, arm: Arm, soft_start_s: float = 0.0):
@@ -178,7 +175,7 @@ class Runtime:
         self.contract = contract = load(folder)
         fits(contract, arm)
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # others would be waited for
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # no waiting for other threads
         try:
             policy = onnxruntime.InferenceSession(str(Path(folder) / "policy.onnx"), options)
         except Exception as error:  # of many kinds
@@ -187,12 +184,13 @@ class Runtime:
         (taken,) = policy.get_inputs()
         if taken.shape[-1] != contract["observation"]["size"]:
             size = contract["observation"]["size"]
-            raise BundleError(f"contract.json: observations of {size} numbers, policy.onnx takes {taken.shape[-1]}")
+            raise BundleError(f"contract.json: {size} observations, policy.onnx takes {taken.shape[-1]}")
         self._policy, self._model = policy, Model(contract["model"])
-        self.driver = Driver(contract["law"], self._model, soft_start_s)
+        self._control = Control(contract)
+        self.driver = Driver(contract["law"], self._model, soft_start_s, self._control)
         self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
         self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
-        self._follower = Follower(contract) if contract["goal"]["kind"] == "plan" else None
+        self._follower = Follower(contract, self._control) if contract["goal"]["kind"] == "plan" else None
         self._cycle = self._limited = 0
 
     def reset(self, plan: np.ndarray | None = None) -> None:
@@ -200,10 +198,10 @@ class Runtime:
 
         Args:
             plan: (rows, columns) as of `goal` of the contract, where the policy follows plans; the arm is at the
-                angles of its first row. With a base it takes a tenth of a second to be worked out.
+                angles of its first row. The setpoints of computed torque take a tenth of a second.
 
         Raises:
-            BundleError: the plan is of another size or not finite, there is none, or the policy takes points.
+            BundleError: the plan is missing, of another size or not finite, or the policy takes points.
         """
         if self._follower is not None:
             self._follower.take(plan)
@@ -214,7 +212,7 @@ class Runtime:
 
     @property
     def done(self) -> bool:
-        """Whether the driver has brought the arm to rest; `driver.stopping` says why."""
+        """Whether the driver has brought the arm to rest; `driver.stopping` is the reason."""
         return self.driver.done
 
     def __call__(
@@ -223,8 +221,8 @@ class Runtime:
         """Return the torque (n,) Nm to send in this cycle.
 
         Args:
-            q, dq: (n,) rad, rad/s, as the arm measures them. tau_J_d: (n,) Nm, what it applied last.
-            goal: (3,) m in the base frame, finite; None where the policy follows a plan, whose time is the number of
+            q, dq: (n,) rad, rad/s, as measured. tau_J_d: (n,) Nm, the torque that the arm applied last.
+            goal: (3,) m in the base frame, finite; None if the policy follows a plan, whose time is the number of
                 cycles since `reset`.
 
         Raises:
@@ -242,18 +240,19 @@ class Runtime:
             raise BundleError(
                 f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and {size} are allowed"
             )
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is the driver's to stop
+        with np.errstate(invalid="ignore", over="ignore"):  # the driver stops at values that are not finite
             self._model.place(q)
-            target = None
+            command = None
             if self._cycle % self._every == 0:
                 made = self._look(q, dq, goal)
                 seen = self.observe(made)
-                target = self.act(seen) + made.get("base", 0.0) if np.isfinite(seen).all() else None
+                if np.isfinite(seen).all():
+                    command = np.concatenate([self.act(seen), made.get("setpoint", np.zeros(0))])
             self._cycle += 1
-            return self.driver(q, dq, tau_J_d, target, placed=True)
+            return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> dict[str, np.ndarray]:
-        """Return what observations of this control step are made of; the model has been placed at q."""
+        """Return the observation sources of this control step; the model is at q already."""
         ee, jacobian = self._model.hand()
         made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort}
         if self._follower is not None:
@@ -266,14 +265,14 @@ class Runtime:
         return made | {"pull": jacobian.T @ made["error"]}
 
     def observe(self, made: dict[str, np.ndarray]) -> np.ndarray:
-        """Return the observation (d,) float32 of what `_look` saw."""
+        """Return the observation (d,) float32 of the sources of `_look`."""
         scaled = [made[of] if by is None else made[of] / by for of, by, _ in self._entries]
         parts = [np.tanh(x) if tanh else x for x, (_, _, tanh) in zip(scaled, self._entries, strict=True)]
         return np.concatenate(parts).astype(np.float32)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) Nm that the policy wants at an observation (d,); a base is not in it."""
-        return self._policy.run(["torque"], {"observation": observation[None]})[0][0].astype(float)
+        """Return the action (a,) in SI units at an observation (d,)."""
+        return self._policy.run(None, {"observation": observation[None]})[0][0].astype(float)
 
     def plan(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return the plan that goes through joint angles q, dq, ddq (rows, n) rad, rad/s, rad/s^2; between motions.
@@ -289,34 +288,34 @@ class Runtime:
         q, dq, ddq = (np.asarray(x, dtype=float) for x in (q, dq, ddq))
         allowed = self.contract["goal"]["shape"][0], self._model.n
         if not q.shape == dq.shape == ddq.shape == allowed:
-            raise BundleError(f"q, dq and ddq are of shapes {q.shape}, {dq.shape}, {ddq.shape}; {allowed} is allowed")
+            raise BundleError(f"expected q, dq and ddq of shape {allowed}, got {q.shape}, {dq.shape}, {ddq.shape}")
         return plan_of(self._model, q, dq, ddq)
 
 
 def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
-    """Raise BundleError where policy.onnx says another thing of itself than the contract."""
-    limits, torque, rates = contract["limits"], contract["torque"], contract["rates"]
+    """Raise BundleError if the metadata of policy.onnx differ from the contract."""
+    limits, torque, rates, control = (contract[k] for k in ("limits", "torque", "rates", "control"))
 
     def words(values: Sequence[float | None], none: str = "inf") -> str:
         return " ".join(none if v is None else f"{v:g}" for v in values)
 
-    said = {"joints": " ".join(contract["joints"]), "observation": contract["observation"]["words"]}
-    said |= {"policy_hz": str(rates["policy_hz"]), "low_pass_hz": str(rates["low_pass_hz"])}
-    said |= {"q_min_rad": words(limits["q_min_rad"], "-inf"), "q_max_rad": words(limits["q_max_rad"])}
-    said |= {"dq_max_rad_per_s": words(limits["dq_max_rad_per_s"]), "torque_max_Nm": words(torque["max_Nm"])}
-    said["torque_rate_max_Nm_per_s"] = words(torque["max_rate_Nm_per_s"])
-    said |= {"torque_scale_Nm": words(torque["action_Nm"])}
-    for name, value in said.items():
+    expected = {"joints": " ".join(contract["joints"]), "observation": contract["observation"]["words"]}
+    expected |= {"policy_hz": str(rates["policy_hz"]), "low_pass_hz": str(rates["low_pass_hz"])}
+    expected |= {"q_min_rad": words(limits["q_min_rad"], "-inf"), "q_max_rad": words(limits["q_max_rad"])}
+    expected |= {"dq_max_rad_per_s": words(limits["dq_max_rad_per_s"]), "torque_max_Nm": words(torque["max_Nm"])}
+    expected["torque_rate_max_Nm_per_s"] = words(torque["max_rate_Nm_per_s"])
+    expected |= {"control": control["name"], "action_scale": words(control["action_scale"])}
+    for name, value in expected.items():
         if metadata.get(name) != value:
-            raise BundleError(f"contract.json says {name} '{value}', policy.onnx '{metadata.get(name)}'")
+            raise BundleError(f"{name}: '{value}' in contract.json, '{metadata.get(name)}' in policy.onnx")
     if not metadata.get("torque", "").startswith(torque["convention"]):
         raise BundleError(
-            f"contract.json says torque '{torque['convention']}', policy.onnx '{metadata.get('torque')}'"
+            f"torque: '{torque['convention']}' in contract.json, '{metadata.get('torque')}' in policy.onnx"
         )
 
 
 def main() -> int:
-    """Say what a bundle wants of an arm, and whether it is whole."""
+    """Check a bundle, and print what it requires of an arm."""
     try:
         contract = load(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent)
     except BundleError as error:

@@ -1,1 +1,6 @@
-"""Real2Sim: the friction, inertia, offsets and delay with which a simulated arm moves as the recorded one did."""
+"""Real2Sim: estimate friction, inertia, offsets and timing of an arm from a recording.
+
+identify.py is the entry and lists the steps. residuals/ compares a model with a recording, structure/ selects
+friction family and terms by cross-validation, friction/ estimates breakaway, presliding and stiction, search/
+minimizes.
+"""

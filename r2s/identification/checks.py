@@ -1,42 +1,42 @@
-"""Whether a recording fits the arm, before anything is fitted to it."""
+"""Checks of a recording before a fit: joints, limits, enough motion, damaged rows, units."""
 
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.identification.plausible import OVER_LIMIT, check_numbers
-from r2s.identification.windows import MOVED
+from r2s.identification.residuals.windows import MOVED
+from r2s.identification.unit_checks import OVER_LIMIT, check_units
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-SPIKE = 5.0  # times the fastest joint and the largest torque: what no sensor's noise reaches
-NONSENSE = 1e9  # times those: no unit is so far off, and squares of more would not be numbers
-JUMP = 0.05  # rad, that q may jump beside, as encoders do
+SPIKE = 5.0  # times the largest speed and torque: above the noise of any sensor
+NONSENSE = 1e9  # times those: no unit is so far off, and larger squares would overflow
+JUMP = 0.05  # rad, that an encoder may jump
+MARGIN = 0.05  # rad beyond the position limits: logs of arms at their limits do occur
+LEAST_S = 1.0  # s of motion
 
 
 def check_recording(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if a user's recording does not fit the arm (`check_motion`) or is in other units."""
+    """Raise UserError if a user's recording does not fit the arm (`check_motion`), is damaged or has other units."""
     check_motion(robot, recording)
     _check_spikes(robot, recording, NONSENSE)
-    check_numbers(robot, recording)
+    check_units(robot, recording)
     _check_spikes(robot, recording, SPIKE)
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if the recording is not of this arm, leaves its limits or hardly moves."""
-    if recording.n_joints != robot.n:
-        raise UserError(f"the recording has {recording.n_joints} joints, {robot.name} has {robot.n}")
-    _check_limits(robot, recording, "the recording")
+    """Raise UserError if the recording is of another arm, exceeds its limits or hardly moves."""
+    _check_joints(robot, recording, "the recording")
     moved = np.ptp(recording.q, axis=0)
-    if moved.max() < MOVED or recording.duration < 1.0:
+    if moved.max() < MOVED or recording.duration < LEAST_S:
         raise UserError(
-            f"the recording has not enough motion to identify anything: {recording.duration:.2f} s in which the "
-            f"joint that moves most moves {moved.max():.4f} rad; at least 1 s and {MOVED:g} rad are needed"
+            f"the recording: expected at least {LEAST_S:g} s in which a joint moves {MOVED:g} rad, got "
+            f"{recording.duration:.2f} s and {moved.max():.4f} rad"
         )
 
 
 def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
-    """Raise UserError where a row has `most` times what this arm can, as a damaged file does."""
+    """Raise UserError for a row beyond `most` times the limits of the arm, as in a damaged file."""
     r = recording
     speed = most * robot.dq_max
     jumps = np.zeros_like(r.q)
@@ -50,17 +50,14 @@ def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
         if share[row, j] > 1:
             raise UserError(
                 f"the recording: {field} of joint {j + 1} is {getattr(r, field)[row, j]:.4g} {unit} at row {row}, "
-                f"more than {most:g} times what {robot.name} can: is the file damaged?"
+                f"more than {most:g} times the limit of {robot.name}: is the file damaged?"
             )
 
 
 def check_ramps(robot: Robot, ramps: Ramps) -> None:
-    """Raise UserError if the ramps are not of this arm, leave its limits or are in other units."""
-    r = ramps.recording
-    if r.n_joints != robot.n:
-        raise UserError(f"the ramps have {r.n_joints} joints, {robot.name} has {robot.n}")
-    _check_limits(robot, r, "the ramps")
-    most = np.abs(r.tau).max(0)
+    """Raise UserError if the ramps are of another arm, exceed its limits or have other units."""
+    _check_joints(robot, ramps.recording, "the ramps")
+    most = np.abs(ramps.recording.tau).max(0)
     j = int((most / robot.tau_max).argmax())
     if most[j] > OVER_LIMIT * robot.tau_max[j]:
         raise UserError(
@@ -69,10 +66,11 @@ def check_ramps(robot: Robot, ramps: Ramps) -> None:
         )
 
 
-def _check_limits(robot: Robot, recording: Recording, what: str) -> None:
-    """Raise UserError where `what` leaves the position limits."""
-    margin = 0.05  # rad: logs of arms that touch their limits are not unheard of
-    out = np.maximum(robot.q_min - margin - recording.q.min(0), recording.q.max(0) - robot.q_max - margin)
+def _check_joints(robot: Robot, recording: Recording, what: str) -> None:
+    """Raise UserError if `what` has another number of joints or exceeds the position limits."""
+    if recording.n_joints != robot.n:
+        raise UserError(f"{what}: expected {robot.n} joints of {robot.name}, got {recording.n_joints}")
+    out = np.maximum(robot.q_min - MARGIN - recording.q.min(0), recording.q.max(0) - robot.q_max - MARGIN)
     if out.max() > 0:
         j = int(out.argmax())
         worst = recording.q[:, j].min() if recording.q[:, j].min() < robot.q_min[j] else recording.q[:, j].max()

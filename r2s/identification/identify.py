@@ -1,55 +1,133 @@
-"""Real2Sim: find friction, inertia, offsets and delay that make the simulated arm do what the recorded one did.
+"""Real2Sim: estimate the parameters with which the simulated arm reproduces a recording.
 
-`identify` goes: friction family (compared on motion left out, with family=auto) -> the searches one after the other
--> again, weighed by what was left unexplained -> breakaway -> the joint distribution of what was found. The paper's
-algorithm is search=ga on the residual of eq. (8).
+`identify` runs STEPS in order; each is a function from one immutable `State` to the next. The paper's algorithm is
+search=ga on the residual of eq. (8).
 """
 
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
-from r2s.identification.breakaway import Breakaway, breakaway
-from r2s.identification.bristles import NAME as PRESLIDING
-from r2s.identification.bristles import Bending, bending
 from r2s.identification.checks import check_motion
-from r2s.identification.dead_zone import stiction
-from r2s.identification.family_selection import compare_families, joints_kept
-from r2s.identification.problem import (
-    Known,
-    Problem,
-    Report,
-    Search,
-    answers_early,
-    believed,
-    optional_friction,
-    searched,
-)
-from r2s.identification.replay_residual import ReplayResidual
+from r2s.identification.friction.breakaway import Breakaway, Slide, estimate_breakaway
+from r2s.identification.friction.presliding import NAME as PRESLIDING
+from r2s.identification.friction.presliding import Presliding, estimate_presliding
+from r2s.identification.friction.static_friction import StaticFriction
+from r2s.identification.friction.stiction import choose_stiction
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.posterior import posterior
+from r2s.identification.problem import Problem, Report, Search, fits_torque, implicit_friction
+from r2s.identification.residuals.replay_residual import ReplayResidual
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.residuals.windows import cut_windows
+from r2s.identification.result import IdentificationResult, conclude
 from r2s.identification.settings import Settings
-from r2s.identification.spare_terms import needed
-from r2s.identification.static_friction import StaticFriction
-from r2s.identification.term_selection import demanded
-from r2s.identification.torque_residual import TorqueResidual
-from r2s.identification.uncertainty import Identified, conclude, posterior
+from r2s.identification.structure.backward_elimination import eliminate_terms
+from r2s.identification.structure.cross_validation import CrossValidation
+from r2s.identification.structure.family_selection import compare_families
+from r2s.identification.structure.forward_selection import select_terms
+from r2s.identification.terms import add_terms, optional_friction, scaled_prior, search_space
 from r2s.physics.actuation import EARLY
-from r2s.physics.dynamics import HOLDS, Dynamics, of_family
+from r2s.physics.dynamics import STICTION_MODELS, Dynamics, with_family
 from r2s.physics.friction import FAMILIES
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
-STANDSTILL = 0.02  # rad/s: what friction is of a joint that is slower, or stands, its velocity does not tell
-REWEIGH = 2  # times that a local search goes on with weights from what is left unexplained
-ALIKE = 0.2  # share by which what counts as an independent row may be wrong
-CLEAR = 1.5  # of dq_min: joints that are slower may be in the dead zone
+STANDSTILL = 0.02  # rad/s, below which friction of a commanded arm is not a function of velocity
+CLEAR = 1.5  # times dq_min, below which a replayed joint may stick
+MAX_BATCH = 64  # candidates replayed at once
+REWEIGHTS = 2  # further fits of a local search, each with weights from the residual before
+ALIKE = 0.2  # relative error of the number of independent rows
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
+
+
+class History:
+    """Progress rows, stored with the arrays of each step so that a resumed run repeats them."""
+
+    def __init__(self, report: Report, memo: Memo):
+        self.rows: list[dict] = []
+        self._report, self._memo, self._began = report, memo, time.perf_counter()
+
+    def add(self, row: dict) -> None:
+        """Keep and report a row."""
+        self.rows.append(row | {"seconds": time.perf_counter() - self._began})
+        self._report(row)
+
+    def step(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return the arrays of `make`, or the stored ones of an interrupted run."""
+        before = len(self.rows)
+        done = self._memo(name, lambda: make() | {"history": json.dumps(self.rows[before:])})
+        if len(self.rows) == before:
+            self.rows.extend(json.loads(str(done["history"])))
+        return done
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """State of an identification between two steps.
+
+    Attributes:
+        robot to ramps: arguments of `identify`; `select_family` sets the family of `nominal`.
+        prior: standard deviations in SI units. terms: estimated beside friction.
+        families: error of held-out torque by family; empty if the family was given.
+        space: parameters and nominal values, with breakaway and stiction once they are estimated.
+        problem, u: least-squares problem and its solution (P,) on the unit cube.
+        edges, static_friction: breakaway commands from ramps, and friction at the onset of sliding (Stribeck
+            families).
+        refused: whether replays were discarded. dynamics: the arm with its breakaway torques.
+    """
+
+    robot: Robot
+    nominal: Dynamics
+    recording: Recording
+    searches: Sequence[Search]
+    settings: Settings
+    ramps: Ramps | None
+    prior: dict[str, ArrayLike]
+    history: History
+    terms: Sequence[str] = ()
+    families: dict[str, float] = field(default_factory=dict)
+    space: ParameterSpace = None  # type: ignore[assignment] # `formulate` sets these three
+    problem: Problem = None  # type: ignore[assignment]
+    u: np.ndarray = None  # type: ignore[assignment]
+    edges: Breakaway | None = None
+    static_friction: StaticFriction | None = None
+    refused: bool = False
+    dynamics: Dynamics = None  # type: ignore[assignment] # `fit_breakaway` sets it
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the torque is a command, which can be replayed and shows delay and breakaway."""
+        return self.recording.torque == "commanded"
+
+    @property
+    def slowest(self) -> float:
+        """rad/s, velocity from which torque rows count."""
+        return STANDSTILL if self.commanded else 0.0
+
+    @property
+    def cross_validation(self) -> CrossValidation:
+        """Data and settings of the selection steps."""
+        s, data = self.settings, (self.robot, self.nominal, self.recording)
+        return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add)
+
+    def fitted(self) -> Dynamics:
+        """Return the dynamics of u."""
+        return self.space.dynamics(self.space.from_unit(self.u))
+
+    def slide(self, arm: Dynamics) -> Slide | None:
+        """Return how joints slide after breakaway; None without a Stribeck rise, or if bristles creep."""
+        if self.static_friction is None or self.nominal.family.has_memory:
+            return None
+        return self.static_friction.slide(arm)
 
 
 def identify(
@@ -60,227 +138,216 @@ def identify(
     settings: Settings,
     *,
     ramps: Ramps | None = None,
-    seed: int = 0,
-    nthread: int = 0,
     report: Report = lambda row: None,
     memo: Memo = lambda name, make: make(),
-) -> Identified:
-    """Run the searches one after the other, each from where the last ended, and say how sure the result is.
+) -> IdentificationResult:
+    """Estimate the parameters of an arm, with intervals.
 
     Args:
-        robot: the arm.
-        nominal: where to start, and what blocks without bounds keep.
-        recording: what the arm did; its torque decides the residual (replay_residual.py or torque_residual.py).
-        searches: at least one.
-        settings: what is searched, within what, and how the residuals are made.
-        ramps: of the breakaway protocol; without them the dead zone's edges are looked for in the recording.
-        seed: of the draws of what was found.
-        nthread: 0 is all.
-        report: called with a row of history after every step or generation.
-        memo: called with the name of a step and a function that does it, returns its result; it may remember.
+        robot, nominal: the arm; start of the searches, and values of all other parameters.
+        recording: training motion; its torque level decides the residual.
+        searches: at least one; each starts where the one before ended.
+        settings: parameters, bounds, prior, and how residuals are computed.
+        ramps: of the breakaway protocol; without them breakaway is scanned for in the recording.
+        report: called with a row of progress after every step or generation.
+        memo: called with the name of a step and a function that computes its arrays; it may return stored ones.
 
     Raises:
         UserError: the recording does not fit the arm or hardly moves.
     """
     check_motion(robot, recording)
-    names = [f.name for f in FAMILIES]
-    bounds, family = settings.bounds, settings.family
-    prior = believed(settings.prior, robot, recording)
-    terms = list(settings.terms)
-    folds = settings.folds
-    began, history = time.perf_counter(), []
+    prior, history = scaled_prior(settings.prior, robot, recording), History(report, memo)
+    s = State(robot, nominal, recording, searches, settings, ramps, prior, history, settings.terms)
+    for step in STEPS:
+        s = step(s)
+    sure = history.step("posterior", lambda: posterior(s.problem, s.u, settings.seed)._asdict())
+    story = {"families": s.families, "edges": s.edges, "refused": s.refused}
+    return conclude(s.problem, s.space, sure, history=pd.DataFrame(history.rows), **story)
 
-    def told(row: dict) -> None:
-        history.append(row | {"seconds": time.perf_counter() - began})
-        report(row)
 
-    def step(name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Do a step, or remember it together with its rows of history."""
-        before = len(history)
-        done = memo(name, lambda: make() | {"history": json.dumps(history[before:])})
-        if len(history) == before:
-            history.extend(json.loads(str(done["history"])))
-        return done
-
-    how = {"cutoff_hz": settings.cutoff_hz}
-    commanded = recording.torque == "commanded"
-    slowest = STANDSTILL if commanded else 0.0
-    families: dict[str, float] = {}
+def select_family(s: State) -> State:
+    """Set the friction family: the given one, or for family=auto that with the least error of held-out torque."""
+    family, families = s.settings.family, {}
     if family == "auto":
-        given = robot, nominal, recording, bounds, prior, terms, folds, how, told, slowest
-        chosen = step("family", lambda: compare_families(*given))
-        families = dict(zip(names, np.asarray(chosen["error"]).tolist(), strict=True))
-        family = names[int(chosen["best"])]
-    nominal = of_family(nominal, family)
-    level = how | {"slowest": slowest}
-    # a term of friction that the family does not have
-    absent = {*optional_friction()} - {*nominal.family.optional}
-    if extra := [name for name in settings.extra if name not in absent]:
-        base = searched(robot, nominal, bounds, terms, recording)
+        found = s.history.step("family", lambda: compare_families(s.cross_validation, s.terms, s.slowest))
+        names = [f.name for f in FAMILIES]
+        families = dict(zip(names, np.asarray(found["error"]).tolist(), strict=True))
+        family = names[int(found["best"])]
+    return replace(s, nominal=with_family(s.nominal, family), families=families)
 
-        def choose() -> dict[str, Any]:
-            more = demanded(base, recording, bounds, prior, extra, folds, level, told)
-            return {"entered": [name in more for name in extra]}
 
-        entered = np.asarray(step("terms", choose)["entered"], dtype=bool)
-        terms = with_terms(terms, [name for name, enters in zip(extra, entered, strict=True) if enters])
-    if spare := [name for name in settings.spare if name in terms]:
+def add_candidate_terms(s: State) -> State:
+    """Add the candidate terms that improve held-out prediction."""
+    absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms of other families
+    candidates = [name for name in s.settings.candidate_terms if name not in absent]
+    if not candidates:
+        return s
+    given = s.cross_validation, s.terms, candidates, s.slowest
+    entered = s.history.step("candidate terms", lambda: select_terms(*given))["entered"]
+    return replace(s, terms=add_terms(s.terms, [name for name, e in zip(candidates, entered, strict=True) if e]))
 
-        def chosen_terms() -> dict[str, Any]:
-            left = needed(robot, nominal, recording, bounds, prior, terms, spare, folds, how, told)
-            return {"needed": [name in left for name in terms]}
 
-        is_needed = np.asarray(step("spare", chosen_terms)["needed"], dtype=bool)
-        terms = [name for name, keep in zip(terms, is_needed, strict=True) if keep]
-    space = searched(robot, nominal, bounds, terms, recording)
-    quick = TorqueResidual(robot, space, recording, **level)
-    data: ReplayResidual | TorqueResidual = quick
-    edges = breakaway(ramps) if commanded and ramps is not None else None  # a link-side sensor hides the motor's
-    started_on_level, replayed = on_level(searches[0]), not all(map(on_level, searches))
-    # how far the bristles are bent where a window starts nobody measured: replays would put right what is right
-    if commanded and replayed and not (nominal.family.has_memory and started_on_level):
-        data = ReplayResidual(
-            *(robot, space, recording),
-            window_s=settings.window_s,
-            stride=settings.stride,
-            slowest=0.0 if nominal.family.has_memory else CLEAR * nominal.dq_min,  # bristles have no dead zone
-            edges=None if edges is None else _not_held(edges.command),
-            batch=min(len(space.start) + 1, 64),
-            nthread=nthread,
-        )
-    still = None
-    if ramps is not None and edges is not None and "rise" in space.blocks:
-        still = StaticFriction(robot, ramps, edges)
-    beside: list[Known] = [] if still is None else [still]
-    falls = None if nominal.family.has_memory else still  # bristles creep, and a slide has none
+def prune_terms(s: State) -> State:
+    """Remove the prunable terms that held-out prediction does not need."""
+    prunable = [name for name in s.settings.prunable_terms if name in s.terms]
+    if not prunable:
+        return s
+    given = s.cross_validation, s.terms, prunable
+    needed = s.history.step("prunable terms", lambda: eliminate_terms(*given))["needed"]
+    return replace(s, terms=[name for name, keep in zip(s.terms, needed, strict=True) if keep])
 
-    kept = np.zeros(robot.n, dtype=bool)
-    if settings.keep_nominal:
-        kept = step("kept", lambda: {"kept": joints_kept(robot, space, recording, prior, folds, how)})["kept"]
-    problem_of = partial(Problem, prior=prior, kept=np.asarray(kept, dtype=bool), beside=beside)
-    problem = problem_of(data, quick)
-    u = problem.start
-    lag = space.where("lag") if "lag" in space.blocks else None
-    refused = False
 
-    def ended(name: str, search: Search, u: np.ndarray, report: Report = told) -> np.ndarray:
-        u = np.asarray(step(name, lambda: {"u": search(problem, u, report)})["u"])
-        if on_level(search):  # it weighs as it goes on; one that is remembered does not
-            problem.quick_data.adapt(space.from_unit(u), fitted=True)
-        return u
+def formulate(s: State) -> State:
+    """Set up the parameter space, the residuals and the problem."""
+    how, memory = s.settings, s.nominal.family.has_memory
+    space = search_space(s.robot, s.nominal, how.bounds, s.terms, s.recording)
+    torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
+    data: ReplayResidual | TorqueResidual = torque_data
+    edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
+    # replays start from unknown bristle deflections, which would spoil a good torque fit of a family with memory
+    if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
+        slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
+        released = None if edges is None else np.where(np.isnan(edges.command), [-np.inf, np.inf], edges.command)
+        windows = cut_windows(s.recording, how.window_s, slowest=slowest, edges=released)
+        batch = min(len(space.start) + 1, MAX_BATCH)
+        data = ReplayResidual(space, s.recording, windows, stride=how.stride, batch=batch, nthread=how.nthread)
+    static = None
+    if s.ramps is not None and edges is not None and "rise" in space.blocks:
+        static = StaticFriction(s.robot, s.ramps, edges)
+    problem = Problem.of(data, torque_data, s.prior, () if static is None else (static,))
+    return replace(s, space=space, problem=problem, u=problem.start, edges=edges, static_friction=static)
 
-    for k, search in enumerate(searches):
-        v = ended(f"search {k + 1}", search, u)
-        if commanded and on_level(search) and not k and answers_early(problem, v):
-            quick.ahead = EARLY * SIM_DT
-            v = ended("search 1, early", search, v)
-        if k and started_on_level and data is not quick and worse_on_level(problem, u, v):
-            refused, problem, data = True, problem_of(quick, quick), quick
-            break
+
+def fit(s: State) -> State:
+    """Run the searches in turn; refuse replays that disagree with the torque of moving joints."""
+    problem, u = s.problem, s.u
+    for k, search in enumerate(s.searches):
+        v, problem = _run(s, f"search {k + 1}", search, problem, u)
+        if s.commanded and fits_torque(search) and not k and implicit_friction(problem, v):
+            problem = problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT))
+            v, problem = _run(s, "search 1, implicit friction", search, problem, v)
+        if k and fits_torque(s.searches[0]) and problem.uses_replays and worse_on_torque(problem, u, v):
+            return replace(s, problem=replace(problem, data=problem.torque_data), u=u, refused=True)
         u = v
-        # what a first search leaves is not noise: weights come from what the last one could not explain
-        problem.adapt(u, fitted=k == len(searches) - 1 or on_level(search))
-    if ramps is not None and falls is not None:  # how the arm slides is known by now, and by that when it let go
-        arm = space.dynamics(space.from_unit(u))
-        edges = breakaway(ramps, delay=float(arm.delay), lag=float(arm.lag), slide=falls.slide(arm))
-        beside[:] = [falls := StaticFriction(robot, ramps, edges)]
-        problem = problem_of(data, quick)
-    if data is quick and commanded and PRESLIDING in space.blocks:
-
-        def bends() -> dict[str, np.ndarray]:
-            arm = space.dynamics(space.from_unit(u))
-            return bending(robot, arm, recording, quick, bounds, prior, told, seed=seed, nthread=nthread)
-
-        known = step("bristles", bends)
-        beside.append(Bending(known["presliding"], known["sigma"]))
-        data = TorqueResidual(robot, space, recording, **level, presliding_rad=known["presliding"])
-        data.ahead = quick.ahead
-        problem = problem_of(data, data)
-    last = searches[-1]
-    if last.local:  # a local search goes on from where it was, weighed by what is left unexplained
-
-        def again(row: dict) -> None:
-            told(row | {"search": f"{row['search']}, reweighed"})
-
-        for k in range(REWEIGH):
-            alone = lag is None or k < REWEIGH - 1
-            local = last if alone else partial(without_lag, last)
-            u = ended(f"reweighed {k + 1}", local, u, again)  # type: ignore[arg-type]
-            problem.adapt(u, fitted=True)
-        if lag is not None and np.array_equal(u[lag], problem.start[lag]):
-            problem.fix(lag)
-    dynamics = space.dynamics(space.from_unit(u))
-    if commanded and ramps is not None:
-        slide = None if falls is None else falls.slide(dynamics)
-        edges = breakaway(ramps, delay=float(dynamics.delay), lag=float(dynamics.lag), slide=slide)
-        command = _commands(edges, dynamics)
-        dynamics = replace(space, break_command=command).dynamics(space.from_unit(u))
-        dynamics = replace(dynamics, breakaway=StaticFriction(robot, ramps, edges).edges(dynamics))
-        command = np.where(edges.count > 0, dynamics.breakaway - dynamics.offset[:, None], command)
-        space = replace(space, break_command=command)
-    if commanded and not nominal.family.has_memory and (ramps is not None or settings.breakaway):
-        largest = settings.breakaway if ramps is None else None
-        rule_of = partial(stiction, window_s=settings.window_s, stride=settings.stride, nthread=nthread)
-        found = step("stiction", lambda: rule_of(robot, dynamics, recording, largest, told))
-        rule, dq_min = HOLDS[int(found["hold"])], float(found["dq_min"])
-        space = replace(space, nominal=replace(space.nominal, hold=rule, dq_min=dq_min))
-        if ramps is None:
-            space = replace(space, nominal=replace(space.nominal, breakaway=np.asarray(found["edges"])))
-    sure = step("posterior", lambda: posterior(problem, u, seed)._asdict())
-    return conclude(problem, space, sure, pd.DataFrame(history), families, edges, refused)
+        # the residual of a first search contains model error, so weights come from the last one
+        problem = problem.reweighted(u, fitted=k == len(s.searches) - 1 or fits_torque(search))
+    return replace(s, problem=problem, u=u)
 
 
-def on_level(search: Search) -> bool:
-    """Say whether a search minimises the residual on the level of torque, and needs no replays."""
-    return getattr(search, "level", "") == "torque"
+def reread_ramps(s: State) -> State:
+    """Estimate breakaway again with the fitted sliding motion, delay and lag."""
+    arm = s.fitted()
+    if s.ramps is None or (slide := s.slide(arm)) is None:
+        return s
+    edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=slide)
+    static = StaticFriction(s.robot, s.ramps, edges)
+    return replace(s, problem=replace(s.problem, extra=(static,)), edges=edges, static_friction=static)
 
 
-def with_terms(terms: Sequence[str], more: Sequence[str]) -> list[str]:
-    """Return the terms and `more`; a link has a tensor, so `link` takes the place of `inertia_scale`."""
-    return [name for name in terms if not (name == "inertia_scale" and "link" in more)] + list(more)
+def fit_presliding(s: State) -> State:
+    """Estimate the presliding distance from replays, for a family with memory that was fitted to torque."""
+    if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
+        return s
+    how, torque_data = s.settings, s.problem.torque_data
+    given = s.fitted(), s.recording, torque_data, how.bounds, s.prior
+    rest: dict[str, Any] = {"report": s.history.add, "seed": how.seed, "nthread": how.nthread}
+    found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
+    rest = {"cutoff_hz": how.cutoff_hz, "slowest": s.slowest, "presliding_rad": found["presliding"]}
+    data = TorqueResidual(s.space, s.recording, **rest).with_lead(torque_data.lead_s)
+    extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
+    return replace(s, problem=Problem.of(data, data, s.prior, extra))
 
 
-def worse_on_level(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
-    """Say whether v (P,) explains torque clearly worse than u (P,), the fit to it.
+def reweight(s: State) -> State:
+    """Repeat a local search with weights from its residual; the last repetition decides whether a lag is needed."""
+    search = s.searches[-1]
+    if not search.local:
+        return s
+    problem, u = s.problem, s.u
+    lag = s.space.where("lag") if "lag" in s.space.blocks else None
 
-    Two estimates of the same parameters differ by their errors: the sum of squares then rises by about P. It is in
-    units that are no better than how many rows in a row say the same, of which there are a few: ALIKE.
+    def report(row: dict) -> None:
+        s.history.add(row | {"search": f"{row['search']}, reweighted"})
+
+    for k in range(REWEIGHTS):
+        last = lag is not None and k == REWEIGHTS - 1
+        local = partial(without_lag, search) if last else search
+        u, problem = _run(s, f"reweighted {k + 1}", local, problem, u, report)  # type: ignore[arg-type]
+        problem = problem.reweighted(u, fitted=True)
+    if lag is not None and np.array_equal(u[lag], problem.start[lag]):
+        problem = problem.fixed(lag)
+    return replace(s, problem=problem, u=u)
+
+
+def fit_breakaway(s: State) -> State:
+    """Set the breakaway torques from ramps, by the fitted arm."""
+    arm, space = s.fitted(), s.space
+    if not s.commanded or s.ramps is None:
+        return replace(s, dynamics=arm)
+    edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=s.slide(arm))
+    # without a release the torque is at least the largest command that the joint held against
+    beyond = np.abs(edges.held + arm.offset[:, None]) > np.abs(arm.breakaway)
+    command = np.where(np.isnan(edges.command) & beyond & (edges.held != 0), edges.held, edges.command)
+    arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))
+    arm = replace(arm, breakaway=StaticFriction(s.robot, s.ramps, edges).breakaway(arm))
+    command = np.where(edges.count > 0, arm.breakaway - arm.offset[:, None], command)
+    return replace(s, edges=edges, space=replace(space, breakaway_command=command), dynamics=arm)
+
+
+def fit_stiction(s: State) -> State:
+    """Choose the stiction model, and without ramps scan for the breakaway torques."""
+    how, ramped = s.settings, s.ramps is not None
+    if not s.commanded or s.nominal.family.has_memory or not (ramped or how.breakaway):
+        return s
+    given = s.robot, s.dynamics, s.recording, None if ramped else how.breakaway, s.history.add
+    rest: dict[str, Any] = {"window_s": how.window_s, "stride": how.stride, "nthread": how.nthread}
+    found = s.history.step("stiction", lambda: choose_stiction(*given, **rest))
+    own: dict[str, Any] = {"stiction_model": STICTION_MODELS[int(found["model"])], "dq_min": float(found["dq_min"])}
+    own |= {} if ramped else {"breakaway": np.asarray(found["breakaway"])}
+    return replace(s, space=replace(s.space, nominal=replace(s.space.nominal, **own)))
+
+
+STEPS: tuple[Callable[[State], State], ...] = (
+    *(select_family, add_candidate_terms, prune_terms, formulate, fit),
+    *(reread_ramps, fit_presliding, reweight, fit_breakaway, fit_stiction),
+)
+
+
+def _run(
+    s: State, name: str, search: Search, problem: Problem, u: np.ndarray, report: Report | None = None
+) -> tuple[np.ndarray, Problem]:
+    """Return the solution of a search, and the problem with its weights if the search reweights torque."""
+    v = np.asarray(s.history.step(name, lambda: {"u": search(problem, u, report or s.history.add)})["u"])
+    return v, problem.torque_reweighted(v) if fits_torque(search) else problem
+
+
+def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
+    """Return whether v (P,) explains torque clearly worse than u (P,), the fit to torque.
+
+    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. Its unit
+    is as accurate as the number of independent rows: ALIKE.
     """
-    fitted = (problem.quick(u[None])[0] ** 2).sum()
-    rise = (problem.quick(v[None])[0] ** 2).sum() - fitted
+    fitted = (problem.torque_residual(u[None])[0] ** 2).sum()
+    rise = (problem.torque_residual(v[None])[0] ** 2).sum() - fitted
     return bool(rise > max(len(u), ALIKE * fitted))
 
 
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return u (P,) of a local search without a lag, or with one where the data clearly need it.
+    """Return u (P,) of a local search without a lag, or with one if the data clearly need it.
 
-    A short lag does to slow torques what a delay does, and together they wander. Clearly: the cost falls by more than
-    the logarithm of the rows (Schwarz, Annals of Statistics 6(2), 1978), but for the half second that speaks most for
-    it: rows of the same half second are not as many as they count.
+    For slow torques a short lag acts like a delay, and the two trade. The data need a lag if the cost falls by more
+    than the logarithm of the rows (Schwarz, Annals of Statistics 6(2), 1978), apart from the block of half a second
+    that favours it most, because rows of a block are correlated.
     """
     lag = problem.space.where("lag")
-    before, having = problem.sigma[lag], problem.residual(start[None])[0] ** 2
-    problem.fix(lag)
+    having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(lag)
     u = start.copy()
     u[lag] = problem.start[lag]
-    u = search(problem, u, report)
-    u[lag] = problem.start[lag]  # to the bit: by that it is known to be fixed
-    without, rows = problem.residual(u[None])[0] ** 2, len(problem.clusters)
+    u = search(fixed, u, report)
+    if fits_torque(search):
+        fixed = fixed.torque_reweighted(u)
+    u[lag] = problem.start[lag]  # exactly: `reweight` recognizes a fixed lag by that
+    without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
     most = np.bincount(problem.clusters, (without - having)[:rows]).max()
     needed = without.sum() - having.sum() - most > np.log(rows)
-    problem.believe(lag, before)
-    return search(problem, start, report) if needed else u
-
-
-def _not_held(command: np.ndarray) -> np.ndarray:
-    """Return (n, 2) Nm, the commands at which joints let go; without end where no ramp got that far."""
-    return np.where(np.isnan(command), [-np.inf, np.inf], command)
-
-
-def _commands(edges: Breakaway, dynamics: Dynamics) -> np.ndarray:
-    """Return (n, 2) Nm, the commands at which joints let go; NaN, the nominal edge, where no ramp got that far.
-
-    Where the joint was held against more than the nominal edge and offset say, that much is known of the edge.
-    """
-    beyond = np.abs(edges.tried + dynamics.offset[:, None]) > np.abs(dynamics.breakaway)
-    return np.where(np.isnan(edges.command) & beyond & (edges.tried != 0), edges.tried, edges.command)
+    return search(replace(fixed, sigma=problem.sigma), start, report) if needed else u

@@ -1,7 +1,7 @@
-"""Mass, centre and tensor of links as ten numbers that are physical at every value.
+"""Mass, centre of mass and inertia tensor of links by ten parameters that are physical at every value.
 
-The log-Cholesky parameters of Rucker and Wensing (IEEE RA-L 7(2), 2022) of the pseudo-inertia relative to the nominal
-one: J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
+Log-Cholesky parameters of the pseudo-inertia J relative to the nominal link (Rucker and Wensing, IEEE RA-L 7(2),
+2022): J = U0 V V^T U0^T, V = exp(alpha) [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """Return (..., 4, 4) [[Sigma, h], [h^T, m]] about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-    Sigma is the second moment of the mass; positive definite is the same as a tensor of positive moments that keep
-    the triangle inequality. A tensor that does not is given the nearest flat one and a little thickness.
+    Sigma is the second moment of mass. It is positive definite exactly if the tensor has positive principal moments
+    that satisfy the triangle inequality. Other tensors become the nearest flat one with a little thickness.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)
@@ -38,7 +38,7 @@ def _upper(j: np.ndarray) -> np.ndarray:
 
 
 def links(robot: Robot, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m and tensor about it (..., n, 3, 3) for theta (..., n, 10)."""
+    """Return mass (..., n) kg, com (..., n, 3) m and central tensor (..., n, 3, 3) kg m^2 for theta (..., n, 10)."""
     v = np.zeros((*theta.shape[:-1], 4, 4))
     for i in range(3):
         v[..., i, i] = np.exp(theta[..., 1 + i])
@@ -62,16 +62,16 @@ def log_cholesky(robot: Robot, dynamics: Dynamics) -> np.ndarray:
     return np.stack([np.log(scale), *diagonal, *rest], -1)
 
 
-def carrying(
+def add_point_mass(
     mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, payload: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mass (..., n) kg, com (..., n, 3) m and tensor (..., n, 3, 3) of links, the last with a payload.
+    """Return mass (..., n) kg, com (..., n, 3) m and tensor (..., n, 3, 3) of links, the last with a point mass.
 
-    Its centre counts more than its extent, so it is a point: a gripper's own tensor is small beside m r^2.
+    A point suffices: the tensor of a gripper about its own centre is small against m r^2.
 
     Args:
         mass, com, inertia: of the links without it.
-        payload: (...) kg, at least 0. place: (..., 3) m, of its centre in the last link's frame.
+        payload: (...) kg, at least 0. place: (..., 3) m, its position in the last link's frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))
     out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]

@@ -1,4 +1,4 @@
-"""parameters.yaml and posterior.npz: what carries an identification to the other stages."""
+"""parameters.yaml and posterior.npz: the result of an identification as the other stages read it."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,11 +9,11 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, check_number, nearest
-from r2s.files import DAMAGED, whole
+from r2s.files import DAMAGED, atomic_write
 from r2s.identification.parameters import (
     TIMING,
     WHOLE_ARM,
-    Estimate,
+    ParameterEstimate,
     ParameterSpace,
     logarithmic,
     parameter_space,
@@ -21,27 +21,30 @@ from r2s.identification.parameters import (
 )
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import family as friction_family
-from r2s.physics.friction import spelled
+from r2s.physics.friction import family_path
 from r2s.physics.robot import Robot
-from r2s.recordings.speed_noise import MOST_NOISE
+from r2s.recordings.speed_noise import MAX_NOISE
+
+SIDES = ("negative", "positive")
+FIXED = ("phi", "offset", "inertia")
+OPTIONAL = ("mass", "com", "armature", "load", "drag", "gain", "speed_noise")  # absent in files of older versions
+# limits of a plausible file, beyond those of any arm: friction and offsets, Nm; a link's centre from its joint, m
+MOST_NM, FARTHEST_M = 1e4, 10.0
 
 
 def save_parameters(
     path: Path,
     space: ParameterSpace,
-    found: Estimate,
+    found: ParameterEstimate,
     source: Mapping[str, Any],
     note: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write parameters.yaml: value, unit, nominal, bounds, 95 % interval and whether the data could tell, per joint.
-
-    The draws of the joint distribution go to posterior.npz beside it: what dr=identified draws from.
+    """Write parameters.yaml (value, unit, nominal, bounds, 95 % interval and identifiability) and posterior.npz.
 
     Args:
-        path: the file.
-        space: what was searched.
-        found: the result.
-        source: where it came from (recording, search, run), kept as it is. note: further entries, kept as they are.
+        path: of parameters.yaml; the draws of the posterior go beside it, for dr=identified.
+        space, found: the parameters and their estimate.
+        source: origin of the estimate (recording, search, run). note: further entries.
     """
     robot, fixed = space.robot, space.nominal
 
@@ -49,7 +52,7 @@ def save_parameters(
         return float(f"{values[0]:.6g}") if len(values) == 1 else [float(f"{v:.6g}") for v in values]
 
     document: dict[str, Any] = {"robot": robot.name, "joints": robot.n, "source": dict(source)}
-    document["friction_family"] = spelled(fixed.family)
+    document["friction_family"] = family_path(fixed.family)
     document["parameters"] = {}
     for name in space.blocks:
         entry: dict[str, Any] = {"unit": units()[name]}
@@ -58,40 +61,25 @@ def save_parameters(
         entry |= {key: numbers(space.block(row, name)) for key, row in zip(keys, rows, strict=True)}
         seen = space.block(found.identifiable, name).tolist()
         document["parameters"][name] = entry | {"identifiable": seen[0] if name in WHOLE_ARM else seen}
-    document["fixed"] = {
-        "phi": fixed.phi.tolist(),
-        "offset": fixed.offset.tolist(),
-        "breakaway_negative": fixed.breakaway[:, 0].tolist(),
-        "breakaway_positive": fixed.breakaway[:, 1].tolist(),
-        "dq_min": fixed.dq_min,
-        "hold": fixed.hold,
-        "inertia": fixed.inertia.tolist(),
-    }
-    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in LATER}
-    document["fixed"] |= {k: float(getattr(fixed, k)) for k in TIMING}
+    document["fixed"] = {f"breakaway_{side}": fixed.breakaway[:, i].tolist() for i, side in enumerate(SIDES)}
+    document["fixed"] |= {"stiction_model": fixed.stiction_model}
+    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in (*FIXED, *OPTIONAL)}
+    document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
-    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for the reader; parameters are loaded
+    rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    with whole(path.with_name("posterior.npz")) as part:  # first: parameters.yaml says that both are there
+    with atomic_write(path.with_name("posterior.npz")) as part:  # first: where parameters.yaml exists, both exist
         np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
-    with whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
-MOST_NM, FARTHEST_M = 1e4, 10.0  # of friction and offsets; of a link's centre from its joint
-FIXED = ("phi", "offset", "inertia")
-# files of before may lack them: then they are the robot's, or 0
-LATER = ("mass", "com", "armature", "load", "drag", "gain", "speed_noise")
-
-
 def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
-    """Return the searched space and the values found of `calibration=RUN_FOLDER` (or of a parameters.yaml itself).
-
-    `space.dynamics(x)` is the identified arm.
+    """Return space and values x of `calibration=RUN_FOLDER` (or of a parameters.yaml); see `ParameterSpace.dynamics`.
 
     Raises:
-        UserError: no such run or file, another robot's parameters, or a file that does not hold them.
+        UserError: no such run or file, parameters of another robot, or a damaged file.
     """
     path = Path(folder)
     path = path / "parameters.yaml" if path.is_dir() else path
@@ -112,7 +100,7 @@ def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, n
 
 
 def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
-    """Return what `load_parameters` does; raises whatever a document that is none of ours leads to."""
+    """Return what `load_parameters` does; a malformed document raises KeyError, ValueError and the like."""
     found, fixed = document["parameters"], document["fixed"]
 
     def numbers(name: str, value: Any, count: int) -> np.ndarray:
@@ -121,18 +109,13 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
             raise ValueError(f"{name}: not {count} finite value{'s' * (count > 1)}")
         return array
 
-    rows = [k for k in (*FIXED, *LATER) if k in FIXED or k in fixed]
-    own = {k: numbers(k, fixed[k], robot.n) for k in rows}
-    edges = [numbers(k, fixed[k], robot.n) for k in ("breakaway_negative", "breakaway_positive")]
+    rows = [k for k in (*FIXED, *OPTIONAL) if k in FIXED or k in fixed]
+    own: dict[str, Any] = {k: numbers(k, fixed[k], robot.n) for k in rows}
+    own["breakaway"] = np.stack([numbers(k, fixed[k], robot.n) for k in map("breakaway_{}".format, SIDES)], -1)
+    own |= {k: float(fixed[k]) for k in TIMING}
+    own["stiction_model"] = fixed.get("stiction_model", fixed.get("hold", "command"))  # of older files
     family = friction_family(document["friction_family"])
-    nominal = replace(
-        Dynamics.of(robot, own["phi"], family, float(fixed["dq_min"])),
-        **own,  # type: ignore[arg-type]
-        breakaway=np.stack(edges, -1),
-        delay=float(fixed["delay"]),
-        lag=float(fixed["lag"]),
-        hold=fixed.get("hold", "command"),  # files of before know of no other
-    )
+    nominal = replace(Dynamics.of(robot, own["phi"], family, float(fixed["dq_min"])), **own)
     everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}
     space = parameter_space(robot, nominal, everything)
     x = np.concatenate([numbers(k, found[k]["value"], space.size(k)) for k in space.blocks])
@@ -141,28 +124,29 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
 
 
 def _check_physical(d: Dynamics) -> None:
-    """Raise ValueError where these are the dynamics of no arm: a damaged file may hold any number."""
+    """Raise ValueError for dynamics that no arm can have."""
     for name in ("dq_min", "delay", "lag"):
         check_number(name, float(getattr(d, name)), "[0, 10]" if name == "dq_min" else "[0, 1]")
     fast = np.ones(d.phi.shape[:-1])
-    gives = (d.friction(fast) < 0) | (d.friction(-fast) > 0) | (d.load < 0) | (d.armature < 0)
+    forth, back = d.friction(fast), d.friction(-fast)
+    gains_energy = (forth < 0) | (back > 0) | (d.load < 0) | (d.armature < 0)
     edges = (d.breakaway[..., 0] > 0) | (d.breakaway[..., 1] < 0)
-    no_body = (d.mass <= 0) | (np.linalg.eigvalsh(d.inertia)[..., 0] <= 0) | (np.abs(d.com).max(-1) > FARTHEST_M)
-    beyond = (np.abs(d.offset) > MOST_NM) | (np.abs(d.friction(fast)) > MOST_NM) | (np.abs(d.gain) >= 1)
-    noisy = (d.speed_noise < 0) | (d.speed_noise > MOST_NOISE)
-    reasons = {"friction or a rotor that gives energy": gives, "edges of breakaway on one side": edges}
-    reasons |= {f"a noise of its speed outside [0, {MOST_NOISE:g}] rad/s": noisy}
-    reasons |= {"a link that no body can be": no_body, "an offset, friction or a gain beyond any arm": beyond}
+    link = (d.mass <= 0) | (np.linalg.eigvalsh(d.inertia)[..., 0] <= 0) | (np.abs(d.com).max(-1) > FARTHEST_M)
+    large = (np.abs(d.offset) > MOST_NM) | (np.abs(forth) > MOST_NM) | (np.abs(d.gain) >= 1)
+    noise = (d.speed_noise < 0) | (d.speed_noise > MAX_NOISE)
+    reasons = {"friction or a rotor that adds energy": gains_energy, "breakaway torques of one sign": edges}
+    reasons |= {"an unphysical link": link, "an offset, friction or gain beyond any arm": large}
+    reasons |= {f"a velocity noise outside [0, {MAX_NOISE:g}] rad/s": noise}
     for reason, joints in reasons.items():
         if joints.any():
             raise ValueError(f"joint {int(joints.argmax()) + 1} has {reason}")
 
 
 def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
-    """Return the draws (S, P) of the joint distribution that `save_parameters` wrote beside `space`'s values.
+    """Return the posterior draws (S, P) that `save_parameters` wrote beside the values of `space`.
 
     Raises:
-        UserError: there are none, they are of other parameters, or the file does not hold them.
+        UserError: no posterior.npz, one of other parameters, or a damaged file.
     """
     path = Path(folder)
     path = (path if path.is_dir() else path.parent) / "posterior.npz"

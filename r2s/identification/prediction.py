@@ -1,17 +1,18 @@
-"""What a model predicts of motion that it was not fitted to: torque, and open-loop motion."""
+"""Prediction errors on motion that was not fitted: of torque, and of open-loop motion."""
 
 import numpy as np
 
 from r2s.errors import UserError
 from r2s.identification.parameters import parameter_space
-from r2s.identification.torque_residual import TorqueResidual
-from r2s.identification.windows import cut_windows, replay
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.residuals.windows import cut_windows, replay
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
+MAX_WINDOWS = 100  # per horizon
 
 
 def prediction_errors(
@@ -26,37 +27,35 @@ def prediction_errors(
 ) -> dict:
     """Return one side of summary.json: torque RMSE per joint and, for commanded torque, open-loop errors.
 
-    position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after 0.1, 0.5
-    and 2 s open loop (horizons that no trajectory reaches are left out).
+    position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after each of the
+    HORIZONS that the trajectories reach.
     """
     space = parameter_space(robot, nominal, {"offset": [-1.0, 1.0]})
-    torque = TorqueResidual(robot, space, recording, cutoff_hz=cutoff_hz)
+    torque, sides = TorqueResidual(space, recording, cutoff_hz=cutoff_hz), {"": identified, "nominal_": nominal}
     out: dict = {"rows": len(recording.t), "seconds": recording.duration}
-    for name, dynamics in (("", identified), ("nominal_", nominal)):
-        error = torque.off(dynamics)
-        out[f"{name}torque_rmse_Nm"] = np.sqrt((error**2).mean(0)).tolist()
+    for name, dynamics in sides.items():
+        out[f"{name}torque_rmse_Nm"] = np.sqrt((torque.error(dynamics) ** 2).mean(0)).tolist()
     if recording.torque != "commanded":
         return out
     windows = cut_windows(recording, window_s)
-    for name, dynamics in (("", identified), ("nominal_", nominal)):
+    for name, dynamics in sides.items():
         error = replay(robot, dynamics, windows, nthread) - windows.q
         out[f"{name}position_rmse_mrad"] = (1e3 * np.sqrt((error**2).mean((0, 1)))).tolist()
-        out[f"{name}ee_error_mm"] = _open_loop_ee(robot, dynamics, recording, nthread)
+        out[f"{name}ee_error_mm"] = open_loop_error(robot, dynamics, recording, nthread)
     return out
 
 
-def _open_loop_ee(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
+def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthread: int) -> dict[str, float]:
     """Return {"0.1": mm, ...}: mean distance between simulated and recorded end effector after each horizon."""
     errors = {}
     for horizon in HORIZONS:
         try:
-            windows = cut_windows(recording, horizon, limit=100)
+            windows = cut_windows(recording, horizon, limit=MAX_WINDOWS)
         except UserError:
             continue
         sim = Simulator(robot, dynamics, len(windows.q0), nthread)
-        q = replay(robot, dynamics, windows, nthread)[:, -1]
         places = []
-        for state in (q, windows.q[:, -1]):
+        for state in (replay(robot, dynamics, windows, nthread)[:, -1], windows.q[:, -1]):
             sim.reset(state, np.zeros_like(state))
             places.append(sim.ee.copy())
         errors[f"{horizon:g}"] = float(1e3 * np.linalg.norm(places[0] - places[1], axis=-1).mean())

@@ -1,4 +1,4 @@
-"""What an identification is told: what is searched, within what, and how the residuals are made."""
+"""Settings of an identification: parameters, bounds, prior, and how residuals are computed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,32 +6,33 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, check_number, choices
-from r2s.identification.parameters import check_bounds, check_parameters
-from r2s.identification.problem import check_choices, check_prior, check_terms, optional_friction, parts
+from r2s.identification.parameters import check_bounds
+from r2s.identification.terms import blocks_of, check_prior, check_terms, optional_friction
+from r2s.physics.friction import family as friction_family
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of `identify`: `identify.*` of the config, with the terms and the prior of one kind of torque.
+    """Settings of `identify`: those of conf/identify, with the terms and prior of one torque level.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...}, of whatever may be searched; an end is a number, or one per joint.
+        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; an end is a number or (n,).
         prior: {"inertia_scale": sigma, ...}, see `Problem`.
-        terms: what is searched beside friction: viscous, offset, inertia_scale or link, payload, armature, delay,
-            lag, load, drag, gain.
-        extra: terms that enter where motion left out demands them; `link` then takes the place of `inertia_scale`.
-        family: of the friction; auto keeps the one with the smallest error on motion left out.
-        window_s: length of a replayed window, s (commanded torque).
-        stride: ms that compared angles are means of (commanded torque).
-        cutoff_hz: zero-phase filter of the torque.
-        breakaway: scan the dead zone's edges up to this, Nm, where there are no ramps (commanded torque; a link-side
-            sensor does not feel the motor's breakaway). None keeps the nominal edges.
+        terms: estimated beside friction, see terms.py.
+        family: of friction; auto selects it by cross-validation.
+        window_s: s, length of replayed windows (commanded torque).
+        stride: ms, averaging of compared angles (commanded torque).
+        cutoff_hz: of the zero-phase filter of torque.
+        breakaway: Nm, upper limit of the scan for breakaway torques without ramps (commanded torque; a link-side
+            sensor does not measure the motor's breakaway). None keeps the nominal ones.
         folds: of the cross-validation within the recording.
-        spare: those of the terms that are left out where motion left out is predicted as well without them.
-        keep_nominal: a joint whose refit predicts motion left out not clearly better than the nominal one keeps that.
+        candidate_terms: terms that enter if they improve held-out prediction; `link` replaces `inertia_scale`.
+        prunable_terms: terms that are removed if held-out prediction stays as good.
+        seed: of the posterior's draws.
+        nthread: of the physics; 0 uses all cores.
 
     Raises:
-        UserError: a family, term or parameter that does not exist, or a number outside its range.
+        UserError: an unknown family, term or parameter, or a number outside its range.
     """
 
     bounds: Mapping[str, Sequence[ArrayLike]]
@@ -43,25 +44,27 @@ class Settings:
     cutoff_hz: float = 10.0
     breakaway: float | None = 1.5
     folds: int = 4
-    keep_nominal: bool = False
-    extra: Sequence[str] = ()
-    spare: Sequence[str] = ()
+    candidate_terms: Sequence[str] = ()
+    prunable_terms: Sequence[str] = ()
+    seed: int = 0
+    nthread: int = 0
 
     def __post_init__(self):
-        check_choices(self.family, [*self.terms, *self.extra])
-        check_terms("identify.spare", self.spare)
-        check_parameters("bounds", self.bounds)
+        if self.family != "auto":
+            friction_family(self.family)
+        for name in ("terms", "candidate_terms", "prunable_terms"):
+            check_terms(f"identify.{name}", getattr(self, name))
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
-        terms = [name for term in (*self.terms, *self.extra) for name in parts(term)]
-        if missing := [name for name in terms if name not in {*self.bounds, *optional_friction()}]:
+        names = [name for term in (*self.terms, *self.candidate_terms) for name in blocks_of(term)]
+        if missing := [name for name in names if name not in {*self.bounds, *optional_friction()}]:
             raise UserError(f"identify.bounds: none for {choices(missing)}")
         check_number("identify.window_s", self.window_s, "(0, inf)")
         check_number("identify.stride", self.stride, "[1, inf)", whole=True)
-        check_number("identify.cutoff_hz", self.cutoff_hz, "(0, 500]")  # half the rate of rows
+        check_number("identify.cutoff_hz", self.cutoff_hz, "(0, 500]")  # Nyquist frequency of 1 kHz
         if self.breakaway is not None:
             check_number("identify.breakaway", self.breakaway, "[0, inf)")
         check_number("identify.folds", self.folds, "[1, inf)", whole=True)
-        chosen = self.extra or {*self.spare} & {*self.terms}
-        if self.folds < 2 and (self.family == "auto" or self.keep_nominal or chosen):
-            raise UserError(f"identify.folds: {self.folds} is too few to leave motion out; at least 2 are needed")
+        selects = self.candidate_terms or {*self.prunable_terms} & {*self.terms}
+        if self.folds < 2 and (self.family == "auto" or selects):
+            raise UserError(f"identify.folds: {self.folds} is too few for cross-validation; at least 2 are needed")

@@ -1,62 +1,27 @@
 """Deep Deterministic Policy Gradient (Lillicrap et al. 2016, arXiv:1509.02971).
 
-The losses are those of `torchrl.objectives.DDPGLoss` with both networks delayed, which the tests hold this file to.
-The networks and their normalisation are those of all algorithms here, LayerNorm where the paper has batch norm; the
-noise of exploration is white, which Fujimoto et al. 2018 found as good as the paper's Ornstein-Uhlenbeck process.
+The losses equal those of `torchrl.objectives.DDPGLoss` with both networks delayed; the tests compare them. Two
+differences from the paper: the critics have LayerNorm instead of batch norm, and exploration noise is white. Fujimoto
+et al. 2018 found white noise as good as the paper's Ornstein-Uhlenbeck process.
 """
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from r2s.errors import check_number
-from r2s.learning.learner import Learner, polyak
+from r2s.learning.learner import DeterministicLearner, polyak
 
 
-class DDPG(Learner):
-    """Learner of a deterministic policy, with one critic.
+class DDPG(DeterministicLearner):
+    """Learner of a deterministic policy with one critic; arguments as in `DeterministicLearner`."""
 
-    Args:
-        scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.learning.networks.Learner.
-        explore_std: of the Gaussian noise on an action in [-1, 1].
-
-    Raises:
-        UserError: a setting of the wrong kind or out of range.
-    """
-
-    def __init__(
-        self,
-        scale: tuple[Tensor, Tensor],
-        torque: Tensor,
-        *,
-        hidden: Sequence[int] = (128, 128),
-        gamma: float = 0.95,
-        tau: float = 0.01,
-        lr: float = 1e-3,
-        explore_std: float = 0.1,
-        action_l2: float = 0.0,
-    ):
-        check_number("explore_std", explore_std, "[0, inf)")
-        super().__init__(
-            scale, torque, hidden=hidden, n_critics=1, outputs=1, gamma=gamma, tau=tau, lr=lr, action_l2=action_l2
-        )
-        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
-        self.explore_std = explore_std
-
-    @torch.no_grad()
-    def explore(self, observation: Tensor) -> Tensor:
-        """Return the policy's actions (B, n) with noise, for observations (B, d)."""
-        action = self.actor.mode(self.normalizer(observation))
-        return (action + self.explore_std * torch.randn_like(action)).clamp(-1.0, 1.0)
+    def __init__(self, scale: tuple[Tensor, Tensor], action_scale: Tensor, **shared: Any):
+        super().__init__(scale, action_scale, (1, 1), **shared)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return critic and actor losses of a batch.
-
-        Args:
-            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
-        """
+        """Return critic and actor losses of a batch with normalized observations; see `Learner.update`."""
         with torch.no_grad():
             next_action = self.target_actor.mode(batch["next_observation"])
             next_value = self.targets(batch["next_observation"], next_action)[0, :, 0]
@@ -69,7 +34,7 @@ class DDPG(Learner):
         return {"loss_critic": critic, "loss_actor": actor}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return the losses (detached)."""
+        """Do one gradient step; return the losses."""
         out = self.losses(self.normalized(batch))
         self.descend(out["loss_critic"] + out["loss_actor"])
         polyak(self.targets, self.critics, self.tau)

@@ -1,61 +1,52 @@
-"""How well a policy does in simulation: 200 fixed episodes, deterministic, the same for every policy.
+"""Evaluation in simulation: 200 fixed episodes, deterministic, the same for every policy.
 
-Two sets of goals, starts and draws: a training is watched, and its best policy chosen, on SELECTED; what is reported
-of a policy comes from JUDGED, on which no policy is chosen. Settings of conf/algo and conf/reward have been compared
-on JUDGED too: benchmarks/minutes.py judges them on goals of its own.
+There are two sets of goals, starts and draws. SELECTION selects the best policy during a training. REPORT gives the
+reported measures; no policy is selected on it. Settings of conf/algo and conf/reward were compared on REPORT as well,
+so benchmarks/minutes.py uses a third set.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from r2s.learning.batch import ArmBatch
-from r2s.learning.randomization import TellingDraw
+from r2s.learning.randomization import Draw
+from r2s.learning.vector_arms import VectorArms
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
-from r2s.tasks.episode import Acts, Episodes, rollout
+from r2s.tasks.rollout import Episodes, PolicyLike, rollout
 from r2s.tasks.task import Task
 
-SELECTED, JUDGED = 7_000_000, 2_026_1122  # seeds; trainings use their own, below 2^20
+SELECTION, REPORT = 7_000_000, 2_026_1122  # seeds, larger than those of trainings
 
 
-def streams(seed: int) -> list[np.random.Generator]:
+def generators(seed: int) -> list[np.random.Generator]:
     """Return independent generators of starts, goals and draws."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)]
 
 
-def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = JUDGED) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts (count, n) rad and goals (count, ...): the same for every policy, simulator and arm."""
-    of_starts, of_goals, _ = streams(seed)
-    goals = task.goals(robot, of_goals, count)
-    return task.begin(task.starts(robot, of_starts, count), goals), goals
+def fixed_episodes(robot: Robot, task: Task, count: int, seed: int = REPORT) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts (count, n) rad and goals (count, ...), the same for every policy, simulator and arm."""
+    starts, goals, _ = generators(seed)
+    drawn = task.goals(robot, goals, count)
+    return task.begin(task.starts(robot, starts, count), drawn), drawn
 
 
-def fixed_draws(draw: Callable[[np.random.Generator, int], Dynamics], count: int, seed: int = JUDGED) -> Dynamics:
-    """Return the dynamics of the arms of those episodes."""
-    return draw(streams(seed)[2], count)
+def fixed_draws(draw: Draw, count: int, seed: int = REPORT) -> Dynamics:
+    """Return the dynamics of the arms of these episodes."""
+    return draw(generators(seed)[2], count)
 
 
 def make_evaluation(
-    robot: Robot,
-    task: Task,
-    draw: Callable[[np.random.Generator, int], Dynamics],
-    *,
-    episodes: int = 200,
-    nthread: int = 0,
-    seed: int = JUDGED,
-) -> Callable[[Acts], Episodes]:
-    """Return policy -> Episodes: all fixed episodes at once, each arm with its own (fixed) draw of the dynamics.
+    robot: Robot, task: Task, draw: Draw, *, episodes: int = 200, nthread: int = 0, seed: int = REPORT
+) -> Callable[[PolicyLike], Episodes]:
+    """Return policy -> Episodes, which runs all fixed episodes in parallel, each on an arm with its own fixed draw.
 
-    The function raises FloatingPointError where an action or a reward is not finite.
+    The function raises FloatingPointError if an action or a reward is not finite.
     """
-    drawn = fixed_draws(draw, episodes, seed)
-    arms = ArmBatch(robot, task, drawn, episodes, nthread)
-    if isinstance(draw, TellingDraw):
-        arms.tell(*draw.said(np.random.default_rng([seed, 4]), drawn))
+    arms = VectorArms(robot, task, fixed_draws(draw, episodes, seed), episodes, nthread)
     starts, goals = fixed_episodes(robot, task, episodes, seed)
 
-    def evaluate(policy: Acts) -> Episodes:
+    def evaluate(policy: PolicyLike) -> Episodes:
         done = rollout(policy, arms, task, starts, goals)
         if not np.isfinite(done.reward).all():
             episode, step = np.argwhere(~np.isfinite(done.reward))[0]

@@ -1,4 +1,4 @@
-"""What DDPG, TD3, SAC and TQC have in common: networks, optimiser, targets, and the verbs of a learner."""
+"""What DDPG, TD3, SAC and TQC share: networks, optimizer, target networks and the interface of a learner."""
 
 import copy
 import warnings
@@ -10,109 +10,106 @@ import torch
 from torch import Tensor, nn
 
 from r2s.errors import UserError, check_number
-from r2s.learning.networks import Actor, Critics, Normalizer, Policy, Told
+from r2s.learning.networks import Actor, Critics, Normalizer, Policy
 
 
 class Learner(nn.Module, ABC):
-    """What DDPG, TD3, SAC and TQC have in common; r2s/learning/train.py needs no more than this.
+    """An off-policy actor-critic algorithm.
 
-    The verbs are `explore`, `update`, `set_lr`, `policy`, `state_dict` and `load_state_dict`; the last two carry the
-    optimiser and the number of updates as well, so that a copy goes on bit for bit. Beside them each algorithm has
-    `losses`, which takes its random draws as arguments and is what the tests hold against TorchRL.
+    The training loop calls `explore`, `update`, `set_lr`, `policy`, `state_dict` and `load_state_dict`. The state
+    dict includes the optimizer and the number of updates, so a restored learner continues bit for bit. Each algorithm
+    also has `losses`, which takes its random draws as arguments; the tests compare it with TorchRL.
 
     Args:
-        scale: mean and standard deviation (d,) that normalise an observation.
-        torque: (n,) Nm, what an action of 1 asks for; goes into the policy.
-        hidden: units per layer, of actor and critics.
-        n_critics, outputs: critics in the ensemble, numbers that each returns.
-        gamma: discount. tau: step of the target networks. lr: of Adam, for all.
-        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER): where the
-            critics hardly tell actions apart, the small one wins, instead of full torque one way and the other.
-        told: what the policy is told, at the end of its observations; critics see it as it is. None: nothing.
+        scale: mean and standard deviation (d,) that normalize an observation.
+        action_scale: (a,), an action of 1 in SI units; part of the policy.
+        critics: number of critics, and outputs of each.
+        hidden: units per hidden layer of actor and critics.
+        gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
+        action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
+            critics hardly distinguish actions, the policy then prefers small ones to full torque in alternation.
 
     Raises:
-        UserError: a setting of the wrong kind or out of range.
+        UserError: a setting has the wrong type or is out of range.
     """
 
-    torque: Tensor
-    heavy: tuple[str, ...] = ("losses",)  # the methods that an update spends its time in
+    action_scale: Tensor
+    compiled: tuple[str, ...] = ("losses",)  # methods that take most of an update
 
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
-        torque: Tensor,
+        action_scale: Tensor,
+        critics: tuple[int, int],
         *,
-        hidden: Sequence[int],
-        n_critics: int,
-        outputs: int,
-        gamma: float,
-        tau: float,
-        lr: float,
-        action_l2: float,
-        told: Told | None = None,
+        hidden: Sequence[int] = (128, 128),
+        gamma: float = 0.95,
+        tau: float = 0.01,
+        lr: float = 1e-3,
+        action_l2: float = 0.0,
     ):
         super().__init__()
         check_hidden(hidden)
-        check_number("n_critics", n_critics, "[1, inf)", whole=True)
+        check_number("n_critics", critics[0], "[1, inf)", whole=True)
         check_number("gamma", gamma, "[0, 1)")
         check_number("tau", tau, "(0, 1]")
         check_number("lr", lr, "(0, 1]")
-        check_number("lr", lr, "[1e-12, 1]")  # below it float32 learns nothing
+        check_number("lr", lr, "[1e-12, 1]")  # smaller steps vanish in float32
         check_number("action_l2", action_l2, "[0, inf)")
-        obs_dim, act_dim = len(scale[0]), len(torque)
+        obs_dim, act_dim = len(scale[0]), len(action_scale)
         self.normalizer = Normalizer(*scale)
-        self.actor = Actor(obs_dim, act_dim, tuple(hidden), told=told)
-        self.critics = Critics(obs_dim, act_dim, tuple(hidden), n_critics, outputs)
+        self.actor = Actor(obs_dim, act_dim, tuple(hidden))
+        self.critics = Critics(obs_dim, act_dim, tuple(hidden), *critics)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
-        self.register_buffer("torque", torque.float())
+        self.register_buffer("action_scale", action_scale.float())
         self.gamma, self.tau, self.lr, self.action_l2 = gamma, tau, lr, action_l2
         self.updates = 0
-        # one optimiser: a parameter without a gradient, as the actor's between delayed updates, is left alone
+        # One optimizer suffices: Adam skips parameters without a gradient, such as the actor's in a delayed update.
         self.optimizer = torch.optim.Adam([*self.actor.parameters(), *self.critics.parameters()], lr=lr, fused=True)
 
     @abstractmethod
     def explore(self, observation: Tensor) -> Tensor:
-        """Return actions (B, n) in [-1, 1] to try, for observations (B, d) in SI units."""
+        """Return exploratory actions (B, a) in [-1, 1] for observations (B, d) in SI units."""
 
     @abstractmethod
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return what is worth logging, scalars, detached.
+        """Do one gradient step and return the scalars to log, detached.
 
         Args:
-            batch: observation, next_observation (B, d); action (B, n); reward, terminated (B,).
+            batch: observation, next_observation (B, d) in SI units; action (B, a); reward, terminated (B,).
         """
 
     @property
     def policy(self) -> Policy:
-        """The deterministic policy, sharing this learner's weights."""
-        return Policy(self.normalizer, self.actor, self.torque)
+        """The deterministic policy, which shares the weights of this learner."""
+        return Policy(self.normalizer, self.actor, self.action_scale)
 
     def set_lr(self, share: float) -> None:
-        """Set the learning rate to this share of its first value."""
+        """Set the learning rate to this share of its initial value."""
         for group in self.optimizer.param_groups:
             group["lr"] = share * self.lr
 
     def normalized(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return what an update needs of the batch, with both observations normalised."""
+        """Return the batch with normalized observations."""
         both = {k: self.normalizer(batch[k]) for k in ("observation", "next_observation")}
         return both | {k: batch[k] for k in ("action", "reward", "terminated")}
 
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
-        """Turn the losses and their gradients into machine code for batches of this size, before the first update.
+        """Compile the losses and their gradients for this batch size, before the first update.
 
-        Takes 5 to 20 s, less when it was done before on the same machine. On a GPU the code is captured as a graph.
-        Where it cannot be done, as without a C++ compiler, one warning says so and the learner stays as it is.
+        This takes 5 to 20 s, less if the machine has cached it. On a GPU it captures a graph. If compilation fails,
+        for example without a C++ compiler, one warning appears and the learner stays eager.
 
         Returns:
-            Whether it was done.
+            Whether the losses are compiled.
         """
-        mode = "reduce-overhead" if self.torque.is_cuda else "default"
-        eager = {name: getattr(self, name) for name in self.heavy}
+        mode = "reduce-overhead" if self.action_scale.is_cuda else "default"
+        eager = {name: getattr(self, name) for name in self.compiled}
         before, random = copy.deepcopy(self.state_dict()), torch.get_rng_state()
-        sizes = {"observation": len(self.normalizer.mean), "action": len(self.torque)}
+        sizes = {"observation": len(self.normalizer.mean), "action": len(self.action_scale)}
         sizes["next_observation"] = sizes["observation"]
-        batch = {k: torch.zeros(batch_size, size, device=self.torque.device) for k, size in sizes.items()}
-        batch |= {k: torch.zeros(batch_size, device=self.torque.device) for k in ("reward", "terminated")}
+        batch = {k: torch.zeros(batch_size, size, device=self.action_scale.device) for k, size in sizes.items()}
+        batch |= {k: torch.zeros(batch_size, device=self.action_scale.device) for k in ("reward", "terminated")}
         try:
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
@@ -130,10 +127,10 @@ class Learner(nn.Module, ABC):
         return True
 
     def descend(self, loss: Tensor) -> None:
-        """Take one step of Adam down the gradient of `loss`.
+        """Take one Adam step on `loss`.
 
         Raises:
-            FloatingPointError: the loss is not finite; nothing has changed.
+            FloatingPointError: the loss is not finite; the learner is unchanged.
         """
         if not torch.isfinite(loss):
             raise FloatingPointError(f"the loss of update {self.updates + 1} is {float(loss.detach())}")
@@ -143,41 +140,68 @@ class Learner(nn.Module, ABC):
         self.updates += 1
 
     def get_extra_state(self) -> dict:
-        """Return what state_dict holds beyond parameters and buffers."""
+        """Return the part of the state dict beyond parameters and buffers."""
         return {"optimizer": self.optimizer.state_dict(), "updates": self.updates}
 
     def set_extra_state(self, state: dict) -> None:
-        """Take over what get_extra_state returned."""
-        # torch would keep the moments it is given, and then two learners would write into them
+        """Restore what `get_extra_state` returned."""
+        # torch keeps the given moments by reference: without a copy two learners would write into them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.updates = state["updates"]
 
 
-class EntropyLearner(Learner):
-    """What SAC and TQC have in common: a stochastic policy and a temperature that holds its entropy.
+class DeterministicLearner(Learner):
+    """What DDPG and TD3 share: a deterministic policy with a target network, and Gaussian exploration noise.
 
     Args:
-        scale, torque, shared: see Learner.
-        alpha_init: first temperature. target_entropy: None is minus the number of joints.
-
-    Raises:
-        UserError: a setting of the wrong kind or out of range.
+        scale, action_scale, critics, shared: see `Learner`.
+        explore_std: standard deviation of the noise on an action in [-1, 1].
     """
 
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
-        torque: Tensor,
+        action_scale: Tensor,
+        critics: tuple[int, int],
         *,
-        alpha_init: float,
-        target_entropy: float | None,
+        explore_std: float = 0.1,
+        **shared: Any,
+    ):
+        check_number("explore_std", explore_std, "[0, inf)")
+        super().__init__(scale, action_scale, critics, **shared)
+        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.explore_std = explore_std
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """Return the policy's actions (B, a) with noise, for observations (B, d)."""
+        action = self.actor.mode(self.normalizer(observation))
+        return (action + self.explore_std * torch.randn_like(action)).clamp(-1.0, 1.0)
+
+
+class EntropyLearner(Learner):
+    """What SAC and TQC share: a stochastic policy, and a temperature that holds its entropy.
+
+    Args:
+        scale, action_scale, critics, shared: see `Learner`.
+        alpha_init: initial temperature. target_entropy: None: minus the number of actions.
+    """
+
+    def __init__(
+        self,
+        scale: tuple[Tensor, Tensor],
+        action_scale: Tensor,
+        critics: tuple[int, int],
+        *,
+        alpha_init: float = 0.01,
+        target_entropy: float | None = None,
         **shared: Any,
     ):
         check_number("alpha_init", alpha_init, "(0, inf)")
         if target_entropy is not None:
             check_number("target_entropy", target_entropy, "(-inf, inf)")
-        super().__init__(scale, torque, **shared)
-        self.target_entropy = -float(len(torque)) if target_entropy is None else target_entropy
+        super().__init__(scale, action_scale, critics, **shared)
+        self.target_entropy = -float(len(action_scale)) if target_entropy is None else target_entropy
         self.log_alpha = nn.Parameter(torch.tensor(float(alpha_init)).log())
         self.optimizer.add_param_group({"params": [self.log_alpha]})
 
@@ -186,23 +210,29 @@ class EntropyLearner(Learner):
         """Return critic, actor and alpha losses and the entropy of a batch.
 
         Args:
-            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
-            noise: two standard normal draws (B, n), for the next action and for the action of the actor's loss.
+            batch: see `update`, with normalized observations.
+            noise: two standard normal draws (B, a), for the next action and for the action of the actor's loss.
         """
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
-        """Return sampled actions (B, n) for observations (B, d)."""
+        """Return sampled actions (B, a) for observations (B, d)."""
         loc, scale = self.actor(self.normalizer(observation))
         return torch.tanh(loc + scale * torch.randn_like(loc))
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return the losses, entropy and alpha (detached)."""
+        """Do one gradient step; return losses, entropy and alpha."""
         batch = self.normalized(batch)
         out = self.losses(batch, (torch.randn_like(batch["action"]), torch.randn_like(batch["action"])))
         self.descend(out["loss_critic"] + out["loss_actor"] + out["loss_alpha"])
         polyak(self.targets, self.critics, self.tau)
         return {k: v.detach() for k, v in out.items()} | {"alpha": self.log_alpha.detach().exp()}
+
+    def entropy_losses(self, alpha: Tensor, value: Tensor, action: Tensor, log_prob: Tensor) -> dict[str, Tensor]:
+        """Return actor and alpha losses and the entropy; value, log_prob (B,) of action (B, a)."""
+        actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
+        temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
+        return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
 
 
 @torch.no_grad()
@@ -212,8 +242,8 @@ def polyak(target: nn.Module, source: nn.Module, tau: float) -> None:
 
 
 def check_hidden(hidden: object) -> None:
-    """Check the units per hidden layer; raise UserError where they are not one or more positive whole numbers."""
+    """Raise UserError unless the units per hidden layer are a non-empty list of positive integers."""
     if not isinstance(hidden, Sequence) or isinstance(hidden, str) or not hidden:
-        raise UserError(f"hidden: {hidden!r} is not allowed; units per layer are, such as [128, 128]")
+        raise UserError(f"hidden: expected units per layer such as [128, 128], got {hidden!r}")
     for units in hidden:
         check_number("hidden", units, "[1, inf)", whole=True)

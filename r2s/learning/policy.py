@@ -1,4 +1,4 @@
-"""A policy on disk: policy.pt for r2s, policy.onnx for everything else. SI units in, torque in Nm out."""
+"""Files of a policy: policy.pt for r2s, policy.onnx for other programs; SI units in and out."""
 
 import contextlib
 import io
@@ -6,106 +6,111 @@ import logging
 import warnings
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from r2s.adaptation.telling import SAID, said_scale
+from r2s.control.controller import Controller
 from r2s.errors import UserError
-from r2s.files import whole
+from r2s.files import atomic_write
 from r2s.learning.checkpoint import load_tensors, save_tensors
-from r2s.learning.networks import Actor, Normalizer, Policy, Told
+from r2s.learning.networks import Actor, Normalizer, Policy
 from r2s.physics.robot import Robot
-from r2s.tasks.task import Task
+from r2s.tasks.task import Task, observation_scale
 
 
-def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...], told: Told | None = None) -> Policy:
-    """Return an untrained policy of this arm and task; told: what it is told beside, None: nothing."""
-    mean, std = observation_scale(robot, task, told)
-    torque = torch.from_numpy(task.share * task.torque(robot)).float()
-    return Policy(Normalizer(mean, std), Actor(len(mean), robot.n, hidden, told=told), torque)
+def make_policy(robot: Robot, task: Task, hidden: tuple[int, ...]) -> Policy:
+    """Return an untrained policy for an arm and a task."""
+    mean, std = normalization(robot, task)
+    control = task.control(robot)
+    scale, offset = (torch.from_numpy(x).float() for x in (control.action_scale, control.action_offset))
+    return Policy(Normalizer(mean, std), Actor(len(mean), control.action_dim, hidden), scale, offset)
 
 
-def observation_scale(robot: Robot, task: Task, told: Told | None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mean and standard deviation (d,) of what a policy observes, and then of what it is told."""
-    mean, std = task.observation_scale(robot)
-    if told:
-        mean = np.concatenate([mean, np.zeros(told.numbers)])
-        std = np.concatenate([std, said_scale(robot.n)])
+def normalization(robot: Robot, task: Task) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean and standard deviation (d,) of the observations of a task and its controller."""
+    mean, std = observation_scale(task, robot)
     return torch.from_numpy(mean), torch.from_numpy(std)
 
 
 def save_policy(folder: Path, policy: Policy) -> None:
-    """Write policy.pt: the state dict and the sizes that it fits."""
+    """Write policy.pt: the state dict and the sizes of the hidden layers."""
     linear = [m.out_features for m in policy.actor.body if isinstance(m, torch.nn.Linear)]
-    told = {"told": list(policy.told)} if policy.told else {}
-    save_tensors(folder / "policy.pt", {"state": policy.state_dict(), "hidden": linear[:-1]} | told)
+    save_tensors(folder / "policy.pt", {"state": policy.state_dict(), "hidden": linear[:-1]})
 
 
 def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
     """Return the policy of a run folder.
 
     Raises:
-        UserError: no policy.pt there, a damaged one, or one of another arm.
+        UserError: policy.pt is missing, damaged, or of another arm.
     """
     path = Path(folder) / "policy.pt"
     if not path.is_file():
         raise UserError(f"policy: no policy.pt in {folder}")
     saved = load_tensors(path, "policy")
+    if "told" in saved:  # inputs of adapters that were removed
+        raise UserError(f"policy: {path} was trained with adapt=osi or rma, which were removed; train it again")
     try:
-        told = Told(*saved["told"]) if "told" in saved else None
-        policy = make_policy(robot, task, tuple(saved["hidden"]), told)
+        policy = make_policy(robot, task, tuple(saved["hidden"]))
         policy.load_state_dict(saved["state"])
     except KeyError as error:
-        raise UserError(f"policy: {path} is not what r2s wrote: it has no {error}") from None
+        raise UserError(f"policy: {path} is damaged: it has no {error}") from None
     except RuntimeError:
-        raise UserError(f"policy: {path} does not fit {robot.name} with {robot.n} joints") from None
+        raise UserError(f"policy: {path} does not fit the task with {robot.name}, {robot.n} joints") from None
     return policy.eval()
 
 
 def export_onnx(path: Path, policy: Policy, robot: Robot, task: Task) -> None:
-    """Write policy.onnx: `observation` (B, d) in SI units -> `torque` (B, n) Nm, normalisation inside.
+    """Write policy.onnx: `observation` (B, d) -> action (B, a) in SI units, normalization included.
 
-    Its metadata carries what a driver needs: joint count and order, policy rate, torque limits, low-pass.
+    The output has the name of the controller's action, `torque` by default. The metadata describe joints, policy
+    rate, limits, low-pass and controller for a driver.
     """
     import onnx
 
     example = torch.zeros(2, len(policy.normalizer.mean))
     quiet = contextlib.redirect_stdout(io.StringIO())
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with whole(path) as part:
+    with atomic_write(path) as part:
         with warnings.catch_warnings(), quiet:
-            warnings.simplefilter("ignore")  # the exporter warns of its own internals
+            warnings.simplefilter("ignore")  # the exporter warns about its own internals
             torch.onnx.export(
                 policy,
                 (example,),
                 str(part),
                 input_names=["observation"],
-                output_names=["torque"],
+                output_names=[task.control(robot).action.replace(" ", "_")],
                 dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
                 external_data=False,
                 verbose=False,
             )
         model = onnx.load(part)
-        for key, value in _facts(policy, robot, task).items():
+        for key, value in _metadata(policy, robot, task).items():
             model.metadata_props.add(key=key, value=value)
         onnx.save(model, part)
 
 
-def _facts(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
-    """Return what a driver has to know."""
-    arm = robot.model(gravity=False)
+def observation_words(task: Task, control: Controller) -> str:
+    """Return the terms and units of an observation in one line."""
+    return task.observation_summary + ("; control torque / torque limit" if control.observes_torque else "")
+
+
+def _metadata(policy: Policy, robot: Robot, task: Task) -> dict[str, str]:
+    """Return the metadata of policy.onnx."""
+    arm, control = robot.model(gravity=False), task.control(robot)
     return {
         "robot": robot.name,
         "joints": " ".join(arm.joint(j).name or f"joint{j + 1}" for j in range(robot.n)),
-        "observation": task.observed + (f"; told: {SAID}" if policy.told else ""),
+        "observation": observation_words(task, control),
         "policy_hz": str(task.ctrl_hz),
         "q_min_rad": " ".join(f"{q:g}" for q in robot.q_min),
         "q_max_rad": " ".join(f"{q:g}" for q in robot.q_max),
         "dq_max_rad_per_s": " ".join(f"{v:g}" for v in robot.dq_max),
         "torque_max_Nm": " ".join(f"{t:g}" for t in robot.tau_max),
         "torque_rate_max_Nm_per_s": " ".join(f"{t:g}" for t in robot.dtau_max),
-        "torque_scale_Nm": " ".join(f"{t:g}" for t in policy.torque_scale.tolist()),
+        "control": control.name,
+        "action": control.action,
+        "action_unit": control.unit,
+        "action_scale": " ".join(f"{t:g}" for t in policy.action_scale.tolist()),
         "low_pass_hz": str(task.cutoff_hz),
-        "torque": "without gravity, before low-pass, clip and rate limit"
-        + ("" if task.share == 1.0 else "; to be added to the task's base"),
+        "torque": "without gravity, before low-pass, clip and rate limit",
     }

@@ -1,100 +1,69 @@
 """Twin Delayed Deep Deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477).
 
-DDPG with three changes: the smaller of two critics as target, noise on the target's action, and an actor and targets
-that move at every other update only. The losses are those of `torchrl.objectives.TD3Loss` with the paper's squared
-error, which the tests hold this file to.
+Three changes to DDPG: the target is the smaller of two critics, the target's action has noise, and the actor and the
+target networks move in every other update only. The losses equal those of `torchrl.objectives.TD3Loss` with the
+paper's squared error; the tests compare them.
 """
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from r2s.errors import check_number
-from r2s.learning.learner import Learner, polyak
+from r2s.learning.learner import DeterministicLearner, polyak
 
 
-class TD3(Learner):
-    """Learner of a deterministic policy, with pessimistic critics.
+class TD3(DeterministicLearner):
+    """Learner of a deterministic policy with pessimistic critics.
 
     Args:
-        scale, torque, hidden, gamma, tau, lr, action_l2: see r2s.learning.networks.Learner.
-        n_critics: the smallest of their values is the target; the actor follows the first.
-        explore_std: of the Gaussian noise on an action in [-1, 1].
-        smoothing_std, smoothing_clip: of the noise on the target's action, and what it is limited to.
-        policy_delay: updates of the critics for one of the actor and of the targets.
-
-    Raises:
-        UserError: a setting of the wrong kind or out of range.
+        scale, action_scale, shared: see `DeterministicLearner`.
+        n_critics: number of critics; the target is the smallest of their values, the actor follows the first.
+        smoothing_std, smoothing_clip: standard deviation and limit of the noise on the target's action.
+        policy_delay: updates of the critics per update of the actor and of the target networks.
     """
 
     last_actor_loss: Tensor
-
-    heavy = ("_critic_loss", "_actor_loss")
+    compiled = ("_critic_loss", "_actor_loss")
 
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
-        torque: Tensor,
+        action_scale: Tensor,
         *,
-        hidden: Sequence[int] = (128, 128),
         n_critics: int = 2,
-        gamma: float = 0.95,
-        tau: float = 0.01,
-        lr: float = 1e-3,
-        explore_std: float = 0.1,
         smoothing_std: float = 0.2,
         smoothing_clip: float = 0.5,
         policy_delay: int = 2,
-        action_l2: float = 0.0,
+        **shared: Any,
     ):
-        check_number("explore_std", explore_std, "[0, inf)")
         check_number("smoothing_std", smoothing_std, "[0, inf)")
         check_number("smoothing_clip", smoothing_clip, "[0, inf)")
         check_number("policy_delay", policy_delay, "[1, inf)", whole=True)
-        super().__init__(
-            scale,
-            torque,
-            hidden=hidden,
-            n_critics=n_critics,
-            outputs=1,
-            gamma=gamma,
-            tau=tau,
-            lr=lr,
-            action_l2=action_l2,
-        )
-        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
-        self.explore_std, self.policy_delay = explore_std, policy_delay
+        super().__init__(scale, action_scale, (n_critics, 1), **shared)
+        self.policy_delay = policy_delay
         self.smoothing_std, self.smoothing_clip = smoothing_std, smoothing_clip
         self.register_buffer("last_actor_loss", torch.zeros(()))
-
-    @torch.no_grad()
-    def explore(self, observation: Tensor) -> Tensor:
-        """Return the policy's actions (B, n) with noise, for observations (B, d)."""
-        action = self.actor.mode(self.normalizer(observation))
-        return (action + self.explore_std * torch.randn_like(action)).clamp(-1.0, 1.0)
 
     def losses(self, batch: Mapping[str, Tensor], noise: Tensor) -> dict[str, Tensor]:
         """Return critic and actor losses of a batch.
 
         Args:
-            batch: observation, next_observation (B, d), already normalised; action (B, n); reward, terminated (B,).
-            noise: a standard normal draw (B, n), for the next action.
+            batch: see `Learner.update`, with normalized observations.
+            noise: a standard normal draw (B, a) for the next action.
         """
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step on a batch in SI units; return the losses (detached).
-
-        Between the updates of the actor its loss is the last one that was worked out.
-        """
+        """Do one gradient step; return the losses, of a delayed actor the last one."""
         batch = self.normalized(batch)
         loss = critic = self._critic_loss(batch, torch.randn_like(batch["action"]))
-        due = self.updates % self.policy_delay == 0  # the first update is: every row of a log has a loss to show
+        due = self.updates % self.policy_delay == 0  # also in the first update, so that every logged row has a loss
         if due:
             actor = self._actor_loss(batch)
-            self.last_actor_loss = actor.detach().clone()  # a captured graph writes over its outputs
+            self.last_actor_loss = actor.detach().clone()  # a captured graph overwrites its outputs
             loss = critic + actor
         self.descend(loss)
         if due:

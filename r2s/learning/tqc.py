@@ -1,111 +1,79 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses are those of `torchrl.objectives.TQCLoss`, which the tests hold this file to (values and gradients, 1e-5).
-Two things are written differently because two cores have to do: the critics are one batched network instead of a
-vmap, and the quantile loss goes by prefix sums over the sorted targets instead of all pairs.
-
-The verbs are those of r2s.learning.networks.Learner; `losses` is what the tests compare.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). Two parts are
+written differently so that two cores suffice: the critics are one batched network instead of a vmap, and the quantile
+loss uses prefix sums over the sorted targets instead of all pairs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from r2s.errors import check_number
 from r2s.learning.learner import EntropyLearner
-from r2s.learning.networks import Told, sample_tanh
+from r2s.learning.networks import sample_tanh
 
 
 class TQC(EntropyLearner):
-    """Learner of a stochastic policy, with quantile critics whose highest atoms are left out.
+    """Learner of a stochastic policy with quantile critics, whose highest atoms are dropped from the target.
 
     Args:
-        scale, torque, told, hidden, gamma, tau, lr, action_l2: see r2s.learning.networks.Learner.
-        n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms left out of the target, per critic.
-        alpha_init, target_entropy: see r2s.learning.networks.EntropyLearner.
-
-    Raises:
-        UserError: a setting of the wrong kind or out of range.
+        scale, action_scale, shared: see `EntropyLearner`.
+        n_critics, n_quantiles: ensemble. drop_per_critic: highest atoms dropped, per critic.
     """
 
     def __init__(
         self,
         scale: tuple[Tensor, Tensor],
-        torque: Tensor,
-        told: Told | None = None,
+        action_scale: Tensor,
         *,
-        hidden: Sequence[int] = (128, 128),
         n_critics: int = 2,
         n_quantiles: int = 25,
         drop_per_critic: int = 2,
-        gamma: float = 0.95,
-        tau: float = 0.01,
-        lr: float = 1e-3,
-        alpha_init: float = 0.01,
-        target_entropy: float | None = None,
-        action_l2: float = 0.0,
+        **shared: Any,
     ):
         check_number("n_quantiles", n_quantiles, "[1, inf)", whole=True)
         check_number("drop_per_critic", drop_per_critic, f"[0, {n_quantiles})", whole=True)
-        super().__init__(
-            scale,
-            torque,
-            hidden=hidden,
-            n_critics=n_critics,
-            outputs=n_quantiles,
-            gamma=gamma,
-            tau=tau,
-            lr=lr,
-            action_l2=action_l2,
-            told=told,
-            alpha_init=alpha_init,
-            target_entropy=target_entropy,
-        )
+        super().__init__(scale, action_scale, (n_critics, n_quantiles), **shared)
         self.keep = n_critics * (n_quantiles - drop_per_critic)
 
     def losses(self, batch: Mapping[str, Tensor], noise: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-        """Return critic, actor and alpha losses and the entropy, see EntropyLearner."""
+        """Return critic, actor and alpha losses and the entropy; see `EntropyLearner.losses`."""
         alpha = self.log_alpha.exp().detach()
         with torch.no_grad():
             next_action, next_log_prob = sample_tanh(self.actor(batch["next_observation"]), noise[0])
             atoms = self.targets(batch["next_observation"], next_action).transpose(0, 1).flatten(1)
             atoms = atoms.sort(-1).values[:, : self.keep] - (alpha * next_log_prob)[:, None]
-            live = self.gamma * (1.0 - batch["terminated"])
-            target = batch["reward"][:, None] + live[:, None] * atoms
+            discount = self.gamma * (1.0 - batch["terminated"])
+            target = batch["reward"][:, None] + discount[:, None] * atoms
         quantiles = self.critics(batch["observation"], batch["action"])
         critic = QuantileHuber.apply(quantiles, target)
 
         action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
         value = self.critics.frozen(batch["observation"], action).mean((0, 2))
-        actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
-        temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
-        return {
-            "loss_critic": critic,
-            "loss_actor": actor,
-            "loss_alpha": temperature,
-            "entropy": -log_prob.mean(),
-        }
+        return {"loss_critic": critic} | self.entropy_losses(alpha, value, action, log_prob)
 
 
 class QuantileHuber(torch.autograd.Function):
-    """Quantile Huber loss of quantiles (C, B, N) against sorted targets (B, M), as TQCLoss: sum over C of the mean.
+    """Quantile Huber loss of quantiles (C, B, N) and sorted targets (B, M), as in TQCLoss: sum over C of the mean.
 
-    With delta = y_j - theta_i, the loss of a pair is |tau_i - [delta < 0]| huber(delta) and its derivative by theta
-    |tau_i - [delta < 0]| clip(-delta, -1, 1). The targets are sorted, so the pairs of one theta fall into four runs
-    (delta below -1, to 0, to 1, above), and prefix sums of y and y^2 give the sums over each run exactly: three
-    searches instead of N M pairs.
+    With delta = y_j - theta_i, the loss of a pair is |tau_i - [delta < 0]| huber(delta). Its derivative with respect
+    to theta is |tau_i - [delta < 0]| clip(-delta, -1, 1). The targets are sorted, so the pairs of one theta form four
+    intervals: delta below -1, to 0, to 1, above. Prefix sums of y and y^2 give the exact sum over each interval, with
+    three searches instead of N M pairs.
     """
 
     @staticmethod
     def forward(ctx, quantiles: Tensor, target: Tensor) -> Tensor:
-        """Return the scalar loss; the gradient is worked out here and kept."""
+        """Return the scalar loss and save its gradient for `backward`."""
         count, b, n = quantiles.shape
         m = target.shape[-1]
-        # sums of squares cancel in single precision: centre the targets of each row, sum in double
-        centre = target.double().mean(-1, keepdim=True)
-        y = target.double() - centre
-        theta = quantiles.transpose(0, 1).reshape(b, -1).double() - centre
+        # Sums of squares cancel in single precision: center the targets of each row and sum in double.
+        center = target.double().mean(-1, keepdim=True)
+        y = target.double() - center
+        theta = quantiles.transpose(0, 1).reshape(b, -1).double() - center
         zero = y.new_zeros(b, 1)
         first = torch.cat([zero, y.cumsum(-1)], -1)
         second = torch.cat([zero, y.square().cumsum(-1)], -1)
@@ -131,5 +99,5 @@ class QuantileHuber(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """Return the kept gradient times what comes from above."""
+        """Return the saved gradient times the upstream one."""
         return ctx.saved_tensors[0] * grad, None

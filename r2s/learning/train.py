@@ -1,8 +1,8 @@
-"""The training loop, the same for every algorithm: act, step all arms, store, update, now and then evaluate.
+"""The training loop of all algorithms: act, step all arms, store, update, evaluate at intervals.
 
-The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows what is spent.
-With env_steps alone a seed gives the same run, bit for bit at a fixed number of threads, stopped and resumed or not;
-minutes make the curriculum follow the clock.
+The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the share spent.
+With env_steps alone a seed gives the same run bit for bit at a fixed number of threads, stopped and resumed or not.
+With minutes the curriculum follows the clock.
 """
 
 import copy
@@ -26,16 +26,17 @@ from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
-from r2s.tasks.rewards import Curriculum
 from r2s.tasks.task import Episodes
+
+LOG_UPDATES = 1000  # updates between two rows of metrics.csv
 
 
 @dataclass(frozen=True)
 class Budget:
-    """When training ends: minutes of wall clock, env_steps, or whichever of both comes first.
+    """End of a training: minutes of wall clock or env_steps, whichever comes first.
 
     Raises:
-        UserError: it never ends, or before it began.
+        UserError: neither is given, or a value is not positive.
     """
 
     minutes: float | None
@@ -50,31 +51,28 @@ class Budget:
                 check_number(f"budget.{name}", value, "(0, inf)")
 
     def spent(self, seconds: float, env_steps: int) -> float:
-        """Return the fraction spent; 1 and above is the end."""
+        """Return the share spent; the training ends at 1."""
         time_share = seconds / (60.0 * self.minutes) if self.minutes else 0.0
         step_share = env_steps / self.env_steps if self.env_steps else 0.0
         return max(time_share, step_share)
 
 
-MATMUL = ("medium", "high", "highest")
-
-
 @dataclass(frozen=True)
 class Loop:
-    """How the loop runs, whatever the algorithm.
+    """Settings of the training loop, independent of the algorithm.
 
     Attributes:
-        batch_size: transitions per update. updates_per_step: per step of all arms.
-        learning_starts: environment steps of uniform random actions.
-        replay_size: transitions kept.
-        lr_decay, lr_end: from this fraction of the budget on the learning rate falls linearly, to this share.
-        eval_env_steps: environment steps between two evaluations; one more comes at the end.
-        compile: turn the losses into machine code first; the time counts.
-        matmul: precision of the products within an update, for torch.set_float32_matmul_precision: "highest", or
-            "medium", which rounds their factors to bfloat16 where the processor multiplies those faster.
+        batch_size: transitions per update. updates_per_step: updates per step of all arms.
+        learning_starts: environment steps with uniform random actions.
+        replay_size: capacity of the replay buffer.
+        lr_decay, lr_end: from this share of the budget, the learning rate falls linearly to the share lr_end.
+        eval_env_steps: environment steps between two evaluations; the last evaluation is at the end.
+        compile: compile the losses first; this time counts.
+        matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
+            factors to bfloat16 if the processor multiplies those faster.
 
     Raises:
-        UserError: a value out of its range.
+        UserError: a value is out of range.
     """
 
     batch_size: int = 256
@@ -96,22 +94,22 @@ class Loop:
         check_number("algo.lr_end", self.lr_end, "[0, 1]")
         check_number("evaluation.env_steps", self.eval_env_steps, "[1, inf)", whole=True)
         if not isinstance(self.compile, bool):
-            raise UserError(f"compile: {self.compile!r} is not allowed; true and false are")
-        if self.matmul not in MATMUL:
-            raise UserError(f"matmul: '{self.matmul}' is not allowed; medium, high and highest are")
+            raise UserError(f"compile: expected true or false, got {self.compile!r}")
+        if self.matmul not in ("medium", "high", "highest"):
+            raise UserError(f"matmul: expected medium, high or highest, got {self.matmul!r}")
 
     def lr_share(self, spent: float) -> float:
-        """Return the learning rate's share at the fraction `spent` of the budget."""
+        """Return the factor of the learning rate when this share of the budget is spent."""
         return 1.0 - (1.0 - self.lr_end) * max(0.0, spent - self.lr_decay) / max(1.0 - self.lr_decay, 1e-9)
 
 
 @dataclass(frozen=True)
-class Listeners:
-    """Who is told while a training runs.
+class Callbacks:
+    """Functions that a training calls.
 
     Attributes:
-        log: gets a row of metrics about every thousand updates. evaluated: a row of evaluations.csv.
-        progress: gets the fraction spent and what is worth showing, every step.
+        log: with a row of metrics.csv. evaluated: with a row of evaluations.csv.
+        progress: with the share of the budget and the numbers to show, after every step.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -119,8 +117,203 @@ class Listeners:
     progress: Callable[[float, dict], None] = lambda share, row: None
 
 
+def train(
+    env: TaskEnv,
+    algo: Learner,
+    evaluate: Callable[[Policy], Episodes],
+    loop: Loop,
+    budget: Budget,
+    *,
+    checkpoint: Checkpoint | None = None,
+    dump: Path | None = None,
+    callbacks: Callbacks = Callbacks(),
+) -> None:
+    """Train `algo` in place.
+
+    Args:
+        env: arms, task and reward.
+        algo: a learner, for example r2s.learning.tqc.TQC.
+        evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
+        loop, budget: settings.
+        checkpoint: written after every evaluation; if it exists, the training continues from it.
+        dump: file for the cause of a value that is not finite, for `replay_dump`.
+        callbacks: for logs and progress.
+
+    Raises:
+        FloatingPointError: an action, observation, reward or loss is not finite.
+    """
+    keep_memory()
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage that it allocates
+    run = Training(env, algo, evaluate, loop, dump)
+    if checkpoint:
+        run.restore(checkpoint)
+    while (spent := budget.spent(run.seconds, run.env_steps)) < 1.0:
+        env.weights = env.reward.weights(env.task, spent, run.factor)
+        algo.set_lr(loop.lr_share(spent))
+        run.step(spent)
+        if run.env_steps < loop.learning_starts:
+            continue
+        for _ in range(loop.updates_per_step):
+            losses = run.update()
+        if run.updates % LOG_UPDATES < loop.updates_per_step or run.updates == loop.updates_per_step:
+            callbacks.log(run.metrics(losses))
+        if run.env_steps >= run.next_eval:
+            run.next_eval += loop.eval_env_steps
+            callbacks.evaluated(run.evaluate())
+            if checkpoint:
+                run.save(checkpoint)
+        callbacks.progress(spent, run.evaluation | {"env_steps": run.env_steps, "updates": run.updates})
+    callbacks.evaluated(run.evaluate())
+
+
+class Training:
+    """The state of a training: arms, learner, replay buffer and counters; arguments as in `train`.
+
+    Attributes:
+        env_steps, updates: counters. next_eval: environment steps of the next evaluation.
+        factor: of `Reward.adapt`. evaluation: the last row of evaluations.csv.
+    """
+
+    def __init__(
+        self, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes], loop: Loop, dump: Path | None
+    ):
+        self._began = time.perf_counter()
+        self._env, self._algo, self._evaluate, self._loop, self._dump = env, algo, evaluate, loop, dump
+        self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
+        self.factor = 1.0
+        self.evaluation: dict[str, Any] = {}
+        self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
+        self._origin: dict[str, Any] = {}  # state of the environment before `_actions`, for a dump
+        self._actions: list[torch.Tensor] = []
+        self._device = algo.action_scale.device
+        if loop.compile:
+            with matmul_precision(loop.matmul):
+                algo.compile(loop.batch_size)
+        storage = LazyTensorStorage(loop.replay_size, device=self._device)
+        self._replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=loop.batch_size)
+        self._state = env.reset()
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time of the training, stopped runs included."""
+        return time.perf_counter() - self._began
+
+    def step(self, spent: float) -> None:
+        """Step all arms and store the transitions; `spent`: share of the budget."""
+        env, state = self._env, self._state
+        observation = state["observation"].to(self._device)
+        random = self.env_steps < self._loop.learning_starts
+        state["action"] = env.action_spec.rand() if random else self._algo.explore(observation).cpu()
+        if len(self._actions) % env.task.steps == 0:
+            self._origin, self._actions = env.state(), []  # once per episode: a copy in every step is slow
+        self._actions.append(state["action"])
+        with self._dump_errors(lambda: {"env": self._origin, "actions": torch.stack(self._actions)}):
+            step, self._state = env.step_and_maybe_reset(state)
+        self._replay.extend(_transition(step))
+        terms = step["next", "reward_terms"].mean(0).numpy()
+        self.factor = env.reward.adapt(self.factor, spent, terms, env.nsim)
+        self._terms.append(terms)
+        self.env_steps += env.nsim
+
+    def update(self) -> dict[str, torch.Tensor]:
+        """Do one gradient update on a batch with the present reward weights; return the losses."""
+        weights = torch.from_numpy(self._env.weights.astype(np.float32)).to(self._device)
+        batch = self._replay.sample()
+        batch["reward"] = batch["reward_terms"] @ weights
+        random, matmul = torch.get_rng_state(), self._loop.matmul
+
+        def cause() -> dict[str, Any]:
+            return {"algo": self._algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": matmul}
+
+        with self._dump_errors(cause), matmul_precision(matmul):
+            losses = self._algo.update(batch)
+        self.updates += 1
+        return losses
+
+    def metrics(self, losses: dict[str, torch.Tensor]) -> dict[str, float]:
+        """Return a row of metrics.csv; means of the reward terms are over the steps since the last row."""
+        names, means = self._env.reward.terms(self._env.task), np.mean(self._terms, axis=0)
+        self._terms = []
+        row = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
+        row |= {k: float(v) for k, v in losses.items()}
+        row |= {f"weight_{name}": float(w) for name, w in zip(names, self._env.weights, strict=True)}
+        return row | {f"term_{name}": float(x) for name, x in zip(names, means, strict=True)}
+
+    def evaluate(self) -> dict[str, Any]:
+        """Evaluate the present policy; return a row of evaluations.csv."""
+        with self._dump_errors(lambda: {"algo": self._algo.state_dict()}, ", in an evaluation"):
+            measures = self._env.task.measures(self._evaluate(copy.deepcopy(self._algo.policy).cpu()))
+        counters = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
+        self.evaluation = counters | measures
+        return self.evaluation
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Write a checkpoint."""
+        state: dict[str, Any] = {"env_steps": self.env_steps, "updates": self.updates, "next_eval": self.next_eval}
+        state |= {"factor": self.factor, "seconds": self.seconds, "evaluation": self.evaluation}
+        state |= {"terms": torch.tensor(np.array(self._terms)), "torch": torch.get_rng_state()}
+        state |= {"algo": self._algo.state_dict(), "env": _tensors(self._env.state()), "state": self._state.to_dict()}
+        checkpoint.save(state, self._replay, self.env_steps, self._loop.replay_size)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continue from a checkpoint, if there is one."""
+        saved = checkpoint.load(self._replay, self._loop.replay_size)
+        if saved is None:
+            return
+        self._algo.load_state_dict(saved["algo"])
+        self._env.set_state(_arrays(saved["env"]))
+        self._state = self._state.update(saved["state"])
+        self.env_steps, self.updates, self.next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
+        self.factor, self.evaluation = saved["factor"], saved["evaluation"]
+        self._terms = list(saved["terms"].numpy())
+        self._began -= saved["seconds"]
+        torch.set_rng_state(saved["torch"])
+
+    @contextmanager
+    def _dump_errors(self, cause: Callable[[], dict[str, Any]], when: str = "") -> Iterator[None]:
+        """If the block raises FloatingPointError, write `cause` into the dump and name it in the message."""
+        try:
+            yield
+        except FloatingPointError as error:
+            message = f"{error}, after {self.env_steps} env steps{when}"
+            if self._dump is not None:
+                save_tensors(self._dump, _tensors(cause()))
+                message += f"; replay it with r2s.learning.train.replay_dump on {self._dump}"
+            raise FloatingPointError(message) from None
+
+
+def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
+    """Repeat the step, update or evaluation that gave a value that is not finite.
+
+    Args:
+        path: the dump. env, algo, evaluate: made as for the training.
+
+    Raises:
+        FloatingPointError: the same as in the training.
+        UserError: there is no dump.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} is no dump of a training")
+    cause = load_tensors(path, "dump")
+    if "algo" in cause:
+        algo.load_state_dict(cause["algo"])
+        if "batch" not in cause:
+            evaluate(algo.policy)
+            return
+        torch.set_rng_state(cause["torch"])
+        with matmul_precision(cause["matmul"]):
+            algo.update(cause["batch"])
+        return
+    env.reset()
+    env.set_state(_arrays(cause["env"]))
+    state: TensorDictBase = env.read()
+    for action in cause["actions"]:
+        state["action"] = action
+        _, state = env.step_and_maybe_reset(state)
+
+
 def keep_memory() -> None:
-    """Let glibc keep freed blocks: it gives large ones back at once, and every update would fault them in again."""
+    """Let glibc keep freed memory: it returns large blocks at once, and every update would fault them in again."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
@@ -130,8 +323,8 @@ def keep_memory() -> None:
 
 
 @contextmanager
-def products(precision: str) -> Iterator[None]:
-    """Let float32 matrix products in here have this precision; elsewhere, as in a policy's, it is the highest."""
+def matmul_precision(precision: str) -> Iterator[None]:
+    """Set the precision of float32 matrix products in the block; elsewhere, as in policies, it is the highest."""
     torch.set_float32_matmul_precision(precision)
     try:
         yield
@@ -139,161 +332,8 @@ def products(precision: str) -> Iterator[None]:
         torch.set_float32_matmul_precision("highest")
 
 
-def train(
-    env: TaskEnv,
-    algo: Learner,
-    evaluate: Callable[[Policy], Episodes],
-    weights: Curriculum,
-    loop: Loop,
-    budget: Budget,
-    *,
-    checkpoint: Checkpoint | None = None,
-    dump: Path | None = None,
-    listeners: Listeners = Listeners(),
-) -> None:
-    """Train `algo` in place.
-
-    Args:
-        env: arms to learn on.
-        algo: a learner (r2s/learning/tqc.py).
-        evaluate: policy -> Episodes (r2s/learning/evaluate.py).
-        weights: of the reward terms, over the budget; of the last of them, as what was seen asks for.
-        loop: how. budget: when to stop.
-        checkpoint: written after every evaluation; where it holds a state, training goes on from there.
-        dump: file for what led to a number that is not finite, for `replay_dump`.
-        listeners: who is told.
-
-    Raises:
-        FloatingPointError: an action, observation, reward or loss is not finite.
-    """
-    keep_memory()
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells of every storage it makes
-    began, env_steps, updates, next_eval = time.perf_counter(), 0, 0, loop.eval_env_steps
-    dearer = 1.0  # factor on the price of what the driver's law had to change
-    since: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
-    device = algo.torque.device
-    if loop.compile:
-        with products(loop.matmul):
-            algo.compile(loop.batch_size)
-    storage = LazyTensorStorage(loop.replay_size, device=device)
-    replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=loop.batch_size)
-    state = env.reset()
-    row: dict = {}
-    shown: dict = {}
-    origin: dict = {}  # the environment's state before `actions`
-    actions: list[torch.Tensor] = []
-    if checkpoint and (saved := checkpoint.load(replay, loop.replay_size)):
-        algo.load_state_dict(saved["algo"])
-        env.set_state(_arrays(saved["env"]))
-        state = state.update(saved["state"])
-        env_steps, updates, next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
-        shown, began, dearer = saved["shown"], began - saved["seconds"], saved.get("dearer", 1.0)
-        since = list(saved["since"].numpy()) if "since" in saved else []
-        torch.set_rng_state(saved["torch"])
-
-    def evaluation() -> dict:
-        try:
-            out = env.task.measures(evaluate(copy.deepcopy(algo.policy).cpu()))
-        except FloatingPointError as error:
-            when = f"{env_steps} env steps, in an evaluation"
-            raise _dumped(error, dump, {"algo": algo.state_dict()}, when) from None
-        return {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began} | out
-
-    while (spent := budget.spent(time.perf_counter() - began, env_steps)) < 1.0:
-        env.weights = weights(spent, dearer)
-        algo.set_lr(loop.lr_share(spent))
-        warm = env_steps >= loop.learning_starts
-        seen = state["observation"].to(device)
-        state["action"] = algo.explore(seen).cpu() if warm else env.action_spec.rand()
-        if len(actions) % env.task.steps == 0:
-            origin, actions = env.state(), []  # a dump replays from here: a copy at every step takes its time
-        actions.append(state["action"])
-        try:
-            step, state_next = env.step_and_maybe_reset(state)
-        except FloatingPointError as error:
-            where = {"env": origin, "actions": torch.stack(actions)}
-            raise _dumped(error, dump, where, f"{env_steps} env steps") from None
-        replay.extend(_transition(step))
-        terms = step["next", "reward_terms"].mean(0).numpy()
-        dearer = weights.dearer(dearer, spent, terms, env.nsim)
-        since.append(terms)
-        state = state_next
-        env_steps += env.nsim
-        if env_steps < loop.learning_starts:
-            continue
-        price = torch.from_numpy(env.weights.astype(np.float32)).to(device)
-        for _ in range(loop.updates_per_step):
-            batch = replay.sample()
-            batch["reward"] = batch["reward_terms"] @ price
-            random = torch.get_rng_state()
-            try:
-                with products(loop.matmul):
-                    row = algo.update(batch)
-            except FloatingPointError as error:
-                where = {"algo": algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": loop.matmul}
-                raise _dumped(error, dump, where, f"{env_steps} env steps") from None
-            updates += 1
-        if updates % 1000 < loop.updates_per_step or updates == loop.updates_per_step:
-            numbers = {k: float(v) for k, v in row.items()}
-            head = {"env_steps": env_steps, "updates": updates, "wall_clock_s": time.perf_counter() - began}
-            paid = {f"weight_{i}": float(w) for i, w in enumerate(env.weights)}
-            paid |= {f"term_{i}": float(x) for i, x in enumerate(np.mean(since, axis=0))}
-            listeners.log(head | numbers | paid)
-            since = []
-        if env_steps >= next_eval:
-            next_eval += loop.eval_env_steps
-            shown = evaluation()
-            listeners.evaluated(shown)
-            if checkpoint:
-                now = {"env_steps": env_steps, "updates": updates, "next_eval": next_eval, "shown": shown}
-                now |= {"dearer": dearer, "seconds": time.perf_counter() - began, "torch": torch.get_rng_state()}
-                now |= {"since": torch.tensor(np.array(since))}
-                now |= {"algo": algo.state_dict(), "env": _tensors(env.state()), "state": state.to_dict()}
-                checkpoint.save(now, replay, env_steps, loop.replay_size)
-        listeners.progress(spent, shown | {"env_steps": env_steps, "updates": updates})
-    listeners.evaluated(evaluation())
-
-
-def _dumped(error: FloatingPointError, path: Path | None, where: dict[str, Any], when: str) -> FloatingPointError:
-    """Write what led to the error and return one that says so."""
-    if path is None:
-        return FloatingPointError(f"{error}, after {when}")
-    save_tensors(path, _tensors(where))
-    return FloatingPointError(f"{error}, after {when}; replay it with r2s.learning.train.replay_dump on {path}")
-
-
-def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
-    """Do again what led to a number that is not finite.
-
-    Args:
-        path: the dump. env, algo, evaluate: made as they were for the training.
-
-    Raises:
-        FloatingPointError: the same as then.
-        UserError: there is no dump.
-    """
-    if not path.is_file():
-        raise UserError(f"{path} is no dump of a training")
-    where = load_tensors(path, "dump")
-    if "algo" in where:
-        algo.load_state_dict(where["algo"])
-        if "batch" not in where:
-            evaluate(algo.policy)
-            return
-        torch.set_rng_state(where["torch"])
-        with products(where["matmul"]):
-            algo.update(where["batch"])
-        return
-    env.reset()
-    env.set_state(_arrays(where["env"]))
-    state: TensorDictBase = env.read()
-    for action in where["actions"]:
-        state["action"] = action
-        _, state = env.step_and_maybe_reset(state)
-
-
 def _tensors(node: Any) -> Any:
-    """Return nested dicts with tensors in place of arrays: what torch loads without pickles."""
+    """Return nested dicts with tensors in place of arrays, which torch loads without pickles."""
     if isinstance(node, dict):
         return {k: _tensors(v) for k, v in node.items()}
     return torch.from_numpy(np.ascontiguousarray(node)) if isinstance(node, np.ndarray) else node
@@ -306,8 +346,8 @@ def _arrays(node: Any) -> Any:
     return node.numpy() if isinstance(node, torch.Tensor) else node
 
 
-def _transition(step) -> dict:
-    """Return what an update needs of a step, flat."""
+def _transition(step) -> TensorDict:
+    """Return the part of a step that updates use, flat."""
     after = step["next"]
     return TensorDict(
         {

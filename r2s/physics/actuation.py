@@ -1,12 +1,11 @@
-"""The torque path, one millisecond at a time: the driver's low-pass, clip and rate limit, then the motors' delay.
+"""The torque path, one millisecond at a time: soft start, low-pass, clip and rate limit, and the delay of the motors.
 
-Training, evaluation and hardware share it, so that a policy meets on the arm what it met in simulation. Between the
-two acts the driver's law (limits.py), which needs feedback every millisecond: in training inside the physics step
-(native_friction.py), on an arm in r2s/arm/driver.py.
+Training, evaluation and hardware share it, so that a policy has the same latency on the arm as in simulation. The
+safety filter (safety_filter.py) acts between the two: in training inside the physics step (mujoco_callback.py), on an
+arm in r2s/arm/driver.py.
 """
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -19,40 +18,53 @@ def low_pass_factor(cutoff_hz: float, dt: float = SIM_DT) -> float:
     return dt / (dt + 1.0 / (2.0 * math.pi * cutoff_hz))
 
 
-@njit(cache=True)
-def condition(target, filtered, last, cycle, nstep, factor, fade, tau_max, step_max, out):
-    """Write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`; `Actuation` says what they are.
+@njit(cache=True, error_model="numpy", inline="always")
+def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step_max):
+    """Return one joint's low-pass state and effort, Nm, after one cycle: soft start, low-pass, clip, rate limit.
 
     Args:
-        target: (m, n) Nm. filtered, last: (m, n) Nm, kept from call to call. cycle: (m,), counted here.
-        factor: of the low-pass. fade: cycles over which the torque of a motion fades in.
-        tau_max: (n,) Nm. step_max: (n,) Nm per cycle.
+        target: Nm, of this cycle. filtered, effort: Nm, of the cycle before. cycle: of the motion, from 1.
+        factor: of the low-pass. fade: cycles of the soft start.
+        tau_max: Nm. step_max: Nm per cycle.
     """
+    faded = target
+    if cycle < fade:
+        faded *= cycle / fade
+    filtered += factor * (faded - filtered)
+    clipped = min(max(filtered, -tau_max), tau_max)
+    effort += min(max(clipped - effort, -step_max), step_max)
+    return filtered, effort
+
+
+@njit(cache=True)
+def condition(target, state, settings, nstep, out):
+    """Write the efforts (m, nstep, n) Nm of the next `nstep` ms into `out`: `condition_joint` for m arms.
+
+    Args:
+        target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm and cycle count (m,), updated here.
+        settings: factor of the low-pass, cycles of the soft start, tau_max (n,) Nm, step_max (n,) Nm per cycle.
+    """
+    filtered, effort, cycle = state
+    factor, fade, tau_max, step_max = settings
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
-            f, u = filtered[i, j], last[i, j]
+            f, u = filtered[i, j], effort[i, j]
             for k in range(nstep):
-                wanted = target[i, j]
-                if cycle[i] + k + 1 < fade:
-                    wanted *= (cycle[i] + k + 1) / fade
-                f += factor * (wanted - f)
-                clipped = min(max(f, -tau_max[j]), tau_max[j])
-                u += min(max(clipped - u, -step_max[j]), step_max[j])
+                f, u = condition_joint(target[i, j], f, u, cycle[i] + k + 1, factor, fade, tau_max[j], step_max[j])
                 out[i, k, j] = u
-            filtered[i, j], last[i, j] = f, u
+            filtered[i, j], effort[i, j] = f, u
         cycle[i] += nstep
 
 
 class Actuation:
-    """What is asked of m arms: their targets through a low-pass, clipped, and limited in rate.
+    """Soft start, low-pass, clip and rate limit of the target torques of m arms.
 
     Attributes:
-        last: (m, n) Nm, the effort: the target as it has come through. filtered: (m, n) Nm, of the low-pass.
+        last: (m, n) Nm, the effort: the target after all of them. filtered: (m, n) Nm, of the low-pass.
 
     Args:
-        robot: its torque range and rate. m: arms.
-        cutoff_hz: of the low-pass.
-        soft_start_s: s, over which the torque of a motion fades in; 0: not at all.
+        robot: its torque range and rate. m: arms. cutoff_hz: of the low-pass.
+        soft_start_s: s over which the torque of a motion fades in; 0: not at all.
     """
 
     def __init__(self, robot: Robot, m: int, *, cutoff_hz: float, soft_start_s: float = 0.0):
@@ -68,44 +80,31 @@ class Actuation:
         for array in (self.filtered, self.last, self._cycle):
             array[at] = 0
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Return copies of what is kept from step to step, for `set_state`."""
-        return {name: getattr(self, name).copy() for name in ("filtered", "last", "_cycle")}
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go back to what `state` returned."""
-        for name, array in state.items():
-            getattr(self, name)[:] = array
-
     def __call__(self, target: np.ndarray, nstep: int) -> np.ndarray:
         """Return the efforts (m, nstep, n) Nm of the next `nstep` ms for a constant target (m, n) Nm."""
         out = np.empty((len(target), nstep, target.shape[1]))
         target = np.ascontiguousarray(target, dtype=np.float64)
-        kept = self.filtered, self.last, self._cycle
-        condition(target, *kept, nstep, self._factor, self._fade, self._tau_max, self._step_max, out)
+        settings = self._factor, self._fade, self._tau_max, self._step_max
+        condition(target, (self.filtered, self.last, self._cycle), settings, nstep, out)
         return out
 
 
-MAX_DELAY = 0.02  # s, the longest pure delay that is kept in mind
-
-
-# Steps by which a semi-implicit step answers its torque early: q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), where on an arm
-# the torques of steps k - 1 and k make it, half each.
+MAX_DELAY = 0.02  # s, longest pure delay of the model
+# Steps by which a semi-implicit step responds early to its torque: q(k+1) - 2 q(k) + q(k-1) = h^2 a(k), whereas on an
+# arm the torques of steps k - 1 and k contribute half each.
 EARLY = 0.5
-
-
-SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands that are kept
+SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands in the delay line
 
 
 @njit(cache=True)
-def turn(line, motor, cycle, delay, lag, out):
-    """Take the newest command of a line into one arm's motors; write the mean torque (n,) Nm of the step into `out`.
+def motor_torque(line, motor, cycle, delay, lag, out):
+    """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    A command that comes within a step acts for what is left of it. With a lag m' = (u - m) / lag the mean over a
+    A command that arrives within a step acts for the rest of it. With a lag m' = (u - m) / lag the mean over a
     time s from m is u + (m - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
-        line: (SLOTS, n) Nm, the command of cycle k in row k % SLOTS. motor: (n,) Nm, kept from step to step.
+        line: (SLOTS, n) Nm, the command of cycle k in row k % SLOTS. motor: (n,) Nm, state of the lag.
         cycle: of the newest command, from SLOTS on. delay, lag: steps.
     """
     whole = int(delay)
@@ -127,21 +126,21 @@ def delayed(tau, delay, lag, steps, line, motor, cycle, out):
     for i in range(tau.shape[0]):
         for k in range(steps):
             line[i, cycle[i] % SLOTS] = tau[i, k]
-            turn(line[i], motor[i], cycle[i], delay[i], lag[i], out[i, k])
+            motor_torque(line[i], motor[i], cycle[i], delay[i], lag[i], out[i, k])
             cycle[i] += 1
 
 
 def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Return delay and lag, s, in steps, as `turn` takes them: at most MAX_DELAY, and half a step more (EARLY)."""
+    """Return delay and lag, s, in steps for `motor_torque`: at most MAX_DELAY, plus EARLY."""
     steps = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT) + EARLY
     return steps, np.asarray(lag) / SIM_DT
 
 
 class Motors:
-    """What the joints of m simulated arms feel of their commands; keeps what is under way.
+    """Delay and lag between the commands and the joint torques of m simulated arms.
 
-    A pure delay, then a first-order lag, as they are on an arm whose time is continuous: the simulated one is half a
-    step early (EARLY), which is made up for here.
+    A pure delay, then a first-order lag, as on an arm in continuous time. The simulated step is half a step early
+    (EARLY), which is compensated here.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -156,19 +155,10 @@ class Motors:
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 
     def reset(self, ids: np.ndarray | None = None, tau: np.ndarray | float = 0.0) -> None:
-        """Let the arms `ids` (all by default) have felt the constant torque `tau` (m, n) Nm for long."""
+        """Reset the arms `ids` (all by default) to the steady state of a constant torque `tau` (m, n) Nm."""
         at = slice(None) if ids is None else ids
         self._motor[at] = tau
         self._line[at] = np.asarray(tau)[..., None, :] if np.ndim(tau) else tau
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Return copies of delays, lags and what is under way, for `set_state`."""
-        return {name: getattr(self, name).copy() for name in ("_line", "_motor", "_cycle", "_delay", "_lag")}
-
-    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go back to what `state` returned."""
-        for name, array in state.items():
-            getattr(self, name)[:] = array
 
     def __call__(self, tau: np.ndarray) -> np.ndarray:
         """Return (m, nstep, n) Nm at the joints for commands (m, nstep, n) Nm, one per ms."""

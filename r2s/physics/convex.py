@@ -1,26 +1,25 @@
-"""Whether two convex bodies touch, compiled: spheres, capsules, cylinders, boxes, ellipsoids, hulls of points.
+"""Distance test of convex bodies, compiled: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
 
-A body is a core, of which only the farthest point in a direction is asked for, and a radius around it. The distance
-of two cores is Gilbert, Johnson and Keerthi's (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson
-(Real-Time Collision Detection, 2005, ch. 5), ended as soon as its bounds tell what is asked.
+A body is a core, described by its support function, and a radius around it. The distance of two cores follows
+Gilbert, Johnson and Keerthi (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson (Real-Time
+Collision Detection, 2005, ch. 5); the iteration ends as soon as its bounds decide the test.
 """
 
 import numpy as np
 
 from r2s.compiled import njit
 
-# Columns of a body: its kind, radius around the core, the core's half sizes, first and number of its vertices, radius
-# of the sphere about its centre that holds it
-KIND, ROUND, SIZE, FIRST, COUNT, BOUND, BODY = 0, 1, 2, 5, 6, 7, 8
+# Columns of a body: kind, radius around the core, half sizes of the core, first vertex and number of vertices, radius
+# of its bounding sphere.
+KIND, RADIUS, SIZE, FIRST, COUNT, BOUND, BODY = 0, 1, 2, 5, 6, 7, 8
 POINT, SEGMENT, CYLINDER, BOX, ELLIPSOID, HULL = range(6)
-POSE = 12  # of a pose: its place (3,), then its axes (3, 3), row by row
-CLOSE = 1e-7  # m, between the bounds of a distance
-ROUNDS = 64
+CLOSE = 1e-7  # m, gap between upper and lower bound at which the iteration ends
+ITERATIONS = 64
 
 
 @njit(cache=True, error_model="numpy")
-def farthest(body, vertices, pose, dx, dy, dz):
-    """Return the point (x, y, z) of a body's core that lies the farthest in a direction."""
+def support_point(body, vertices, pose, dx, dy, dz):
+    """Return the support point (x, y, z) of a body's core in a direction; a pose has the columns of `link_frames`."""
     x = pose[3] * dx + pose[6] * dy + pose[9] * dz
     y = pose[4] * dx + pose[7] * dy + pose[10] * dz
     z = pose[5] * dx + pose[8] * dy + pose[11] * dz
@@ -54,22 +53,22 @@ def farthest(body, vertices, pose, dx, dy, dz):
 
 
 @njit(cache=True, error_model="numpy")
-def within(a, pose_a, b, pose_b, vertices, more, work):
-    """Return whether two bodies are nearer than `more` m to each other; work is (10, 3), anything."""
-    reach = a[ROUND] + b[ROUND] + more
+def closer_than(distance, a, pose_a, b, pose_b, vertices, work):
+    """Return whether two bodies are closer than `distance` m; work: (10, 3), any content."""
+    reach = a[RADIUS] + b[RADIUS] + distance
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
         return _segments(a, pose_a, b, pose_b) <= reach * reach
     s = work[:4]
     s[0, 0], s[0, 1], s[0, 2] = pose_a[0] - pose_b[0], pose_a[1] - pose_b[1], pose_a[2] - pose_b[2]
     x, y, z, count = s[0, 0], s[0, 1], s[0, 2], 0
-    for _ in range(ROUNDS):
-        far = np.sqrt(x * x + y * y + z * z)  # no less than the distance: the point is one of a minus one of b
+    for _ in range(ITERATIONS):
+        far = np.sqrt(x * x + y * y + z * z)  # upper bound: the point lies in the Minkowski difference
         if far <= max(reach, CLOSE):
             return True
-        ax, ay, az = farthest(a, vertices, pose_a, -x, -y, -z)
-        bx, by, bz = farthest(b, vertices, pose_b, x, y, z)
+        ax, ay, az = support_point(a, vertices, pose_a, -x, -y, -z)
+        bx, by, bz = support_point(b, vertices, pose_b, x, y, z)
         px, py, pz = ax - bx, ay - by, az - bz
-        least = (x * px + y * py + z * pz) / far  # no more than the distance
+        least = (x * px + y * py + z * pz) / far  # lower bound
         if least > reach or far - least < CLOSE:
             return least <= reach
         s[count, 0], s[count, 1], s[count, 2] = px, py, pz
@@ -99,16 +98,16 @@ def _segments(a, p, b, r):
 
 @njit(cache=True, error_model="numpy")
 def _nearest(s, count, t):
-    """Return the point of a simplex s (4, 3) of `count` corners that is nearest to the origin, and how many it needs.
+    """Return the point of a simplex s (4, 3) with `count` corners nearest to the origin, and the corners it needs.
 
-    Those that it needs come first in s afterwards; 4: the origin is inside. t: (6, 3), anything.
+    These corners move to the front of s; 4: the origin is inside. t: (6, 3), any content.
     """
     if count == 1:
         return s[0, 0], s[0, 1], s[0, 2], 1
     if count == 2:
         return _on_edge(s)
     best, x, y, z, kept = np.inf, 0.0, 0.0, 0.0, 4
-    for face in range(4 if count == 4 else 1):  # each has one function to be in: what is compiled twice takes twice
+    for face in range(4 if count == 4 else 1):  # one call of _on_triangle, to halve the compile time
         i, j, k = (face, face + 1, face + 2) if face < 2 else (0, face, 3 if face == 2 else 1)
         if count == 4:
             nx, ny, nz = _normal(s[i], s[j], s[k])
@@ -180,5 +179,5 @@ def _on_triangle(s):
         _copy(s, 1 if other else 0, s, 2)
         return _on_edge(s)
     share = 1.0 / (wa + wb + wc)
-    p, q = wb * share, wc * share  # of the edges to b and to c
+    p, q = wb * share, wc * share  # along the edges to b and to c
     return a[0] + p * ux + q * vx, a[1] + p * uy + q * vy, a[2] + p * uz + q * vz, 3

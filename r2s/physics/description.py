@@ -1,8 +1,8 @@
-"""The arm in one description and three formats: MJCF, URDF and SDF of the same links, limits and friction.
+"""Robot descriptions in three formats: MJCF, URDF and SDF with the same links, limits and friction.
 
-The MJCF that came with the robot is the source; identified masses, centres, tensors and rotors go over it. Each
-link's frame in URDF and SDF is that of its joint at angle zero, so every tensor is written in link axes without a
-rotation (a rotated inertial frame is read wrongly by ignition-physics 5.1, the physics of Gazebo Fortress).
+The robot's file is the source; identified masses, centres, tensors and rotors replace its values. The frame of a
+link in URDF and SDF is that of its joint at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo
+Fortress misreads a rotated inertial frame).
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.urdf import GEAR, ROTOR
+from r2s.physics.urdf import GEAR, ROTOR, Inertia, combined
 
-ENDLESS = 1e16  # rad: SDF's word for no limit
-HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` of a URDF: a link without inertia gets 1 kg and 1 kg m^2 from DART
+ENDLESS = 1e16  # rad, SDF's value for no limit
+HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: DART gives a link without inertia 1 kg and 1 kg m^2
 
 
 @dataclass(frozen=True)
 class Link:
-    """One moving link and the joint that moves it, as URDF and SDF want them.
+    """A moving link and its joint, in the form of URDF and SDF.
 
     Attributes:
         name, joint: of the link, of its joint.
@@ -46,11 +46,11 @@ class Link:
 
 
 def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[list[Link], np.ndarray]:
-    """Return the arm's links from base to hand, and the pose (4, 4) of the end effector in the last one.
+    """Return the arm's links from the base, and the pose (4, 4) of the end effector in the last link.
 
     Args:
         robot: the arm. dynamics: masses, centres, tensors, rotors, friction.
-        friction: add it as Coulomb and viscous terms that match it at 30 % and 100 % of the largest velocities.
+        friction: approximate friction by Coulomb and viscous terms that match it at 30 % and 100 % of dq_max.
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
@@ -79,19 +79,19 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
         before = joint
     site = model.site(robot.ee_site).id
     _, fixed = bodies.moving_parent(model.site_bodyid[site])
-    hand = fixed @ make_pose(model.site_pos[site], rotation(model.site_quat[site]))
-    return out, np.linalg.inv(before) @ hand
+    tip = fixed @ make_pose(model.site_pos[site], rotation(model.site_quat[site]))
+    return out, np.linalg.inv(before) @ tip
 
 
 def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) Nm and (n,) Nm s/rad: the straight line through the friction at 0.3 and 1 times dq_max."""
+    """Return (n,) Nm and (n,) Nm s/rad of the straight line through the friction at 0.3 and 1 times dq_max."""
     fast, slow = (dynamics.family.level(dynamics.phi, share * robot.dq_max) for share in (1.0, 0.3))
     viscous = np.maximum((fast - slow) / (0.7 * robot.dq_max), 0.0)
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
 
 
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; arms with armature get no SDF."""
+    """Write arm.xml (MJCF), arm.urdf and, for an arm without armature, arm.sdf into `folder`."""
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
     write_urdf(folder / "arm.urdf", robot, dynamics)
@@ -100,8 +100,8 @@ def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
 
 
 def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write the arm as MJCF, without meshes; the site `ee` is the end effector, a motor per joint takes torque."""
-    links, hand = chain(robot, dynamics)
+    """Write the arm as MJCF without meshes, with a torque motor per joint and the end effector as site `ee`."""
+    links, tip = chain(robot, dynamics)
     root = ET.Element("mujoco", model=robot.name)
     ET.SubElement(root, "compiler", angle="radian")
     ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast", gravity=_words(robot.gravity))
@@ -118,16 +118,16 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
             joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
         ET.SubElement(parent, "joint", joint | {k: repr(v) for k, v in own.items()})
         ET.SubElement(actuator, "motor", name=link.joint, joint=link.joint, ctrlrange=torque)
-    ET.SubElement(parent, "site", {"name": "ee"} | _place(hand))
+    ET.SubElement(parent, "site", {"name": "ee"} | _place(tip))
     _write(path, root)
 
 
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write the arm as URDF; a link `ee` sits at the end effector. Arguments as `chain`.
+    """Write the arm as URDF with a link `ee` at the end effector; armature becomes Drake's rotor inertia.
 
-    URDF has no armature: it is written as Drake's rotor inertia, which r2s and Drake read, and other readers lack.
+    URDF itself has no armature: r2s and Drake read this element, other readers ignore it.
     """
-    links, hand = chain(robot, dynamics)
+    links, tip = chain(robot, dynamics)
     root = urdf(robot, links)
     for link in links:
         if link.armature:
@@ -141,12 +141,12 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     inertial = ET.SubElement(ET.SubElement(root, "link", name="ee"), "inertial")
     ET.SubElement(inertial, "mass", value=repr(mass))
     ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(moment * np.eye(3)).items()})
-    _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", hand)
+    _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", tip)
     _write(path, root)
 
 
 def urdf(robot: Robot, links: list[Link]) -> ET.Element:
-    """Return URDF's root of the arm made of `links` (`chain`), with the limits of `robot`."""
+    """Return the root element of a URDF with `links` (of `chain`) and the limits of `robot`."""
     root = ET.Element("robot", name=robot.name)
     ET.SubElement(root, "link", name="base")
     parent = "base"
@@ -163,8 +163,8 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
         limit |= {"velocity": robot.dq_max[i], "effort": robot.tau_max[i]}
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
         ET.SubElement(joint, "dynamics", damping=repr(link.damping), friction=repr(link.friction))
-        if robot.slowing is not None:  # Franka's own: not URDF, but libfranka does not connect without it
-            deceleration, offset = (repr(float(x[i])) for x in robot.slowing)
+        if robot.velocity_envelope is not None:  # Franka's extension of URDF, which libfranka requires
+            deceleration, offset = (repr(float(x[i])) for x in robot.velocity_envelope)
             own = {"velocity_offset": offset, "deceleration_limit": deceleration}
             ET.SubElement(joint, "position_based_velocity_limits", own)
         parent = link.name
@@ -172,19 +172,18 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
 
 
 def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = False) -> None:
-    """Write the arm as SDF 1.9, fixed to the world; a frame `ee` sits at the end effector. Arguments as `chain`.
+    """Write the arm as SDF 1.9, fixed to the world, with a frame `ee` at the end effector.
 
-    With `world` the model stands in a world of its own, as r2s/engines/gazebo.py runs it: 1 ms steps as fast as they
-    go, physics and nothing else, no gravity (libfranka's convention: the arm compensates it), no limits of speed or
-    torque (they are the driver's), and no friction (it comes as a torque). Rotors are there a damping, of armature
-    over 1 ms: r2s/engines/gazebo.py puts that torque back.
+    With `world` the file contains the world of r2s/engines/gazebo.py: physics in 1 ms steps without a real-time
+    limit, no gravity (libfranka's convention), no velocity or torque limits (the driver's task), and no friction (it
+    is applied as a torque). A rotor becomes a damping of armature over 1 ms; gazebo.py compensates that torque.
 
     Raises:
-        UserError: the joints have armature, which SDF cannot say; not with `world`.
+        UserError: the joints have armature, which SDF cannot represent; not with `world`.
     """
-    links, hand = chain(robot, dynamics, friction=not world)
+    links, tip = chain(robot, dynamics, friction=not world)
     if not world and any(link.armature for link in links):
-        raise UserError("robot.armature: the joints have some, which SDF cannot say; write it into the links")
+        raise UserError("robot.armature: expected 0, as SDF has no rotor inertia; add it to the links")
     root = ET.Element("sdf", version="1.9")
     place = root
     if world:
@@ -218,12 +217,12 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         _text(ET.SubElement(axis, "dynamics"), damping=repr(damping), friction=repr(link.friction))
         parent = link.name
     frame = ET.SubElement(model, "frame", name="ee", attached_to=parent)
-    _text(frame, pose=_pose_words(hand))
+    _text(frame, pose=_pose_words(tip))
     _write(path, root)
 
 
 class Bodies:
-    """Masses, centres and tensors of all bodies, and where welded bodies sit on the moving ones."""
+    """Masses, centres and tensors of all bodies, and the poses of welded bodies on the moving ones."""
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
@@ -241,7 +240,7 @@ class Bodies:
         inertias: np.ndarray | None,
         n: int,
     ) -> None:
-        """Replace mass (n,), centre (n, 3), tensor (n, 3, 3) of these bodies, where given."""
+        """Replace mass (n,), centre (n, 3) and tensor (n, 3, 3) of these bodies, unless None."""
         if masses is not None:
             self.mass[bodies] = masses
         if coms is not None:
@@ -250,52 +249,47 @@ class Bodies:
             self.inertia[bodies] = inertias
 
     def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
-        """Return the nearest body with a joint at or above `body` (0: the world), body's pose in it."""
+        """Return the nearest body with a joint at or above `body` (0: the world), and the pose of `body` in it."""
         pose = np.eye(4)
         while body and self.model.body_dofnum[body] == 0:
             pose = self.local[body] @ pose
             body = int(self.model.body_parentid[body])
         return body, pose
 
-    def lumped(self, body: int) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return mass, centre and tensor about it of `body` with everything welded to it."""
+    def lumped(self, body: int) -> Inertia:
+        """Return mass, centre and tensor about it of `body` and all bodies welded to it."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)
             if other != body and anchor == body and self.mass[other] > 0:
                 r = pose[:3, :3]
                 parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
-        mass = sum(m for m, _, _ in parts)
-        if len(parts) == 1 or mass == 0:
-            return float(mass), parts[0][1], parts[0][2]
-        com = sum(m * c for m, c, _ in parts) / mass
-        steiner = [m * ((c - com) @ (c - com) * np.eye(3) - np.outer(c - com, c - com)) for m, c, _ in parts]
-        return float(mass), com, sum(i for _, _, i in parts) + sum(steiner)
+        return combined(parts)
 
 
 def shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return value, which is None or has this shape; else raise UserError."""
+    """Return value; raise UserError unless it is None or has this shape."""
     if value is not None and np.shape(value) != shape:
-        raise UserError(f"{name} must be {shape}; it is {np.shape(value)}")
+        raise UserError(f"{name}: expected shape {shape}, got {np.shape(value)}")
     return value
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
-    """Return (3, 3) of a quaternion w x y z."""
+    """Return the rotation matrix (3, 3) of a quaternion w x y z."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quat)
     return matrix.reshape(3, 3)
 
 
 def about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return (3, 3), the rotation about an axis by an angle, rad."""
+    """Return the rotation matrix (3, 3) about an axis by an angle, rad."""
     quat = np.empty(4)
     mujoco.mju_axisAngle2Quat(quat, axis, angle)
     return rotation(quat)
 
 
 def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    """Return (4, 4) with this position and rotation; None is none."""
+    """Return the pose (4, 4) with this position and rotation; None is zero or the identity."""
     pose = np.eye(4)
     if position is not None:
         pose[:3, 3] = position
@@ -324,10 +318,10 @@ def _urdf_joint(root: ET.Element, name: str, kind: str, parent: str, child: str,
 
 
 def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
-    """Return (3,) rad of Rz(yaw) Ry(pitch) Rx(roll) = r, as URDF and SDF have it; any yaw at upright pitch."""
+    """Return roll, pitch, yaw (3,) rad with Rz(yaw) Ry(pitch) Rx(roll) = r; any yaw at gimbal lock."""
     yaw = np.arctan2(r[1, 0], r[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
-    # what Rz(-yaw) r leaves, from elements that are well-conditioned whatever that yaw is
+    # from Rz(-yaw) r, whose elements are well conditioned for any yaw
     roll = np.arctan2(s * r[0, 2] - c * r[1, 2], c * r[1, 1] - s * r[0, 1])
     return np.array([roll, np.arctan2(-r[2, 0], c * r[0, 0] + s * r[1, 0]), yaw])
 

@@ -1,4 +1,4 @@
-"""What an arm's dynamics are: friction, offsets, breakaway, links, rotors, delay and lag."""
+"""Dynamics of an arm: friction, offsets, breakaway, links, rotors, delay and lag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,37 +10,35 @@ from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
 
-HOLDS = ("command", "net")
-BEYOND = 1e4  # Nm, s/rad, rad/s: what a friction parameter cannot be
+STICTION_MODELS = ("command", "net")
+MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: beyond the friction parameters of any arm
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What identification finds and domain randomization draws; any leading batch shape, each field its own.
+    """Dynamics that identification estimates and domain randomization draws; each field with any batch shape.
 
     Attributes:
-        phi: (..., n, K), the parameters of `family`; the paper's are Nm, s/rad, rad/s of eq. (5).
+        phi: (..., n, K) parameters of `family`; Nm, s/rad, rad/s for eq. (5) of the paper.
         offset: (..., n) Nm, added to every command.
-        breakaway: (..., n, 2) Nm, negative and positive edge of what a joint at rest is held between.
-        dq_min: rad/s, speed below which it may be held.
+        breakaway: (..., n, 2) Nm, negative and positive edge of stiction.
+        dq_min: rad/s, a slower joint can stick.
         mass: (..., n) kg, com: (..., n, 3) m, link frame.
         inertia: (..., n, 3, 3) kg m^2 about each link's centre of mass, link axes.
-        armature: (..., n) kg m^2, inertia of each joint's rotor, as the joint feels it through the gear. A link-side
-            torque sensor does not.
-        load: (..., n), friction per torque that gravity loads the joint with.
-        drag: (..., n, 2) Nm, offset that goes with the joint's own sin q and cos q, as a cable's.
-        gain: (..., n), relative error of the link-side torque sensor, or of the motor's torque constant: of what is
-            recorded, not of the arm.
-        speed_noise: (..., n) rad/s, standard deviation of what sensors add to a speed: of what a policy is shown, not
-            of the arm.
+        armature: (..., n) kg m^2, rotor inertia reflected to the joint; not visible to a link-side torque sensor.
+        load: (..., n) friction torque per gravity torque of the joint.
+        drag: (..., n, 2) Nm, offset proportional to sin q and cos q of the joint, such as a cable's.
+        gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; a property of
+            the recording, not of the arm's motion.
+        speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: of the friction.
-        hold: which torque the edges are of. "command" is the paper's eq. (6): command and offset are nullified while
-            they are within the edges. "net" is stiction: a joint stays where it is while all that acts on it, the
-            other joints' motion included, is within the edges (r2s/physics/stick_slip.py).
-        delay, lag: (...) s, of the actuation: pure, and first order. The simulator does not apply them: whoever
-            makes the commands does (`Motors` of r2s/physics/actuation.py).
-        told: (..., 4) kg and kg m, mass and first moment in the last link's frame of the load that the arm's own
-            gravity compensation was told of (r2s/physics/payload.py); what is there in truth is in the last link.
+        stiction_model: the torque that the edges apply to. "command" is eq. (6) of the paper: command and offset have
+            no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the coupling to
+            other joints, lies within the edges (r2s/physics/stick_slip.py).
+        delay, lag: (...) s, pure delay and first-order lag of the actuation; `Simulator` applies them only behind the
+            safety filter, otherwise `Motors` (r2s/physics/actuation.py) does.
+        declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
+            declared to gravity compensation (r2s/physics/payload.py); the real payload is part of the last link.
     """
 
     phi: np.ndarray
@@ -56,20 +54,21 @@ class Dynamics:
     gain: np.ndarray
     speed_noise: np.ndarray
     family: Family = SIGMOID
-    hold: str = "command"
+    stiction_model: str = "command"
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
-    told: np.ndarray = field(default_factory=lambda: np.zeros(4))
+    declared_payload: np.ndarray = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
-        if self.hold not in HOLDS:
+        if self.stiction_model not in STICTION_MODELS:
             raise UserError(
-                f"friction.hold: '{self.hold}'; allowed: {choices(HOLDS)}{nearest(str(self.hold), HOLDS)}"
+                f"friction.stiction_model: '{self.stiction_model}'; allowed: {choices(STICTION_MODELS)}"
+                f"{nearest(str(self.stiction_model), STICTION_MODELS)}"
             )
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return the robot's own links and rotors with friction phi (..., n, K) of a family, and nothing else."""
+        """Return the nominal links and rotors with friction phi (..., n, K) of a family, all else zero."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -88,24 +87,24 @@ class Dynamics:
         )
 
     def friction(self, dq: np.ndarray, bristle: np.ndarray | None = None) -> np.ndarray:
-        """Return (..., n) Nm at dq (..., n) rad/s; what goes with the load is not in it. `bristle`: Family.torque."""
+        """Return the load-independent friction (..., n) Nm at dq (..., n) rad/s; `bristle`: see Family.torque."""
         return self.family.torque(dq, self.phi, bristle)
 
     @property
     def level(self) -> np.ndarray:
-        """(..., n) Nm, what friction surely holds a sliding joint with: the lesser of both ways at 1 rad/s."""
+        """(..., n) Nm, friction at 1 rad/s, the smaller of both directions."""
         n = self.phi.shape[-2]
         return np.minimum(self.friction(np.full(n, 1.0)), -self.friction(np.full(n, -1.0))).clip(0.0)
 
     def one(self, k: int) -> "Dynamics":
-        """Return the k-th of a batch (m, ...); fields that all arms share stay as they are."""
+        """Return the k-th arm of a batch (m, ...); fields without a batch shape stay unchanged."""
         values = {name: (getattr(self, name), axes) for name, axes in AXES.items()}
         return replace(self, **{name: v[k] for name, (v, axes) in values.items() if np.ndim(v) > axes})
 
 
-# of an array that one arm has
+# Number of axes of each array for one arm.
 AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "armature": 1}
-AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "speed_noise": 1, "told": 1}
+AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "speed_noise": 1, "declared_payload": 1}
 
 
 def nominal_dynamics(
@@ -119,49 +118,50 @@ def nominal_dynamics(
     breakaway_positive: Sequence[float] | float = 0.0,
     breakaway_negative: Sequence[float] | float = 0.0,
     dq_min: float = 0.01,
-    hold: str = "command",
+    stiction_model: str = "command",
     inertia_scale: Sequence[float] | float = 1.0,
 ) -> Dynamics:
-    """Return the dynamics that `conf/friction` and `conf/inertia` describe: a number per joint, or one for all.
+    """Return the dynamics of `conf/friction` and `conf/inertia`; a value per joint, or one for all.
 
-    A family other than the sigmoid gets the sigmoid's level at 1 rad/s; auto is the sigmoid, until data choose.
+    Another family than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" is the sigmoid before the family
+    selection.
 
     Raises:
-        UserError: a list that does not fit the arm's joints, or a value out of its physical range.
+        UserError: a list of the wrong length, or a value out of its physical range.
     """
 
     def joints(name: str, value: Sequence[float] | float) -> np.ndarray:
         array = per_joint(name, value, robot.n, f"the {robot.n} joints of {robot.name}")
         if not np.all(np.isfinite(array)):
-            raise UserError(f"{name}: {array.tolist()} has a value that is not finite")
-        if np.abs(array).max() > BEYOND:
-            raise UserError(f"{name}: {array.tolist()} has a value beyond any arm's; at most {BEYOND:g} is allowed")
+            raise UserError(f"{name}: expected finite values, got {array.tolist()}")
+        if np.abs(array).max() > MAX_PARAMETER:
+            raise UserError(f"{name}: expected values of at most {MAX_PARAMETER:g}, got {array.tolist()}")
         return array
 
     phi = np.stack([joints("friction.phi1", phi1), joints("friction.phi2", phi2)], -1)
     scale = joints("inertia.scale", inertia_scale)
     for name, values in (("friction.phi1", phi[:, 0]), ("friction.phi2", phi[:, 1])):
         if np.any(values < 0):
-            raise UserError(f"{name}: {values.min():g} is negative; friction must take energy out")
+            raise UserError(f"{name}: expected values of 0 or more (friction dissipates), got {values.min():g}")
     if np.any(scale <= 0):
-        raise UserError(f"inertia.scale: {scale.min():g} is not positive")
+        raise UserError(f"inertia.scale: expected positive values, got {scale.min():g}")
     low = joints("friction.breakaway_negative", breakaway_negative)
     high = joints("friction.breakaway_positive", breakaway_positive)
     if np.any(low > 0) or np.any(high < 0):
-        raise UserError("friction.breakaway: the negative edges must be <= 0 and the positive ones >= 0")
+        raise UserError("friction.breakaway: expected negative edges <= 0 and positive edges >= 0")
     check_number("friction.dq_min", dq_min, "[0, 10]")
     named = SIGMOID if family == "auto" else friction_family(family)
     phi = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1)
     return replace(
-        Dynamics.of(robot, named.like(SIGMOID, phi), named, float(dq_min)),
+        Dynamics.of(robot, named.matched_to(SIGMOID, phi), named, float(dq_min)),
         offset=joints("friction.offset", offset),
         breakaway=np.stack([low, high], -1),
         inertia=robot.inertia * scale[:, None, None],
-        hold=hold,
+        stiction_model=stiction_model,
     )
 
 
-def of_family(dynamics: Dynamics, name: str) -> Dynamics:
-    """Return the dynamics with friction of another family, of the same level at 1 rad/s."""
+def with_family(dynamics: Dynamics, name: str) -> Dynamics:
+    """Return the dynamics with another friction family and the same friction at 1 rad/s."""
     named = friction_family(name)
-    return replace(dynamics, family=named, phi=named.like(dynamics.family, dynamics.phi))
+    return replace(dynamics, family=named, phi=named.matched_to(dynamics.family, dynamics.phi))

@@ -1,8 +1,7 @@
 """Joint friction: families of one interface, breakaway (eq. 6) and offsets.
 
-A family is one record: its law in NumPy, for readers, residuals and tests, and the same law compiled, which
-native_friction.py puts inside the physics step. `friction.family=` names one of the four below, or, by a dotted path
-such as my_module.MY_FAMILY, a record of your own.
+A family contains its law in NumPy, and the same law compiled for the physics step (mujoco_callback.py).
+`friction.family=` names one of the four below, or, by a dotted path such as my_module.MY_FAMILY, a user's own.
 """
 
 from collections.abc import Callable
@@ -14,38 +13,36 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.errors import UserError, choices, nearest
 
-WIDTH_DQ = 0.01  # rad/s, over which the sign of Coulomb friction turns: inside the dead zone
-PRESLIDING = 1e-3  # rad, over which friction turns, where it is not searched
-MICRO_DAMPING = 5e-3  # s, of bristles, over their stiffness: less than they need to ring for long
-PHI = 8  # most parameters of a family
+WIDTH_DQ = 0.01  # rad/s, width of the sign change of Coulomb friction; equal to the default dq_min of stiction
+PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
+MICRO_DAMPING = 5e-3  # s, damping over stiffness of the bristles, damps their oscillation within a few periods
+PHI = 8  # maximum number of parameters of a family
 
 
 @dataclass(frozen=True)
 class Family:
-    """A friction law of one joint with K parameters, all that the house knows of it.
-
-    Torque is zero at rest and positive for positive velocity.
+    """A friction law of one joint with K parameters; 0 at rest and positive for positive velocity.
 
     Attributes:
         name: in tables.
-        names: of the K parameters. units: of each. logarithmic: those whose values span decades: they are positive
-            and searched by their logarithm.
-        bounds: (low, high) of each parameter, where `identify.bounds` names none, as it does for the four below.
-        optional: the last of the names, those that are 0 and not searched unless `identify.terms` names them.
-        formula: the law in one line of text.
-        law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign (..., n); p is a
-            list of K arrays (..., n). `sign` goes from -1 to 1 with the velocity: tanh(dq / 0.01), or for a family
-            with a memory how far the bristles are bent.
+        names, units: of the K parameters.
+        logarithmic: names of positive parameters that span decades; their search space is logarithmic.
+        bounds: (low, high) of each parameter, used if `identify.bounds` has none, as for the four families below.
+        optional: the last of the names; they are 0 and not searched unless `identify.terms` contains them.
+        formula: the law in one line.
+        law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign have shape
+            (..., n); p is a list of K arrays (..., n). `sign` is tanh(dq / 0.01), or the bristle deflection of a
+            family with a memory, in [-1, 1].
         native: the law for one joint and one step of h seconds, compiled by numba.njit:
-            (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's own, 0 after a reset.
-        sharp: `native` of a law with a jump at rest, with that jump; `hold` = "net" of Dynamics takes it, because it
-            solves for rest. None: the law has no jump, and `native` serves there, too.
-        start: level (..., n) Nm at 1 rad/s -> the K parameters that are not optional, in a list.
-        held: phi (..., n, K) -> (..., n, 2) Nm, the negative and the positive torque that the law holds at rest,
-            which takes a memory. None: it holds nothing, and the dead zone of `passive_torque` does.
+            (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's state, 0 after a reset.
+        sharp: `native` with the jump at rest, for stiction_model="net", which solves for rest. None: the law has no
+            jump.
+        start: level (..., n) Nm at 1 rad/s -> list of the parameters that are not optional.
+        held: phi (..., n, K) -> breakaway torque (..., n, 2) Nm, negative and positive, of a law with a memory.
+            None: the law has no stiction of its own; the dead zone of eq. (6) or stick_slip.py provides it.
 
     Raises:
-        UserError: the parts do not fit each other.
+        UserError: the parts are inconsistent.
     """
 
     name: str
@@ -65,24 +62,24 @@ class Family:
     def __post_init__(self) -> None:
         where, k = f"friction family '{self.name}'", len(self.names)
         if not 1 <= k <= PHI or len(set(self.names)) < k or len(self.units) != k:
-            raise UserError(f"{where}: {k} names and {len(self.units)} units; allowed are 1 to {PHI}, each name once")
+            raise UserError(f"{where}: expected 1 to {PHI} different names with units, got {k} and {len(self.units)}")
         if self.bounds and len(self.bounds) != k:
-            raise UserError(f"{where}: {len(self.bounds)} bounds for {k} parameters")
+            raise UserError(f"{where}: expected {k} bounds, got {len(self.bounds)}")
         for name in (*self.logarithmic, *self.optional):
             if name not in self.names:
-                raise UserError(f"{where}: no parameter '{name}'; it has {choices(self.names)}")
+                raise UserError(f"{where}: expected one of the parameters {choices(self.names)}, got '{name}'")
         if self.optional != self.names[k - len(self.optional) :]:
-            raise UserError(f"{where}: optional parameters must be the last of {choices(self.names)}")
+            raise UserError(f"{where}: expected the optional parameters last, got {choices(self.names)}")
 
     @property
     def has_memory(self) -> bool:
-        """Whether the law holds a joint at rest by itself; then it needs no dead zone."""
+        """Whether the law has a memory and so its own stiction."""
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
-        """Return (..., n, 2) Nm: friction as sliding just begins, of the negative and of the positive direction.
+        """Return the friction (..., n, 2) Nm at the onset of sliding, negative and positive; 0 without a jump.
 
-        It is 0 for a law without a jump. phi: (..., n, K).
+        phi: (..., n, K).
         """
         if self.sharp is None:
             return np.zeros((*phi.shape[:-1], 2))
@@ -90,46 +87,46 @@ class Family:
         return np.stack([self.torque(still, phi, bristle=still + sign) for sign in (-1.0, 1.0)], -1)
 
     def scale(self, name: str) -> tuple[str, str]:
-        """Return how a parameter is measured and searched: its unit, and "logarithmic" or "linear"."""
+        """Return a parameter's unit and its search scale, "logarithmic" or "linear"."""
         return self.units[self.names.index(name)], "logarithmic" if name in self.logarithmic else "linear"
 
     def torque(self, dq: np.ndarray, phi: np.ndarray, bristle: np.ndarray | None = None) -> np.ndarray:
-        """Return the friction torque, Nm; zero at rest, positive for positive velocity.
+        """Return the friction torque (..., n) Nm.
 
         Args:
             dq: (..., n) rad/s.
-            phi: (..., n, K), in the order of `names`; optional ones may be left out.
-            bristle: (..., n) in [-1, 1], in place of tanh(dq / 0.01) where it is known better (`presliding`).
+            phi: (..., n, K), in the order of `names`; optional parameters may be missing.
+            bristle: (..., n) bristle deflection in [-1, 1], such as of `presliding`; default: tanh(dq / 0.01).
         """
         return self.law(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
 
     def slope(self, dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-        """Return d torque / d dq, Nm s/rad, for the arguments of `torque`."""
+        """Return the derivative of `torque` by dq, Nm s/rad."""
         return self.law_slope(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ))
 
     def _columns(self, phi: np.ndarray) -> list[np.ndarray]:
-        left_out = [np.zeros(())] * (len(self.names) - phi.shape[-1])
-        return [phi[..., k] for k in range(phi.shape[-1])] + left_out
+        missing = [np.zeros(())] * (len(self.names) - phi.shape[-1])
+        return [phi[..., k] for k in range(phi.shape[-1])] + missing
 
     def level(self, phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
-        """Return (..., n) Nm: the mean magnitude of friction at plus and minus `dq_max` (..., n) rad/s."""
+        """Return the mean magnitude of friction (..., n) Nm at plus and minus `dq_max` (..., n) rad/s."""
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
-    def like(self, other: "Family", phi: np.ndarray) -> np.ndarray:
-        """Return (..., n, K) parameters of this family with the level at 1 rad/s of `other` (..., n, K')."""
+    def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
+        """Return parameters (..., n, K) with the level at 1 rad/s of phi (..., n, K') of another family."""
         if other == self:
             return phi
         return np.stack(self.start(other.level(phi, np.ones(phi.shape[:-1]))), -1)
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
-    """Return the logistic function, without overflow at any finite x."""
+    """Return the logistic function without overflow."""
     e = np.exp(-np.abs(x))
     return np.where(x >= 0, 1.0, e) / (1.0 + e)
 
 
 def _sigmoid_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    """Return eq. (5) of the paper, and a viscous term."""
+    """Eq. (5) of the paper, and a viscous term."""
     return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + p[3] * dq
 
 
@@ -149,6 +146,7 @@ def _sigmoid_native(p, v, h, memory):
     return p[0] * (s - s0) + p[3] * v, p[0] * p[1] * s * (1.0 - s) + p[3]
 
 
+# The starts are named functions, because another process may receive a family by pickle.
 def _sigmoid_start(level: np.ndarray) -> list[np.ndarray]:
     return [2 * level, np.full_like(level, 20.0), np.zeros_like(level)]
 
@@ -266,19 +264,15 @@ STRIBECK = Family(
 def _bristle_native(p, v, h, memory):
     """Dahl 1968; LuGre without its own damping term: dz/dt = (v - |v| z) / presliding in place of the sign."""
     s = 1.0 if v > 0 else -1.0
-    z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # what the last step did to it
+    z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
     side = 1.0 if z > 0 else -1.0
     level = p[0] * (1.0 + side * p[1]) * (1.0 + p[3] * (1.0 + side * p[6]) * np.exp(-((v / p[4]) ** 2)))
     stiff = level / p[5]
     rate = h + MICRO_DAMPING * np.exp(-((v / 0.02) ** 2))
-    # what the coming step will do to it, at the present velocity
+    # deflection during the coming step, at the present velocity
     viscous = p[2] * (1.0 + s * p[7])
     return level * z + stiff * rate * (v - abs(v) * z) + viscous * v, stiff * rate * (1.0 - s * z) + viscous
-
-
-def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
-    return [*_stribeck_start(level), np.full_like(level, PRESLIDING)]
 
 
 def _bristle_held(phi: np.ndarray) -> np.ndarray:
@@ -287,75 +281,76 @@ def _bristle_held(phi: np.ndarray) -> np.ndarray:
     return sides * level * (1 + sides * asymmetry) * (1 + rise * (1 + sides * other))
 
 
+def _bristle_start(level: np.ndarray) -> list[np.ndarray]:
+    return [*_stribeck_start(level), np.full_like(level, PRESLIDING)]
+
+
 BRISTLE = Family(
     name="bristle",
     names=(*STRIBECK.names[:5], "presliding", *STRIBECK.optional),
     units=(*STRIBECK.units[:5], "rad", "1", "1"),
     logarithmic=(*STRIBECK.logarithmic, "presliding"),
     optional=STRIBECK.optional,
-    formula="Stribeck's, whose sign turns over the distance `presliding`: it has a memory and holds at rest",
+    formula="Stribeck's law with a sign that changes over the distance `presliding`: it has a memory and stiction",
     law=_stribeck_law,
     law_slope=_stribeck_slope,
     native=_bristle_native,
     start=_bristle_start,
     held=_bristle_held,
 )
-FAMILIES = (SIGMOID, COULOMB, STRIBECK, BRISTLE)  # what friction.family=auto compares
-_plugged: dict[str, Family] = {}  # by their dotted paths
+FAMILIES = (SIGMOID, COULOMB, STRIBECK, BRISTLE)  # the candidates of friction.family=auto
+_imported: dict[str, Family] = {}  # by dotted path
 
 
 def known_families() -> tuple[Family, ...]:
-    """Return the built-in families and those that `family` has imported."""
-    return (*FAMILIES, *_plugged.values())
+    """Return the built-in families and those imported by `family`."""
+    return (*FAMILIES, *_imported.values())
 
 
 def family(name: str) -> Family:
-    """Return the built-in family of that name, or import one by its dotted path.
+    """Return a built-in family by its name, or import one by its dotted path.
 
     Raises:
-        UserError: there is none, it is no Family, or one of its parameters has another unit or scale elsewhere.
+        UserError: no such family, or a parameter of it has another unit or scale in another family.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:
         return FAMILIES[names.index(name)]
-    if name in _plugged:
-        return _plugged[name]
+    if name in _imported:
+        return _imported[name]
     module, _, attribute = name.rpartition(".")
     if not module:
         raise UserError(
-            f"friction.family: no family '{name}'; allowed: {choices(names)}, auto, or my_module.MY_FAMILY for a "
-            f"Family of your own{nearest(name, [*names, 'auto'])}"
+            f"friction.family: expected {choices(names)}, auto, or my_module.MY_FAMILY, got '{name}'"
+            f"{nearest(name, [*names, 'auto'])}"
         )
     try:
         found = getattr(import_module(module), attribute)
     except (ImportError, AttributeError, SyntaxError, TypeError, ValueError) as error:
         raise UserError(f"friction.family: cannot import '{name}' ({error})") from None
     if not isinstance(found, Family):
-        raise UserError(f"friction.family: '{name}' is of type {type(found).__name__}; a Family is asked for")
+        raise UserError(f"friction.family: expected a Family, got '{name}' of type {type(found).__name__}")
     for other in known_families():
         for own in set(found.names) & set(other.names):
             scales = [" ".join(f.scale(own)) for f in (found, other)]
             if scales[0] != scales[1]:
                 raise UserError(
-                    f"friction.family: '{own}' of '{name}' is {scales[0]}, that of '{other.name}' is {scales[1]}; "
-                    "give it another name"
+                    f"friction.family: expected '{own}' of '{name}' to be {scales[1]}, as in '{other.name}', got "
+                    f"{scales[0]}; rename it"
                 )
-    _plugged[name] = found
+    _imported[name] = found
     return found
 
 
-def spelled(one: Family) -> str:
-    """Return what `family` finds this family by: its name, or the dotted path that it was imported by."""
-    return next((path for path, f in _plugged.items() if f is one), one.name)
+def family_path(one: Family) -> str:
+    """Return the argument of `family` for a family: its name, or the dotted path of its import."""
+    return next((path for path, f in _imported.items() if f is one), one.name)
 
 
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
-    """Return (T, n) in [-1, 1]: the sign of friction where it turns over a distance, not over a velocity.
+    """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s, dt s and a distance in rad, one or (n,).
 
-    Dahl 1968: dz/dt = (v - |v| z) / distance, stepped exactly, z = 0 at the start.
-
-    Args:
-        dq: (T, n) rad/s, dt s apart. distance: rad, one or (n,); about 1 mrad on a Panda.
+    It replaces the sign of friction: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly from z = 0.
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 
@@ -370,24 +365,3 @@ def _presliding(dq, dt, distance):
             z[j] = s + (z[j] - s) * np.exp(-abs(dq[k, j]) * dt / distance[j])
             out[k, j] = z[j]
     return out
-
-
-def passive_torque(
-    dq: np.ndarray, tau: np.ndarray, friction: np.ndarray, offset: np.ndarray, breakaway: np.ndarray, dq_min: float
-) -> np.ndarray:
-    """Return what the joints feel beside the command `tau`, Nm: offset - friction, or the dead zone's hold.
-
-    The rule "command" of `Dynamics.hold`; of "net" r2s/physics/stick_slip.py is the law.
-
-    Dead zone (eq. 6 and Table II): while abs(dq) < dq_min and command plus offset lie within the breakaway band,
-    the action is nullified (the joint feels neither command nor offset).
-
-    Args:
-        dq, tau: (..., n) rad/s, Nm. friction: (..., n) Nm, of a family at dq.
-        offset: (..., n) Nm, whatever else pulls: drag and gravity error included.
-        breakaway: (..., n, 2) Nm, negative and positive.
-        dq_min: rad/s.
-    """
-    drive = tau + offset
-    held = (np.abs(dq) < dq_min) & (drive > breakaway[..., 0]) & (drive < breakaway[..., 1])
-    return np.where(held, -tau, offset) - friction

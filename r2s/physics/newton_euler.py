@@ -1,8 +1,8 @@
-"""A serial arm's equations of motion, compiled: mass matrix and bias torque of one arm, a microsecond a call.
+"""Equations of motion of a serial arm, compiled: mass matrix and bias torque in about a microsecond.
 
-Newton and Euler's recursion with accelerations of zero for the bias, composite rigid bodies for the mass matrix
-(Featherstone 2008, ch. 5 and 6), both with moments about the base's origin. It shares no code with MuJoCo and DART,
-which it is tested against.
+The bias torque comes from the recursive Newton-Euler algorithm with zero joint accelerations, the mass matrix from
+the composite-rigid-body algorithm (Featherstone 2008, ch. 5 and 6), both with moments about the base's origin. The
+code is independent of MuJoCo and DART, and tests compare the three.
 """
 
 from dataclasses import replace
@@ -14,8 +14,10 @@ from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 
-# Columns of `links`: pose at angle zero in the link before, axis, mass, centre, tensor about it in link axes
+# Columns of `links`: position and rotation in the link before at angle zero, axis, mass, centre of mass, tensor about
+# it in link axes.
 PLACE, FRAME, AXIS, MASS, COM, TENSOR, LINK = 0, 3, 12, 15, 16, 19, 28
+WORK = 22  # columns of the work array of `equations`
 
 
 def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
@@ -30,35 +32,31 @@ def links_of(robot: Robot, mass: np.ndarray, com: np.ndarray, inertia: np.ndarra
 
 @njit(cache=True, error_model="numpy")
 def equations(links, gravity, q, dq, mass, bias, work):
-    """Write the mass matrix (n, n) kg m^2 and the bias torque (n,) Nm: mass ddq + bias = joint torque.
+    """Write the mass matrix (n, n) kg m^2 and the bias torque (n,) Nm of: mass ddq + bias = joint torque.
 
     Args:
-        links: `links_of`. gravity: (3,) m/s^2 in the base frame.
+        links: of `links_of`. gravity: (3,) m/s^2 in the base frame.
         q, dq: (n,) rad, rad/s.
-        mass, bias: where the result is written. work: (n, WORK), anything.
+        mass, bias: outputs. work: (n, WORK), any content.
     """
-    n = len(q)
     R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     px, py, pz = 0.0, 0.0, 0.0
     wx, wy, wz, ex, ey, ez = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # angular velocity and acceleration of the link
-    ax, ay, az = -gravity[0], -gravity[1], -gravity[2]  # of its origin: falling up is standing still
-    for i in range(n):
+    ax, ay, az = -gravity[0], -gravity[1], -gravity[2]  # linear acceleration; gravity enters as a base acceleration
+    for i in range(len(q)):
         k, s = links[i], work[i]
-        rx, ry, rz = turned(R, k[0], k[1], k[2])
+        (rx, ry, rz), (zx, zy, zz), R = joint_frame(R, k, q[i])
         cx, cy, cz = _cross(wx, wy, wz, rx, ry, rz)
         ux, uy, uz = _cross(wx, wy, wz, cx, cy, cz)
         tx, ty, tz = _cross(ex, ey, ez, rx, ry, rz)
         ax, ay, az = ax + tx + ux, ay + ty + uy, az + tz + uz
         px, py, pz = px + rx, py + ry, pz + rz
-        R = product(R, k, FRAME)
-        zx, zy, zz = turned(R, k[AXIS], k[AXIS + 1], k[AXIS + 2])
-        R = spun(R, k[AXIS], k[AXIS + 1], k[AXIS + 2], q[i])
         v = dq[i]
         tx, ty, tz = _cross(wx, wy, wz, zx, zy, zz)
         ex, ey, ez = ex + tx * v, ey + ty * v, ez + tz * v
         wx, wy, wz = wx + zx * v, wy + zy * v, wz + zz * v
         m = k[MASS]
-        rx, ry, rz = turned(R, k[COM], k[COM + 1], k[COM + 2])
+        rx, ry, rz = rotate(R, k[COM], k[COM + 1], k[COM + 2])
         cx, cy, cz = _cross(wx, wy, wz, rx, ry, rz)
         ux, uy, uz = _cross(wx, wy, wz, cx, cy, cz)
         tx, ty, tz = _cross(ex, ey, ez, rx, ry, rz)
@@ -73,15 +71,18 @@ def equations(links, gravity, q, dq, mass, bias, work):
         s[4] = xy * ex + yy * ey + yz * ez + cy + ty
         s[5] = xz * ex + yz * ey + zz_ * ez + cz + tz
         s[6], s[7], s[8], s[9] = m, m * gx, m * gy, m * gz
-        s[10], s[11], s[12] = (
-            xx + m * (gy * gy + gz * gz),
-            yy + m * (gx * gx + gz * gz),
-            zz_ + m * (gx * gx + gy * gy),
-        )
+        s[10], s[11] = xx + m * (gy * gy + gz * gz), yy + m * (gx * gx + gz * gz)
+        s[12] = zz_ + m * (gx * gx + gy * gy)
         s[13], s[14], s[15] = xy - m * gx * gy, xz - m * gx * gz, yz - m * gy * gz
         s[16], s[17], s[18] = zx, zy, zz
         s[19], s[20], s[21] = _cross(px, py, pz, zx, zy, zz)
-    for j in range(n - 1, -1, -1):
+    _project(mass, bias, work)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _project(mass, bias, work):
+    """Sum forces and inertias of the links behind each joint, and project them onto the joint axes."""
+    for j in range(len(bias) - 1, -1, -1):
         s = work[j]
         bias[j] = s[16] * s[3] + s[17] * s[4] + s[18] * s[5] + s[19] * s[0] + s[20] * s[1] + s[21] * s[2]
         zx, zy, zz, vx, vy, vz = (
@@ -91,7 +92,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
             s[19],
             s[20],
             s[21],
-        )  # of unit speed: rotation, and at the origin
+        )  # rotation, and velocity at the base's origin
         m, hx, hy, hz = s[6], s[7], s[8], s[9]
         tx, ty, tz = _cross(zx, zy, zz, hx, hy, hz)
         lx, ly, lz = m * vx + tx, m * vy + ty, m * vz + tz
@@ -108,7 +109,20 @@ def equations(links, gravity, q, dq, mass, bias, work):
                 work[j - 1, c] += s[c]
 
 
-WORK = 22
+@njit(cache=True, inline="always")
+def joint_frame(R, link, angle):
+    """Advance forward kinematics by one joint.
+
+    Args:
+        R: axes of the link before (9 numbers, row by row). link: row of `links_of`. angle: rad.
+
+    Returns:
+        offset from the link before, m, the joint's axis, and the link's axes, all in base axes.
+    """
+    offset = rotate(R, link[PLACE], link[PLACE + 1], link[PLACE + 2])
+    R = product(R, link, FRAME)
+    axis = rotate(R, link[AXIS], link[AXIS + 1], link[AXIS + 2])
+    return offset, axis, rotate_about(R, link[AXIS], link[AXIS + 1], link[AXIS + 2], angle)
 
 
 @njit(cache=True, inline="always")
@@ -117,14 +131,14 @@ def _cross(ax, ay, az, bx, by, bz):
 
 
 @njit(cache=True, inline="always")
-def turned(R, x, y, z):
+def rotate(R, x, y, z):
     """Return R (9 numbers, row by row) times a vector."""
     return R[0] * x + R[1] * y + R[2] * z, R[3] * x + R[4] * y + R[5] * z, R[6] * x + R[7] * y + R[8] * z
 
 
 @njit(cache=True, inline="always")
 def product(R, k, at):
-    """Return R times the matrix that k holds from `at`."""
+    """Return R times the matrix in k[at : at + 9]."""
     return (
         R[0] * k[at] + R[1] * k[at + 3] + R[2] * k[at + 6],
         R[0] * k[at + 1] + R[1] * k[at + 4] + R[2] * k[at + 7],
@@ -139,7 +153,7 @@ def product(R, k, at):
 
 
 @njit(cache=True, inline="always")
-def spun(R, x, y, z, angle):
+def rotate_about(R, x, y, z, angle):
     """Return R times the rotation by `angle` about the unit axis (Rodrigues)."""
     c, s = np.cos(angle), np.sin(angle)
     d = 1.0 - c

@@ -1,7 +1,8 @@
-"""Inverse dynamics as a product: torque = regressor @ standard inertial parameters of the links.
+"""Rigid-body functions of the nominal arm: regressor, inverse dynamics, mass matrix and end-effector kinematics.
 
-Ten numbers per link in the link's own frame, about the link's origin (Khalil and Dombre 2002, ch. 9):
-mass m, first moments h = m c, and the tensor's xx, yy, zz, xy, xz, yz. Everything is vectorised over the samples.
+The regressor form is torque = regressor @ standard inertial parameters. These are ten numbers per link in the link's
+own frame, about the link's origin (Khalil and Dombre 2002, ch. 9): mass m, first moments h = m c, and the tensor's
+xx, yy, zz, xy, xz, yz.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Mass, centre and tensor of n links; any leading batch shape.
+    """Inertial parameters of n links; any leading batch shape.
 
     Attributes:
         mass: (..., n) kg. com: (..., n, 3) m, link frame.
@@ -32,12 +33,12 @@ class LinkInertia:
         """Return (..., n, 10): m, h, and the tensor about the link's origin (parallel axes)."""
         m, c = self.mass[..., None], self.com
         square = (c**2).sum(-1)[..., None, None] * np.eye(3) - c[..., :, None] * c[..., None, :]
-        tensor = six(self.inertia + m[..., None] * square)
+        tensor = tensor_elements(self.inertia + m[..., None] * square)
         lead = tensor.shape[:-1]  # each field may have its own batch
         return np.concatenate([np.broadcast_to(m, (*lead, 1)), np.broadcast_to(m * c, (*lead, 3)), tensor], -1)
 
 
-def six(tensor: np.ndarray) -> np.ndarray:
+def tensor_elements(tensor: np.ndarray) -> np.ndarray:
     """Return (..., 6) xx, yy, zz, xy, xz, yz of symmetric tensors (..., 3, 3)."""
     rows, columns = zip(*_PAIRS, strict=True)
     return tensor[..., rows, columns]
@@ -46,32 +47,33 @@ def six(tensor: np.ndarray) -> np.ndarray:
 def regressor(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (T, n, n, 10): what each standard parameter of each link adds to each joint's torque.
+    """Return (T, n, n, 10): derivative of each joint's torque by each standard parameter of each link.
 
     Args:
         robot: its kinematics.
         q, dq, ddq: (T, n) rad, rad/s, rad/s^2.
-        gravity: (3,) m/s^2, or None for an arm that compensates it.
+        gravity: (3,) m/s^2, or None for an arm with gravity compensation.
     """
-    place, frame, anchor, axis = kinematics(robot, q)
+    place, frame, anchor, axis = joint_kinematics(robot, q)
     samples, n = q.shape
     out = np.zeros((samples, n, n, 10))
     omega, alpha = np.zeros((samples, 3)), np.zeros((samples, 3))
     origin = np.zeros((samples, 3))
-    a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # falling up is standing still
+    a = np.zeros((samples, 3)) - (0.0 if gravity is None else np.asarray(gravity))  # gravity as a base acceleration
 
-    def carried(a, omega, alpha, arm):
+    def at(a, omega, alpha, arm):
+        """Return the linear acceleration at the end of `arm`."""
         return a + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
 
     basis = np.zeros((6, 3, 3))
     for c, (i, j) in enumerate(_PAIRS):
         basis[c, i, j] = basis[c, j, i] = 1.0
     for k in range(n):
-        a = carried(a, omega, alpha, anchor[:, k] - origin)
+        a = at(a, omega, alpha, anchor[:, k] - origin)
         spin = axis[:, k] * dq[:, k, None]
         alpha = alpha + axis[:, k] * ddq[:, k, None] + np.cross(omega, spin)
         omega = omega + spin
-        a, origin = carried(a, omega, alpha, place[:, k] - anchor[:, k]), place[:, k]
+        a, origin = at(a, omega, alpha, place[:, k] - anchor[:, k]), place[:, k]
         R = frame[:, k]
         force, moment = np.zeros((samples, 10, 3)), np.zeros((samples, 10, 3))
         force[:, 0] = a
@@ -80,16 +82,16 @@ def regressor(
             force[:, 1 + i] = np.cross(alpha, h) + np.cross(omega, np.cross(omega, h))
             moment[:, 1 + i] = np.cross(h, a)
         own_omega, own_alpha = np.einsum("tji,tj->ti", R, omega), np.einsum("tji,tj->ti", R, alpha)
-        turned = np.einsum("cij,tj->tci", basis, own_alpha)
-        turned += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
-        moment[:, 4:] = np.einsum("tij,tcj->tci", R, turned)
-        for j in range(k + 1):  # a link is felt by the joints before it
+        rotated = np.einsum("cij,tj->tci", basis, own_alpha)
+        rotated += np.cross(own_omega[:, None], np.einsum("cij,tj->tci", basis, own_omega))
+        moment[:, 4:] = np.einsum("tij,tcj->tci", R, rotated)
+        for j in range(k + 1):  # joints before a link carry it
             about = moment + np.cross((place[:, k] - anchor[:, j])[:, None], force)
             out[:, j, k] = np.einsum("ti,tci->tc", axis[:, j], about)
     return out
 
 
-def kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def joint_kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return link origins (T, n, 3) and frames (T, n, 3, 3), joint anchors and axes (T, n, 3), in the base frame."""
     model = robot.model(gravity=False)
     data = mujoco.MjData(model)
@@ -108,25 +110,31 @@ def kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 def rigid_body(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rest (T, n) Nm, regressor (T, n, n, 10)): what no link of a joint adds, and what the links do.
+    """Return (rest (T, n) Nm, regressor (T, n, n, 10)); the torque is their sum over the links' parameters.
 
-    The rest is the MJCF's armature and damping, and bodies welded to links. Arguments as in `regressor`.
+    The rest is the torque of the MJCF's armature, damping and welded bodies. For the arguments see `regressor`.
     """
     model = robot.model(gravity=gravity is not None)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
     if gravity is not None:
         model.opt.gravity = gravity
-    data, whole = mujoco.MjData(model), np.empty_like(q)
-    for t in range(len(q)):
-        data.qpos, data.qvel, data.qacc = q[t], dq[t], ddq[t]
-        mujoco.mj_inverse(model, data)
-        whole[t] = data.qfrc_inverse
+    total = mujoco_inverse_dynamics(model, q, dq, ddq)
     y = regressor(robot, q, dq, ddq, gravity)
-    return whole - np.einsum("tjkc,kc->tj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard()), y
+    return total - np.einsum("tjkc,kc->tj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard()), y
+
+
+def mujoco_inverse_dynamics(model: mujoco.MjModel, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Return the torque (T, n) Nm of a model at q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
+    data, out = mujoco.MjData(model), np.empty_like(q)
+    for t in range(len(q)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[t], dq[t], ddq[t]
+        mujoco.mj_inverse(model, data)
+        out[t] = data.qfrc_inverse
+    return out
 
 
 def mass_matrix(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return (T, n, n) kg m^2 of the robot's own links and rotors at q (T, n) rad."""
+    """Return the mass matrix (T, n, n) kg m^2 of the nominal links and rotors at q (T, n) rad."""
     model = robot.model(gravity=False)
     data, out = mujoco.MjData(model), np.empty((*q.shape, robot.n))
     for t in range(len(q)):
@@ -137,7 +145,7 @@ def mass_matrix(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return moments (..., 3) kg m^2 and their axes as a quaternion (..., 4) w x y z of tensors (..., 3, 3)."""
+    """Return principal moments (..., 3) kg m^2 and axes, a quaternion (..., 4) w x y z, of tensors (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     moments, axes = np.linalg.eigh(inertia)
@@ -146,10 +154,10 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return moments, quaternions.reshape(*axes.shape[:-2], 4)
 
 
-def put_links(
+def set_links(
     model: mujoco.MjModel, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, armature: np.ndarray
 ) -> None:
-    """Give a compiled arm's links mass (n,) kg, centre (n, 3) m, tensor about it (n, 3, 3), rotors (n,) kg m^2."""
+    """Set mass (n,) kg, centre (n, 3) m, tensor about it (n, 3, 3) and rotor inertia (n,) kg m^2 of a model."""
     at = model.jnt_bodyid
     model.dof_armature[:] = armature
     model.body_mass[at], model.body_ipos[at] = mass, com
@@ -158,7 +166,7 @@ def put_links(
 
 
 class Kinematics:
-    """Where the arm's hand is, from joint angles and the nominal geometry: what a real arm knows, too."""
+    """End-effector position and Jacobian of the nominal geometry, from measured joint angles."""
 
     def __init__(self, robot: Robot):
         self._model = robot.model(gravity=False)
@@ -166,7 +174,7 @@ class Kinematics:
         self._site = self._model.site(robot.ee_site).id
 
     def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ee (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        """Return the end-effector position (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
         self._data.qpos = q
         mujoco.mj_kinematics(self._model, self._data)
         ee = self._data.site_xpos[self._site].copy()
@@ -174,10 +182,7 @@ class Kinematics:
 
 
 class InverseInertia:
-    """How torques accelerate the joints of m arms at rest, by the nominal model.
-
-    1 over its diagonal is the inertia that each joint feels with the others free.
-    """
+    """Inverse mass matrix of m nominal arms; 1 over its diagonal is a joint's inertia with the other joints free."""
 
     def __init__(self, robot: Robot, m: int = 1):
         model = robot.model(gravity=False)

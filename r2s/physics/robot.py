@@ -1,7 +1,7 @@
-"""The arm: kinematics, inertia and gravity from an MJCF or URDF file, limits from it or from the config.
+"""The arm: kinematics, inertia and gravity of an MJCF or URDF file, limits of the file or the config.
 
-r2s commands joint torques, so a file's actuators, sensors, keyframes and contacts are dropped; its joints,
-links, armature and damping stay. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+r2s commands joint torques, so it uses a file's joints, links, armature and damping, and drops actuators, sensors,
+keyframes and contacts. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from r2s.files import located
 from r2s.physics.urdf import is_urdf, read_urdf
 
 PANDA = "r2s:models/panda.xml"
-SIM_DT = 1e-3  # s, the arm's own cycle
-DQ_MAX = 2.0  # rad/s, where nobody says how fast a joint may be
-OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # what conf/robot says beside `load_robot`'s arguments
+SIM_DT = 1e-3  # s, control cycle of the arm
+DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
+OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot for tasks, not for `load_robot`
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Robot:
     Attributes:
         name: the model's name.
         mjcf: its file, MJCF or URDF.
-        q_min, q_max: (n,) rad; -inf and inf where a joint turns without end.
+        q_min, q_max: (n,) rad; -inf and inf for a continuous joint.
         dq_max: (n,) rad/s. ddq_max: (n,) rad/s^2.
         tau_max: (n,) Nm. dtau_max: (n,) Nm/s.
-        q_home: (n,) rad, where episodes and excitations start.
-        ee_site: the site of `model` that reaches for goals.
+        q_home: (n,) rad, start of episodes and excitations.
+        ee_site: the site of `model` that is the end effector.
         gravity: (3,) m/s^2 in the base frame.
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
-        armature: (n,) kg m^2, nominal inertia of each joint's rotor, as the joint feels it through the gear.
-        slowing: where an arm allows less speed the closer a joint is to a position limit: deceleration (n,) rad/s^2
-            and offset (n,) rad/s, of sqrt(2 deceleration way + offset^2) - offset. None: it does not.
+        armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
+        velocity_envelope: position-based velocity limits of an FR3: deceleration (n,) rad/s^2 and offset (n,) rad/s
+            in sqrt(2 deceleration distance + offset^2) - offset, with the distance from a position limit; None: none.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Robot:
     com: np.ndarray
     inertia: np.ndarray
     armature: np.ndarray
-    slowing: tuple[np.ndarray, np.ndarray] | None = None
+    velocity_envelope: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def n(self) -> int:
@@ -65,22 +65,22 @@ class Robot:
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high) (n,) rad to take angles from: the limits; where they leave more than a turn, one about home."""
+        """(low, high) (n,) rad: the position limits, or one turn about home if they are wider."""
         more = self.q_max - self.q_min > 2 * np.pi
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
 
     def model(self, *, gravity: bool, user: int = 0, memory: int = 0, dt: float = SIM_DT) -> mujoco.MjModel:
-        """Compile the arm.
+        """Compile the MuJoCo model.
 
         Args:
-            gravity: False is libfranka's convention (the arm compensates it); True is for link-side torque.
-            user: width of `jnt_user`, where the friction law keeps its parameters (r2s/physics/native_friction.py).
-            memory: doubles that it remembers from step to step.
+            gravity: False is libfranka's convention (the arm compensates gravity); True is for link-side torque.
+            user: columns of `jnt_user`, the parameters of the callback (r2s/physics/mujoco_callback.py).
+            memory: doubles of the callback's state.
             dt: time step, s.
         """
         spec, _ = read_spec(self.mjcf)
-        spec.compile()  # gives the joints their ids, and what is changed below takes them away
+        spec.compile()  # assigns the joints' ids; the changes below invalidate them
         joints = sorted(spec.joints, key=lambda joint: joint.id)
         for item in [*spec.actuators, *spec.sensors, *spec.keys]:
             spec.delete(item)
@@ -92,7 +92,7 @@ class Robot:
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.parent.simple = False  # its centre and tensor may become others
+            joint.parent.simple = False  # MuJoCo simplifies such bodies, but their inertia may change
         spec.nuser_jnt = user
         spec.nuserdata = memory
         spec.option.timestep = dt
@@ -103,25 +103,25 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats: a value per joint, or one for all.
+    """Return (n,) floats from a value per joint or one for all; `joints`, as "the 7 joints of panda", is for errors.
 
     Raises:
-        UserError: `name` has another number of values, or none; `joints` says of what, as in "the 7 joints of panda".
+        UserError: another number of values, or no numbers.
     """
     try:
         array = np.array(value, dtype=float)
         if any(isinstance(x, bool | np.bool_) for x in np.ravel(np.array(value, dtype=object))):
-            raise ValueError  # yaml's true is no 1
+            raise ValueError  # YAML's true would become 1.0
     except (TypeError, ValueError):
-        raise UserError(f"{name} is not a number, nor one for each of {joints}") from None
+        raise UserError(f"{name}: expected a number, or one for each of {joints}, got {value!r}") from None
     array = np.full(n, float(array)) if array.ndim == 0 else array
     if array.shape != (n,):
-        raise UserError(f"{name}: {array.size} values for {joints}")
+        raise UserError(f"{name}: expected {n} values, for {joints}, got {array.size}")
     return array
 
 
 def read_spec(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """Return what an MJCF or URDF file describes, and the joints' speed limits, (n,) or one, rad/s; nan: none.
+    """Return the spec of an MJCF or URDF file and the velocity limits, (n,) or one, rad/s; nan: no limit.
 
     Raises:
         UserError: the file is not valid.
@@ -148,26 +148,24 @@ def load_robot(
     gravity: list[float] | None = None,
     armature: list[float] | float | None = None,
 ) -> Robot:
-    """Read an arm from an MJCF or URDF file; None is the embedded Panda. What is given here goes over the file's.
+    """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
-    Joint ranges and torque limits are read from the file (of MJCF: `actuatorfrcrange` of the joint, or
-    `forcerange`/`ctrlrange` of its motor), and of URDF speed limits. Acceleration and torque-rate limits are part of
-    neither.
+    The file gives position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
+    its motor), and in URDF velocity limits. Neither format has limits of acceleration or torque rate.
 
     Args:
-        mjcf: the file; `r2s:models/panda.xml` is one of the package.
-        ee: the site, body or link that is the end effector; None: the only site, or the last link of a URDF.
+        mjcf: the file; `r2s:models/panda.xml` is one of the package; None: the Panda.
+        ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
         q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
-        gravity: (3,) m/s^2 in the base frame; None: the file's, which in a URDF is an upright base's.
-        armature: kg m^2, of the rotors at the joints; None: the file's.
+        gravity: (3,) m/s^2 in the base frame; None: the file's (in a URDF that of an upright base).
+        armature: kg m^2, rotor inertia at the joints; None: the file's.
 
     Raises:
-        UserError: missing or broken file, not a serial arm of hinge joints, limits or end effector that cannot be
-            found.
+        UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
     """
     path = located(mjcf or PANDA)
     if not path.is_file():
-        others = [p.name for p in path.parent.glob("*.*")] if path.parent.is_dir() else []
+        others = [p.name for p in path.parent.glob("*.*")]
         raise UserError(f"robot.mjcf: no such file: {path}{nearest(path.name, others)}")
     spec, fastest = read_spec(path)
     try:
@@ -175,8 +173,7 @@ def load_robot(
     except ValueError as error:
         raise UserError(f"robot.mjcf: {path} is not a valid model: {' '.join(str(error).split())}") from None
     _check_serial(model, path)
-    n = model.njnt
-    site = _end_effector(model, ee, path)
+    n, site = model.njnt, _end_effector(model, ee, path)
 
     def each(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
         return per_joint(f"robot.{name}", fallback if value is None else value, n, f"the {n} joints of {path.name}")
@@ -184,29 +181,10 @@ def load_robot(
     limited = model.jnt_limited.astype(bool)
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
-    if not np.all(ranges := (low < high) & (np.isfinite(low) == np.isfinite(high))):
-        joint = int(np.argmin(ranges))
-        raise UserError(
-            f"robot.q_min: joint {joint + 1} from {low[joint]:g} to {high[joint]:g} rad is no range; allowed: q_min "
-            "below q_max, or neither"
-        )
-    torque = each("tau_max", tau_max, _torque_limits(model))
-    if not np.all(torque > 0):
-        joints = [model.joint(i).name or f"joint {i + 1}" for i in np.flatnonzero(~(torque > 0))]
-        raise UserError(
-            f"robot.tau_max: {path.name} gives no torque limit for {choices(joints)}; set robot.tau_max=[...]"
-        )
     tenth = 0.1 * np.where(np.isfinite(high - low), high - low, 0.0)
     home = each("q_home", q_home, np.clip(model.qpos0, low + tenth, high - tenth))
-    if np.any(home < low) or np.any(home > high):
-        joint = int(np.argmax(np.maximum(low - home, home - high)))
-        raise UserError(
-            f"robot.q_home: joint {joint + 1} at {home[joint]:.3f} rad, allowed {low[joint]:.3f} to {high[joint]:.3f}"
-        )
-    rotation = np.zeros((n, 3, 3))
-    for i, body in enumerate(model.jnt_bodyid):
-        mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])
-    principal = model.body_inertia[model.jnt_bodyid]
+    torque = each("tau_max", tau_max, _torque_limits(model))
+    _check_limits(model, path, low, high, home, torque)
     return Robot(
         name=spec.modelname or path.stem,
         mjcf=path.resolve(),
@@ -221,19 +199,48 @@ def load_robot(
         gravity=per_joint("robot.gravity", model.opt.gravity if gravity is None else gravity, 3, "x, y and z"),
         mass=model.body_mass[model.jnt_bodyid].copy(),
         com=model.body_ipos[model.jnt_bodyid].copy(),
-        inertia=rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1),
+        inertia=_tensors(model),
         armature=each("armature", armature, model.dof_armature),
     )
 
 
+def _check_limits(
+    model: mujoco.MjModel, path: Path, low: np.ndarray, high: np.ndarray, home: np.ndarray, torque: np.ndarray
+) -> None:
+    """Raise UserError unless position and torque limits are complete and q_home lies within them."""
+    valid = (low < high) & (np.isfinite(low) == np.isfinite(high))
+    if not np.all(valid):
+        j = int(np.argmin(valid))
+        raise UserError(
+            f"robot.q_min: expected q_min below q_max, or neither, got {low[j]:g} and {high[j]:g} rad (joint {j + 1})"
+        )
+    if not np.all(torque > 0):
+        joints = [model.joint(i).name or f"joint {i + 1}" for i in np.flatnonzero(~(torque > 0))]
+        raise UserError(
+            f"robot.tau_max: no torque limit of {choices(joints)} in {path.name}; set robot.tau_max=[...]"
+        )
+    if np.any(home < low) or np.any(home > high):
+        j = int(np.argmax(np.maximum(low - home, home - high)))
+        raise UserError(
+            f"robot.q_home: expected {low[j]:.3f} to {high[j]:.3f} rad, got {home[j]:.3f} (joint {j + 1})"
+        )
+
+
+def _tensors(model: mujoco.MjModel) -> np.ndarray:
+    """Return the tensors (n, 3, 3) kg m^2 of the moving links about their centres of mass, link axes."""
+    rotation = np.zeros((model.njnt, 3, 3))
+    for i, body in enumerate(model.jnt_bodyid):
+        mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])
+    principal = model.body_inertia[model.jnt_bodyid]
+    return rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1)
+
+
 def _check_serial(model: mujoco.MjModel, path: Path) -> None:
-    """Raise UserError unless every joint is a hinge and each moves a link on one chain."""
+    """Raise UserError unless all joints are hinges of one chain."""
     for i in range(model.njnt):
         if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_HINGE:
             kind = mujoco.mjtJoint(int(model.jnt_type[i])).name
-            raise UserError(
-                f"robot.mjcf: {path.name}: joint '{model.joint(i).name}' is {kind}; only hinges are allowed"
-            )
+            raise UserError(f"robot.mjcf: {path.name}: expected hinges, got {kind} (joint '{model.joint(i).name}')")
     if model.njnt == 0:
         raise UserError(f"robot.mjcf: {path.name} has no joints")
     for previous, body in zip(model.jnt_bodyid[:-1], model.jnt_bodyid[1:], strict=True):
@@ -249,32 +256,32 @@ def _check_serial(model: mujoco.MjModel, path: Path) -> None:
 
 
 def _end_effector(model: mujoco.MjModel, name: str | None, path: Path) -> str:
-    """Return the name of a site, or of a body whose frame is to be one; None: the only candidate."""
+    """Return the name of the end effector's site, or of the body whose frame becomes one."""
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(1, model.nbody) if model.body(i).name]
     if name is None:
-        # of a URDF, which has no sites: links at the arm's end that carry no other
+        # a URDF has no sites: use its last links
         ends = _ends(model) if is_urdf(path) else sites
         if len(ends) != 1:
-            raise UserError(f"robot.ee: name one of {path.name}: {choices(ends or bodies)}")
+            raise UserError(f"robot.ee: choose the end effector of {path.name}: {choices(ends or bodies)}")
         return ends[0]
     if name not in [*sites, *bodies]:
         raise UserError(
-            f"robot.ee: no site, body or link '{name}' in {path.name}; it has {choices([*sites, *bodies])}"
+            f"robot.ee: expected one of {choices([*sites, *bodies])} in {path.name}, got '{name}'"
             f"{nearest(name, [*sites, *bodies])}"
         )
     return name
 
 
 def _ends(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the bodies that move with the last joint and carry no other."""
+    """Return the names of the bodies that move with the last joint and have no child."""
     last = model.jnt_bodyid[-1]
-    carrying = set(model.body_parentid.tolist())
-    return [model.body(i).name for i in np.flatnonzero(model.body_weldid == last) if i not in carrying]
+    parents = set(model.body_parentid.tolist())
+    return [model.body(i).name for i in np.flatnonzero(model.body_weldid == last) if i not in parents]
 
 
 def _torque_limits(model: mujoco.MjModel) -> np.ndarray:
-    """Return (n,) Nm from the joints' actuatorfrcrange or their motors' ranges; nan where the file has none."""
+    """Return the torque limits (n,) Nm of the joints' actuatorfrcrange or of their motors; nan: none in the file."""
     limit = np.where(model.jnt_actfrclimited.astype(bool), np.abs(model.jnt_actfrcrange).min(1), np.nan)
     for i in range(model.nu):
         joint = model.actuator_trnid[i, 0]

@@ -1,34 +1,70 @@
-"""Many copies of the arm at once: `mujoco.batch.Batch` with the friction law inside the physics step.
+"""Many copies of the arm at once: `mujoco.batch.Batch` with friction, control law and safety filter in each step.
 
-The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation, so
-the commanded simulator has no gravity. What the compensation gets wrong (it believes the nominal masses and centres)
-acts as a torque of its own (r2s/physics/friction.py).
+The convention is libfranka's: a commanded torque excludes gravity, because the arm adds its own compensation. So the
+simulator has no gravity. The error of that compensation, which uses the nominal masses and centres, acts as a torque
+of its own (r2s/physics/friction.py).
 """
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import mujoco
 import mujoco.batch
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.physics import native_friction as native
-from r2s.physics.actuation import steps_late
+from r2s.physics import mujoco_callback as native
+from r2s.physics.actuation import low_pass_factor, steps_late
+from r2s.physics.control_laws import law_number
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.rigid_body import principal_axes, put_links
+from r2s.physics.rigid_body import principal_axes, set_links
 from r2s.physics.robot import SIM_DT, Robot
+
+
+class ControlLaw(Protocol):
+    """A control law with its parameters; see r2s/physics/control_laws.py.
+
+    Attributes:
+        law: compiled. parameters: (p,). command_size, memory_size: numbers in a command and in the law's memory.
+    """
+
+    @property
+    def law(self): ...  # noqa: D102 (see the class)
+    @property
+    def parameters(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def command_size(self) -> int: ...  # noqa: D102
+    @property
+    def memory_size(self) -> int: ...  # noqa: D102
 
 
 class Simulator:
     """`nsim` arms stepped together on `nthread` threads (0: all), each with its own Dynamics.
 
     Results are bit-identical at any thread count.
+
+    Args:
+        robot, dynamics: the arm; dynamics of one arm or of `nsim`. nsim: arms. nthread: threads.
+        dt: s, of a physics step.
+        control: law that turns commands into torques; None: `rollout` gives torques.
     """
 
-    def __init__(self, robot: Robot, dynamics: Dynamics, nsim: int, nthread: int = 0, dt: float = SIM_DT):
+    def __init__(
+        self,
+        robot: Robot,
+        dynamics: Dynamics,
+        nsim: int,
+        nthread: int = 0,
+        dt: float = SIM_DT,
+        control: ControlLaw | None = None,
+    ):
+        self._control, self._kept = control, native.KEPT * robot.n
+        self._law_number = native.NO_CONTROL if control is None else float(law_number(control.law))
         native.install()
         self.robot = robot
-        self.model = robot.model(gravity=False, user=native.WIDTH, memory=native.KEPT * robot.n, dt=dt)
+        sizes = (0, 0, 0) if control is None else (control.command_size, control.memory_size, len(control.parameters))
+        self._sizes = sizes
+        self.model = robot.model(gravity=False, user=native.WIDTH, memory=self._kept + sum(sizes), dt=dt)
         self.batch = mujoco.batch.Batch(self.model, nsim, nthread)
         self.nsim = nsim
         self._bodies = self.model.jnt_bodyid
@@ -43,6 +79,7 @@ class Simulator:
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
+        self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] :]
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
         self._site_xpos = self.batch.bind("site_xpos")
         self.set_dynamics(dynamics)
@@ -69,15 +106,38 @@ class Simulator:
         self._com[at] = spread(dynamics.com, 2)
         self.batch.set_const(ids)
 
-    def drive(self, limits: np.ndarray) -> None:
-        """Put the driver's law, and behind it each arm's delay and lag, before the torques of `rollout`.
+    def drive(
+        self,
+        limits: np.ndarray,
+        torque_limit: np.ndarray | float = np.inf,
+        cutoff_hz: float = np.inf,
+        soft_start_s: float = 0.0,
+    ) -> None:
+        """Put control law, conditioning, safety filter, delay and lag between `rollout` and the joints.
 
-        These are then efforts, what is asked for; without this call they are what the joints feel.
+        Without a control law the torques of `rollout` are efforts: they go to the safety filter as they are.
 
         Args:
-            limits: (n, COLUMNS), of r2s.physics.limits.limits.
+            limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
+            torque_limit: (n,) Nm, largest target. cutoff_hz: low-pass on the target. soft_start_s: s, of an episode.
         """
-        self._user[:, :, native.LIMITS :] = limits
+        u = native
+        self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits
+        self._user[:, :, u.CONTROL] = self._law_number
+        self._user[:, :, u.FADE] = round(soft_start_s / SIM_DT)
+        self._user[:, :, u.LOW_PASS] = low_pass_factor(cutoff_hz)
+        self._user[:, :, u.TARGET_MAX] = torque_limit
+        self._user[:, :, u.COMMANDS : u.PARAMETERS + 1] = self._sizes
+
+    def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
+        """Set the commands (nsim, c) of the control law until the next call.
+
+        speed_noise (nsim, n) rad/s is what the sensors add to the speeds that the law sees; None: nothing.
+        """
+        n = self.robot.n
+        self._memory[:, self._kept : self._kept + self._sizes[0]] = command
+        if speed_noise is not None:
+            self._memory[:, native.NOISE * n : (native.NOISE + 1) * n] = speed_noise
 
     def push(self, tau: np.ndarray) -> None:
         """Let something else push the joints with tau (nsim, n) Nm from now on, beside the arms' own offsets."""
@@ -96,6 +156,8 @@ class Simulator:
         self.dq[at] = dq
         self._memory[at] = 0.0
         self._memory[at, : self.robot.n] = bristle
+        if self._control is not None:
+            self._parameters[at] = self._control.parameters
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 
@@ -133,6 +195,12 @@ class Simulator:
         return self._memory[:, native.SENT * n : (native.SENT + 1) * n]
 
     @property
+    def effort(self) -> np.ndarray:
+        """(nsim, n) Nm, the target after low-pass, clip and rate limit."""
+        n = self.robot.n
+        return self._memory[:, native.EFFORT * n : (native.EFFORT + 1) * n]
+
+    @property
     def limited(self) -> np.ndarray:
         """(nsim,), in how many cycles since `reset` the driver's law changed what was asked for."""
         return self._memory[:, native.LIMITED * self.robot.n]
@@ -164,7 +232,7 @@ def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
     native.install()
     model = robot.model(gravity=False, user=native.WIDTH, memory=native.KEPT * robot.n)
     model.jnt_user[:, : native.LIMITS] = _law_columns(robot, model, dynamics)
-    put_links(model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
+    set_links(model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
     return model
 
 
@@ -175,18 +243,18 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     # what gravity compensation lacks: it believes the nominal links, and whatever load it was told of
     last = np.arange(robot.n) == robot.n - 1
     errors = (
-        d.mass - robot.mass - last * d.told[..., :1],
-        moment - nominal - last[:, None] * d.told[..., None, 1:],
+        d.mass - robot.mass - last * d.declared_payload[..., :1],
+        moment - nominal - last[:, None] * d.declared_payload[..., None, 1:],
     )
     arrays = (errors[0], d.phi[..., 0], d.offset, d.breakaway[..., 0], moment[..., 0], d.load, d.drag[..., 0])
     delay, lag = (late[..., None] for late in steps_late(d.delay, d.lag))
     rows = np.zeros((*np.broadcast_shapes(*(a.shape for a in (*arrays, delay, lag))), f.LIMITS))
-    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family, d.hold)
+    rows[..., f.MARK], rows[..., f.FAMILY] = f.MARKER, f.number(d.family, d.stiction_model)
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
     rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
     if not d.family.has_memory:  # which holds by itself: no dead zone
-        rows[..., f.DQ_MIN], rows[..., f.NET] = d.dq_min, d.hold == "net"
+        rows[..., f.DQ_MIN], rows[..., f.NET] = d.dq_min, d.stiction_model == "net"
         rows[..., f.REST_NEG : f.REST_POS + 1] = d.family.at_rest(d.phi)
     rows[..., f.DAMPING] = model.dof_damping
     rows[..., f.DRAG_SIN : f.DRAG_COS + 1] = d.drag

@@ -1,113 +1,105 @@
-"""Stick and slip of coupled joints within one step: who is held, lets go, stops or turns, and when.
+"""Stick and slip of coupled joints within one step: which joints stick, break away, stop or reverse, and when.
 
-A joint at rest is held while the net torque on it, which is all but its own friction, the coupling to the others
-included, lies within its edges. Beyond them it slides against the friction of its direction. Torques are constant for
-a step; so are accelerations from event to event, and each event is found where it happens (event-driven integration:
-Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time stepping takes the friction of a step's
-end for all of it, and is wrong by up to h times that friction at every turn.
+A joint at rest sticks while the net torque on it lies within its breakaway edges; the net torque includes the
+coupling to other joints, but not the joint's own friction. Beyond the edges it slides against the friction of its
+direction. Torques are constant for a step, so accelerations are constant between events, and each event is located
+exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time
+stepping would use the friction at the end of a step for all of it, an error of up to h times that friction at each
+reversal.
 
-Hard stops are MuJoCo's own: where a joint lies at one, they come on top of what is found here.
+Joint limits are MuJoCo's own: their force adds to the result of this module.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from r2s.compiled import njit
+from r2s.physics.linear_algebra import factor, factor_active, packed_element, solve, solve_active, unpack
 
-TINY = 1e-9  # rad/s, what round-off leaves of a joint that is held: it is at rest
-HELD, FREE = 0.0, 2.0  # in place of a direction: at rest, and without edges to be held by
+TINY = 1e-9  # rad/s, round-off of the velocity of a sticking joint
+HELD, FREE = 0.0, 2.0  # `side` of a sticking joint and of a joint without stiction; -1, 1: direction of sliding
 
 
-@njit(cache=True, error_model="numpy")
-def turns(mass, damping, h, dq, drive, work):
-    """Return whether any joint comes through rest by sliding on; arguments as below, but friction is in `drive`."""
-    n, change = len(dq), work[len(dq)]
-    for i in range(n):  # Cholesky's root of mass + h damping, its diagonal inverted, and at once the first solution
-        row = i * (i + 1) // 2
-        d, s = mass[row + i] + h * damping[i], h * drive[i]
-        for k in range(i):
-            r = mass[row + k]
-            for c in range(k):
-                r -= work[i, c] * work[k, c]
-            r *= work[k, k]
-            work[i, k] = r
-            d -= r * r
-            s -= r * change[k]
-        d = 1.0 / np.sqrt(d)
-        work[i, i], change[i] = d, s * d
-    for i in range(n - 1, -1, -1):
-        s = change[i]
-        for c in range(i + 1, n):
-            s -= work[c, i] * change[c]
-        change[i] = s * work[i, i]
-        if dq[i] * (dq[i] + change[i]) < 0.0:
-            return True
-    return False
+class JointForces(NamedTuple):
+    """Velocities and torques of n joints at the beginning of a step.
+
+    dq: (n,) rad/s. drive: (n,) Nm, all torques but friction. friction: (n,) Nm at dq. rest: (2, n) Nm, kinetic
+    friction at zero speed in the negative and the positive direction. edges: (2, n) Nm, breakaway, at least `rest`;
+    0, 0: no stiction.
+    """
+
+    dq: np.ndarray
+    drive: np.ndarray
+    friction: np.ndarray
+    rest: np.ndarray
+    edges: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
-def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, work, coming):
-    """Write the velocities (n,) at the end of a step into `coming`; return whether stiction had a part in them.
+def any_reversal(mass, damping, h, dq, net, work):
+    """Return whether a joint reverses if all joints slide on with the net torque `net` (n,) Nm, friction included.
 
-    Where it had none they are those of sliding on: (mass + h damping) (coming - dq) = h (drive - friction).
-
-    Args:
-        mass: (n (n + 1) / 2,) kg m^2, the lower triangle, row by row. damping: (n,) Nm s/rad, implicit. h: s.
-        dq, drive, friction: (n,) rad/s, Nm, Nm: velocity, all torques but friction, friction at dq.
-        rest: (2, n) Nm, friction when sliding just begins, in the negative and in the positive direction.
-        edges: (2, n) Nm, what holds a joint at rest, at least `rest`; 0, 0 where nothing does.
-        dq_min: rad/s, below which a joint whose net torque is within its edges comes to rest.
-        work: (n + 4, n), anything. coming: (n,) rad/s.
+    The other arguments are those of `coming_velocity`.
     """
     n = len(dq)
-    root, side, now, acceleration, rhs = work[:n], work[n], work[n + 1], work[n + 2], work[n + 3]
-    slow, held, within = False, 0, True
-    for j in range(n):
-        coming[j], now[j] = dq[j], friction[j]
-        if edges[0, j] == 0.0 and edges[1, j] == 0.0:
-            side[j] = FREE
-        elif abs(dq[j]) <= dq_min:
-            side[j] = HELD
-            slow |= dq[j] != 0.0
-            held += 1
-            within &= edges[0, j] <= drive[j] <= edges[1, j]
-        else:
-            side[j] = np.sign(dq[j])
-    if held == n and within and not slow:  # nothing moves
+    root, change = work[:n], work[n]
+    unpack(mass, h, damping, root)
+    factor(root, root)
+    for i in range(n):
+        change[i] = h * net[i]
+    solve(root, change)
+    reverses = False
+    for i in range(n):
+        reverses |= dq[i] * (dq[i] + change[i]) < 0.0
+    return reverses
+
+
+@njit(cache=True, error_model="numpy")
+def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
+    """Write the velocities (n,) at the end of a step into `coming`; return whether stiction had an effect.
+
+    Without stiction they solve (mass + h damping) (coming - dq) = h (drive - friction).
+
+    Args:
+        mass: packed mass matrix, kg m^2. damping: (n,) Nm s/rad, implicit. h: s.
+        forces: `JointForces`.
+        dq_min: rad/s, a slower joint stops if its net torque is within its edges.
+        work: (n + 4, n), any content. coming: (n,) rad/s.
+    """
+    n = len(forces.dq)
+    root, side, friction, acceleration, impulse = work[:n], work[n], work[n + 1], work[n + 2], work[n + 3]
+    slow, at_rest = _initial_sides(forces, dq_min, side, friction, coming)
+    if at_rest:
         return True
     took_part, left, events = False, h, 0
     while True:
-        while True:  # of all at rest, the joint farthest beyond its edges lets go
+        while True:  # of the sticking joints, the one farthest beyond its edges breaks away
             for j in range(n):
-                rhs[j] = drive[j] - now[j]
-            _factor(mass, damping, h, side, root)
-            _solve(root, side, rhs, acceleration)
-            j, way = _farthest_beyond(mass, acceleration, drive, edges, side)
-            if j < 0 or events > 4 * n:  # who stopped that often in a millisecond stays for the rest of it
+                acceleration[j] = forces.drive[j] - friction[j]
+            unpack(mass, h, damping, root)
+            factor_active(root, side, root)
+            solve_active(root, side, acceleration)
+            j, direction = _farthest_beyond(mass, acceleration, forces, side)
+            if j < 0 or events > 4 * n:  # a joint with so many stops within a step sticks until its end
                 break
-            side[j] = way if coming[j] == 0.0 else np.sign(coming[j])
-            on = side[j] * dq[j] > 0.0  # it slides as it did
-            now[j] = friction[j] if on else rest[int(side[j] > 0.0), j]
+            side[j] = direction if coming[j] == 0.0 else np.sign(coming[j])
+            on = side[j] * forces.dq[j] > 0.0  # it slides in its old direction
+            friction[j] = forces.friction[j] if on else forces.rest[int(side[j] > 0.0), j]
             took_part |= not on
-        if slow:  # an impulse stops those that are held and not at rest, and the others feel it
+        if slow:  # an impulse stops the slow sticking joints; the coupling transmits it
             slow = False
             for j in range(n):
-                rhs[j] = 0.0
+                impulse[j] = 0.0
                 for k in range(n):
                     if side[k] == HELD:
-                        rhs[j] += element(mass, j, k) * coming[k]
-            _solve(root, side, rhs, rhs)
+                        impulse[j] += packed_element(mass, j, k) * coming[k]
+            solve_active(root, side, impulse)
             for j in range(n):
-                coming[j] = 0.0 if side[j] == HELD else coming[j] + rhs[j]
-        span, first = left, -1
+                coming[j] = 0.0 if side[j] == HELD else coming[j] + impulse[j]
         for j in range(n):
             took_part |= side[j] == HELD
-            if abs(side[j]) == 1.0:
-                if side[j] * (coming[j] + span * acceleration[j]) < 0.0:
-                    until = -coming[j] / acceleration[j] if side[j] * coming[j] > 0.0 else 0.0
-                    if until < span:
-                        span, first = until, j
-                elif side[j] * coming[j] < 0.0 < span:  # by an impulse
-                    span, first = 0.0, j
+        span, first = _first_stop(coming, acceleration, side, left)
         for j in range(n):
             coming[j] += span * acceleration[j]
         if first < 0:
@@ -120,64 +112,52 @@ def coming_velocity(mass, damping, h, dq, drive, friction, rest, edges, dq_min, 
 
 
 @njit(cache=True, error_model="numpy")
-def element(mass, i, k):
-    """Return one element of the matrix whose lower triangle is `mass`."""
-    return mass[i * (i + 1) // 2 + k] if i >= k else mass[k * (k + 1) // 2 + i]
+def _initial_sides(forces, dq_min, side, friction, coming):
+    """Write side, friction and velocity of each joint; return whether a sticking joint moves and whether all rest."""
+    dq, drive, edges, n = forces.dq, forces.drive, forces.edges, len(forces.dq)
+    slow, held, inside = False, 0, True
+    for j in range(n):
+        coming[j], friction[j] = dq[j], forces.friction[j]
+        if edges[0, j] == 0.0 and edges[1, j] == 0.0:
+            side[j] = FREE
+        elif abs(dq[j]) <= dq_min:
+            side[j] = HELD
+            slow |= dq[j] != 0.0
+            held += 1
+            inside &= edges[0, j] <= drive[j] <= edges[1, j]
+        else:
+            side[j] = np.sign(dq[j])
+    return slow, held == n and inside and not slow
 
 
 @njit(cache=True, error_model="numpy")
-def _factor(mass, damping, h, side, root):
-    """Write Cholesky's root of mass + h damping of those that slide, its diagonal inverted."""
-    for i in range(len(side)):
-        if side[i] != HELD:
-            row = i * (i + 1) // 2
-            d = mass[row + i] + h * damping[i]
-            for k in range(i):
-                s = 0.0
-                if side[k] != HELD:
-                    s = mass[row + k]
-                    for c in range(k):
-                        s -= root[i, c] * root[k, c]
-                    s *= root[k, k]
-                    d -= s * s
-                root[i, k] = s
-            root[i, i] = 1.0 / np.sqrt(d)
+def _first_stop(coming, acceleration, side, left):
+    """Return the time of the first stop or reversal within `left` s, and its joint, -1 for none."""
+    span, first = left, -1
+    for j in range(len(side)):
+        if abs(side[j]) == 1.0:
+            if side[j] * (coming[j] + span * acceleration[j]) < 0.0:
+                until = -coming[j] / acceleration[j] if side[j] * coming[j] > 0.0 else 0.0
+                if until < span:
+                    span, first = until, j
+            elif side[j] * coming[j] < 0.0 < span:  # the impulse reversed this joint
+                span, first = 0.0, j
+    return span, first
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(root, side, rhs, x):
-    """Write the solution to x, which may be `rhs`; 0 for those held."""
-    n = len(rhs)
-    for i in range(n):
-        s = 0.0
-        if side[i] != HELD:
-            s = rhs[i]
-            for c in range(i):
-                s -= root[i, c] * x[c]
-            s *= root[i, i]
-        x[i] = s
-    for i in range(n - 1, -1, -1):
-        if side[i] != HELD:
-            s = x[i]
-            for c in range(i + 1, n):
-                if side[c] != HELD:
-                    s -= root[c, i] * x[c]
-            x[i] = s * root[i, i]
-
-
-@njit(cache=True, error_model="numpy")
-def _farthest_beyond(mass, acceleration, drive, edges, side):
-    """Return which held joint's net torque is the farthest beyond its edges, -1 for none, and which way it points."""
-    worst, at, way = 0.0, -1, 1.0
+def _farthest_beyond(mass, acceleration, forces, side):
+    """Return the sticking joint whose net torque is farthest beyond its edges, -1 for none, and the torque's sign."""
+    worst, at, direction = 0.0, -1, 1.0
     for j in range(len(side)):
         if side[j] == HELD:
-            net, row = drive[j], j * (j + 1) // 2
+            net, row = forces.drive[j], j * (j + 1) // 2
             for k in range(j):
-                net -= mass[row + k] * acceleration[k]  # 0 where held
+                net -= mass[row + k] * acceleration[k]  # 0 for a sticking joint
             for k in range(j + 1, len(side)):
                 row += k
                 net -= mass[row + j] * acceleration[k]
-            beyond = max(net - edges[1, j], edges[0, j] - net)
+            beyond = max(net - forces.edges[1, j], forces.edges[0, j] - net)
             if beyond > worst:
-                worst, at, way = beyond, j, np.sign(net)
-    return at, way
+                worst, at, direction = beyond, j, np.sign(net)
+    return at, direction

@@ -1,11 +1,10 @@
-"""Read an arm from URDF: links, joints, limits, and the shapes that the file holds itself.
+"""URDF reader: links, joints, limits, rotor inertia and primitive shapes.
 
-Meshes, materials, transmissions and simulators' own elements are left out. The base and what is fixed to it do not
-move, so their inertia does not count; a link fixed to a moving one is part of it, and its name a frame there.
+Meshes, materials and elements of simulators are ignored. The base and links fixed to it do not move, so their inertia
+does not count. A link fixed to a moving one becomes part of it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -15,15 +14,15 @@ import numpy as np
 from r2s.errors import UserError, choices, nearest
 
 MOVING, FIXED = ("revolute", "continuous"), "fixed"
-ROUNDED = 1e-9  # of a tensor's largest moment
-DRAKE = "http://drake.mit.edu"  # whose elements of an actuator say what URDF has no word for
+ROUNDED = 1e-9  # share of a tensor's largest moment, round-off of the file
+DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements, for which URDF has none
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
-COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers of an attribute; others are one
+COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
 
 
 def is_urdf(path: Path) -> bool:
-    """Return whether a file is named as URDF, or begins as one."""
+    """Return whether a file is a URDF, by its suffix or its root element."""
     if path.suffix.lower() == ".urdf":
         return True
     try:
@@ -34,23 +33,28 @@ def is_urdf(path: Path) -> bool:
 
 
 def read_urdf(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """Return what a URDF describes, and the joints' speed limits (n,) rad/s, nan where it has none.
+    """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    A body has the name of its link, a joint that of its own; damping and friction of `dynamics` stay with it.
+    Bodies and joints keep their names, joints their damping and friction.
 
     Raises:
-        UserError: no XML, no URDF, or not an arm of revolute joints; with the name of the link or joint.
+        UserError: no XML, no URDF, or not an arm of revolute joints.
     """
     return _Reader(path).spec()
 
 
-@dataclass(frozen=True)
-class _Lump:
-    """A mass (kg), its centre (3,) m and its tensor (3, 3) kg m^2 about that, in axes of some link."""
+Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; centre (3,), m; tensor (3, 3) about it, kg m^2
 
-    mass: float
-    com: np.ndarray
-    inertia: np.ndarray
+
+def combined(parts: list[Inertia]) -> Inertia:
+    """Return the inertia of several bodies with parallel axes (Steiner's theorem)."""
+    mass = sum(m for m, _, _ in parts)
+    if len(parts) == 1 or mass == 0:
+        return float(mass), parts[0][1], parts[0][2]
+    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass
+    arms = [(m, c - com) for m, c, _ in parts]
+    steiner = sum((m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms), np.zeros((3, 3)))
+    return float(mass), com, sum((i for _, _, i in parts), np.zeros((3, 3))) + steiner
 
 
 class _Reader:
@@ -59,11 +63,11 @@ class _Reader:
         try:
             root = ET.parse(path).getroot()
         except ET.ParseError as error:
-            raise self._error(f"it is not XML: {error}") from None
+            raise self._error(f"expected XML: {error}") from None
         if root.tag != "robot":
-            raise self._error(f"its outermost element is <{root.tag}>, of a URDF it is <robot>")
+            raise self._error(f"expected the root element <robot>, got <{root.tag}>")
         if any("xacro" in element.tag for element in root.iter()):
-            raise self._error("it holds xacro, which is no URDF yet: `xacro FILE > arm.urdf` makes one of it")
+            raise self._error("expected URDF, got xacro: convert it with `xacro FILE > arm.urdf`")
         self.name = root.get("name") or path.stem
         self.links = self._named(root, "link")
         self.joints = self._named(root, "joint")
@@ -74,10 +78,10 @@ class _Reader:
             self._attach(joint)
         roots = [name for name in self.links if name not in self.above]
         if len(roots) != 1:
-            raise self._error(f"one link must carry all others; {choices(roots) or 'none'} hang on no joint")
+            raise self._error(f"expected one root link, got {choices(roots) or 'none'}")
         self.root = roots[0]
         if loose := sorted(set(self.links) - {self.root, *(c for _, c in self._tree(self.root))}):
-            raise self._error(f"link '{loose[0]}' does not hang on '{self.root}': its joints are a ring")
+            raise self._error(f"link '{loose[0]}' is not connected to '{self.root}': its joints form a loop")
 
     def spec(self) -> tuple[mujoco.MjSpec, np.ndarray]:
         spec = mujoco.MjSpec()
@@ -92,9 +96,8 @@ class _Reader:
             body = bodies[child] = bodies[self._end(joint, "parent")].add_body(name=child, pos=position)
             body.quat = _quaternion(rotation)
             if joint.get("type") != FIXED:
-                lump = self._moved(child)
-                body.mass, body.ipos, body.explicitinertial = lump.mass, lump.com, True
-                x = lump.inertia
+                body.mass, body.ipos, x = self._moved(child)
+                body.explicitinertial = True
                 body.fullinertia = [x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]]
                 speeds.append(self._move(body, joint))
             self._shapes(body, child)
@@ -104,29 +107,29 @@ class _Reader:
         return UserError(f"robot.mjcf: {self.path.name}: {message}")
 
     def _named(self, root: ET.Element, tag: str) -> dict[str, ET.Element]:
-        """Return the elements of a kind by their names."""
+        """Return the elements of a kind by name."""
         out: dict[str, ET.Element] = {}
         for element in root.findall(tag):
             name = element.get("name")
             if not name or name in out:
-                raise self._error(f"two elements are {tag} '{name}'" if name else f"a {tag} has no name")
+                raise self._error(f"two elements {tag} '{name}'" if name else f"a {tag} without a name")
             out[name] = element
         return out
 
     def _attach(self, joint: ET.Element) -> None:
-        """Note what a joint joins, if an arm may have such a joint."""
+        """Register the links of a joint."""
         kind, child = joint.get("type"), self._end(joint, "child")
         if kind not in (*MOVING, FIXED):
-            raise self._error(f"{_what(joint)} is {kind}; allowed are {choices((*MOVING, FIXED))}")
+            raise self._error(f"{_what(joint)}: expected {choices((*MOVING, FIXED))}, got {kind}")
         if joint.find("mimic") is not None:
-            raise self._error(f"{_what(joint)} mimics another one, and no joint of an arm may")
+            raise self._error(f"{_what(joint)}: mimic joints are not supported")
         if child in self.above:
-            raise self._error(f"link '{child}' hangs on two joints, {_what(self.above[child])} and {_what(joint)}")
+            raise self._error(f"link '{child}' has two joints, {_what(self.above[child])} and {_what(joint)}")
         self.above[child] = joint
         self.children[self._end(joint, "parent")].append(joint)
 
     def _rotor(self, transmission: ET.Element) -> tuple[str, float]:
-        """Return the joint of a transmission, and the inertia of its rotors at the joint, kg m^2."""
+        """Return the joint of a transmission and its rotor inertia reflected to the joint, kg m^2."""
         what, joint = f"transmission '{transmission.get('name')}'", transmission.find("joint")
         inertia = 0.0
         for actuator in transmission.findall("actuator"):
@@ -140,11 +143,11 @@ class _Reader:
         element = joint.find(which)
         name = element.get("link", "") if element is not None else ""
         if name not in self.links:
-            raise self._error(f"{_what(joint)}: its {which} is no link: '{name}'{nearest(name, self.links)}")
+            raise self._error(f"{_what(joint)}: no {which} link '{name}'{nearest(name, self.links)}")
         return name
 
     def _tree(self, link: str, *, fixed: bool = False) -> Iterator[tuple[ET.Element, str]]:
-        """Yield the joints beyond a link with their child links, each after what carries it; `fixed`: only those."""
+        """Yield the joints beyond a link with their child links, parents first; `fixed`: only fixed joints."""
         for joint in self.children[link]:
             if not fixed or joint.get("type") == FIXED:
                 child = self._end(joint, "child")
@@ -161,26 +164,26 @@ class _Reader:
         count = COUNT.get(key, 1)
         if len(out) != count or not np.isfinite(out).all():
             what = f"{count} numbers" if count > 1 else "a number"
-            raise self._error(f"{owner}: {key} of <{element.tag}> must be {what}; it is '{text}'")
+            raise self._error(f"{owner}: expected {what} in {key} of <{element.tag}>, got '{text}'")
         return out
 
     def _number(self, element: ET.Element | None, key: str, owner: str, default: str = "") -> float:
         return float(self._numbers(element if element is not None else ET.Element(key), key, default, owner)[0])
 
     def _origin(self, element: ET.Element, owner: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return where an element's <origin> is: (3,) m, and the rotation (3, 3) of its axes."""
+        """Return position (3,) m and rotation (3, 3) of an element's <origin>."""
         origin = element.find("origin")
         origin = ET.Element("origin") if origin is None else origin
         angles = self._numbers(origin, "rpy", "0 0 0", owner)
         return self._numbers(origin, "xyz", "0 0 0", owner), _rotation(angles)
 
     def _move(self, body: mujoco.MjsBody, joint: ET.Element) -> float:
-        """Add the joint that moves a body; return its speed limit, rad/s, or nan."""
+        """Add the joint of a body; return its velocity limit, rad/s, or nan."""
         what = _what(joint)
         axis, limit, dynamics = (joint.find(tag) for tag in ("axis", "limit", "dynamics"))
         along = np.array([1.0, 0.0, 0.0]) if axis is None else self._numbers(axis, "xyz", "1 0 0", what)
         if np.linalg.norm(along) < 1e-6:
-            raise self._error(f"{what}: its axis is 0 0 0")
+            raise self._error(f"{what}: expected an axis, got 0 0 0")
         hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=along)
         hinge.armature = self.rotors.get(joint.get("name", ""), 0.0)
         hinge.damping[0] = self._number(dynamics, "damping", what, "0")
@@ -189,8 +192,8 @@ class _Reader:
             self._number(limit, key, what, "0") for key in ("lower", "upper", "effort", "velocity")
         )
         if low > high:
-            raise self._error(f"{what}: its lower limit {low:g} is above the upper one, {high:g} rad")
-        # a revolute joint without a range is one that somebody made of a continuous one
+            raise self._error(f"{what}: expected lower below upper, got {low:g} and {high:g} rad")
+        # some files declare a continuous joint as revolute without a range
         hinge.limited = int(joint.get("type") == "revolute" and low < high)
         if hinge.limited:
             hinge.range = low, high
@@ -199,35 +202,29 @@ class _Reader:
             hinge.actfrcrange = -effort, effort
         return speed if speed > 0 else np.nan
 
-    def _moved(self, link: str) -> _Lump:
-        """Return what a joint moves: a link and all that is fixed to it, in the link's frame."""
+    def _moved(self, link: str) -> Inertia:
+        """Return the inertia of a link with all links fixed to it, in the link's frame."""
         poses = {link: (np.zeros(3), np.eye(3))}
         for joint, child in self._tree(link, fixed=True):
-            at, turn = poses[self._end(joint, "parent")]
+            at, axes = poses[self._end(joint, "parent")]
             position, rotation = self._origin(joint, _what(joint))
-            poses[child] = at + turn @ position, turn @ rotation
+            poses[child] = at + axes @ position, axes @ rotation
         parts = []
-        for name, (at, turn) in poses.items():
+        for name, (at, axes) in poses.items():
             if (own := self._inertial(name)) is not None:
-                parts.append(_Lump(own.mass, at + turn @ own.com, turn @ own.inertia @ turn.T))
-        mass = sum(part.mass for part in parts)
-        if mass <= 0:
-            raise self._error(f"link '{link}' moves, and has no <inertial> with a mass")
-        if len(parts) == 1:
-            return parts[0]
-        com = sum((part.mass * part.com for part in parts), np.zeros(3)) / mass
-        arms = [(part.mass, part.com - com) for part in parts]
-        steiner = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms)
-        return _Lump(mass, com, sum((part.inertia for part in parts), np.zeros((3, 3))) + steiner)
+                parts.append((own[0], at + axes @ own[1], axes @ own[2] @ axes.T))
+        if sum(m for m, _, _ in parts) <= 0:
+            raise self._error(f"link '{link}': expected an <inertial> with a mass, as the link moves")
+        return combined(parts)
 
-    def _inertial(self, name: str) -> _Lump | None:
-        """Return a link's own inertia in its frame; None where it has none."""
+    def _inertial(self, name: str) -> Inertia | None:
+        """Return a link's own inertia in its frame, or None."""
         what, element = f"link '{name}'", self.links[name].find("inertial")
         if element is None:
             return None
         mass = self._number(element.find("mass"), "value", what)
         if mass < 0:
-            raise self._error(f"{what}: its mass is {mass:g} kg")
+            raise self._error(f"{what}: expected a mass of 0 or more, got {mass:g} kg")
         if mass == 0:
             return None
         tensor = element.find("inertia")
@@ -236,20 +233,20 @@ class _Reader:
         x = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         moments = np.linalg.eigvalsh(x)
         if min(moments[0], moments[0] + moments[1] - moments[2]) < -ROUNDED * moments[2]:
+            listed = ", ".join(f"{m:.4g}" for m in moments)
             raise self._error(
-                f"{what}: no body has the moments of inertia {', '.join(f'{m:.4g}' for m in moments)} kg m^2: none "
-                "may be negative, or more than the other two together"
+                f"{what}: expected moments >= 0 and none above the sum of the others, got {listed} kg m^2"
             )
-        com, turn = self._origin(element, what)
-        return _Lump(mass, com, turn @ x @ turn.T)
+        com, axes = self._origin(element, what)
+        return mass, com, axes @ x @ axes.T
 
     def _shapes(self, body: mujoco.MjsBody, link: str) -> None:
-        """Give a body the boxes, cylinders and spheres of its link; those that collide are marked so."""
+        """Add the boxes, cylinders and spheres of a link to its body, with contact flags for <collision>."""
         kinds = mujoco.mjtGeom
         for tag in ("visual", "collision"):
             for element in self.links[link].findall(tag):
                 what = f"link '{link}'"
-                at, turn = self._origin(element, what)
+                at, axes = self._origin(element, what)
                 for shape in element.findall("geometry/*"):
                     if shape.tag == "box":
                         kind, size = kinds.mjGEOM_BOX, 0.5 * self._numbers(shape, "size", "", what)
@@ -262,7 +259,7 @@ class _Reader:
                         continue
                     contact = int(tag == "collision")
                     body.add_geom(
-                        type=kind, size=size, pos=at, quat=_quaternion(turn), contype=contact, conaffinity=contact,
+                        type=kind, size=size, pos=at, quat=_quaternion(axes), contype=contact, conaffinity=contact,
                         mass=0.0,
                     )  # fmt: skip
 
@@ -272,7 +269,7 @@ def _what(joint: ET.Element) -> str:
 
 
 def _rotation(rpy: np.ndarray) -> np.ndarray:
-    """Return (3, 3) of Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    """Return the matrix (3, 3) of Rz(yaw) Ry(pitch) Rx(roll), rad."""
     (a, b, c), (i, j, k) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [
@@ -284,7 +281,7 @@ def _rotation(rpy: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return (4,) w x y z of a rotation (3, 3)."""
+    """Return the quaternion (4,) w x y z of a rotation (3, 3)."""
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, rotation.flatten())
     return quat

@@ -1,1 +1,1 @@
-"""Recordings of an arm, and the readers that make one of any log file."""
+"""Recordings of an arm: the data type, file readers, breakaway ramps and checks."""

@@ -1,10 +1,10 @@
-"""Read a `Recording` from .csv, .npz, .parquet, HDF5 or a robot's own log: one column map for all of them."""
+"""Read a `Recording` from .csv, .npz, .parquet, HDF5 or a robot's log, with one mapping of column names."""
 
 import os
 import re
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +19,34 @@ from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_
 
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
-DEFAULT_COLUMNS = {  # the first name that the file has
+DEFAULT_COLUMNS = {  # the first name in the file counts
     "t": ("t",),
     "q": ("q",),
     "dq": ("dq",),
     "tau": ("tau",),
     "trajectory": ("segment", "trajectory"),
 }
-TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # looked for before tau
-CURRENT = ("current", "i")  # looked for with a torque constant
+TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # preferred to the column tau
+CURRENT = ("current", "i")  # used with a torque constant
 OPTIONAL = ("dq", "trajectory")
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
-RESTART_S = 0.1  # s, from its first moment: where a clock goes back to that starts anew
+RESTART_S = 0.1  # s, a clock that goes back to within this of its first value has restarted
 
 Spec = str | list[str] | None
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to interpret the columns of a file; see `read`."""
+
+    torque: str | None
+    columns: Mapping[str, Spec]
+    n_joints: int | None = None
+    max_gap_s: float | None = None
+    period: float | None = None
+    name: str = ""
+    torque_constant: np.ndarray | None = None
+    restarts: bool = False  # a clock that goes back to its start begins a new trajectory
 
 
 def read(
@@ -49,66 +63,55 @@ def read(
     model_joints: Sequence[str] | None = None,
     torque_constant: ArrayLike | None = None,
 ) -> Recording:
-    """Read the recording in `path`, or raise a UserError: one line, the file and what is wrong with it.
+    """Read the recording in `path`; the logs of libfranka and of Franka's ROS messages hold several torques.
 
-    torque: 'measured' (contains gravity), 'commanded' (does not) or 'motor' (gravity, all friction and rotors are in
-        it); None only where the file itself says it.
-    columns: the name in the file for any of t (s), q (rad), dq (rad/s), tau (Nm, or A), trajectory. None is
-        the default, t: t, q: q, dq: dq, tau: tau_J if measured, tau_J_d if commanded or tau_motor if motor, where
-        absent tau, trajectory: segment, where absent trajectory. A name for q, dq or tau is a (T, n) array, or
-        stands for q1 q2 ..., q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name
-        spells that out; a list names the joints one by one. In HDF5 a name is a path: robot/q.
-    n_joints: expected number of joints, if known.
-    max_gap_s: longer gaps in time start a new trajectory; None leaves them. Units of time are never guessed.
-    period: s, see `Recording`. name: of the recording; the default is the file's.
-    topic, joints, model_joints: of a bag (.bag, .db3, .mcap or a ROS 2 bag's folder), see `bag_table`.
-    torque_constant: Nm/A at the joint (gear included), (n,) or one for all, of a motor's currents: tau is then the
-        column of the current, A (the default is current, where absent i).
+    Args:
+        path: .csv, .npz, .parquet, .h5, or a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag).
+        torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
+        columns: names in the file of t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
+            DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau is a (T, n) array, or stands for q1 q2 ...,
+            q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name is the joint number;
+            a list names the joints one by one. In HDF5 a name is a path: robot/q.
+        n_joints: expected number of joints.
+        max_gap_s: a longer pause in time begins a new trajectory; None: no splitting.
+        period: s, see `Recording`.
+        name: of the recording; the default is the file's.
+        topic, joints, model_joints: of a bag, see `bag_table`.
+        torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
 
-    Without dq in the file it is the central difference of q on the logged time (zero phase), each trajectory
-    by itself; without trajectory, gaps separate them, and (not in a bag) a clock that goes
-    back to where it began. A file by `Recording.save` comes back as it was. The
-    logs of `franka::logToCSV` and of Franka's ROS messages hold both torques: `torque` picks one.
+    Without a column dq, dq is the central difference of q over the logged time. Without a column trajectory, gaps
+    separate trajectories, and (not in a bag) so does a clock that goes back to its start. A file of `Recording.save`
+    is restored unchanged.
+
+    Raises:
+        UserError: the file or a column is missing or damaged, or the values do not make a recording.
     """
     constant = _constant(torque_constant, torque)
     path = Path(path).expanduser()
-    bag = {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints}
-    table = load_table(path, bag)
+    table = load_table(path, {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints})
+    restarts = not is_bag(path)  # a bag may mix the messages of two starts
+    how = Options(torque, columns or {}, n_joints, max_gap_s, period, name or path.stem, constant, restarts)
     try:
-        how = n_joints, max_gap_s, period, name or path.stem
-        return from_table(table, torque, columns or {}, *how, restarting=not is_bag(path), constant=constant)
+        return from_table(table, how)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 
 
-def from_table(
-    table: Table,
-    torque: str | None,
-    columns: Mapping[str, Spec],
-    n_joints: int | None = None,
-    max_gap_s: float | None = None,
-    period: float | None = None,
-    name: str = "",
-    restarting: bool = False,
-    constant: np.ndarray | None = None,
-) -> Recording:
-    """Return the recording that a file's columns hold; arguments as in `read`, errors without the file's name.
-
-    restarting: a clock that goes back to where it began starts a new trajectory. In a bag it does not: there
-        messages of two starts may be mixed. constant: Nm/A, () or (n,), where tau is a current.
-    """
-    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # what `Recording.save` says about the rows
+def from_table(table: Table, how: Options) -> Recording:
+    """Return the recording in a file's columns; error messages do not name the file."""
+    notes = {k: v.item() for k, v in table.items() if v.ndim == 0}  # scalars of `Recording.save`
     table = {k: v for k, v in table.items() if v.ndim > 0}
-    torque = _agreed_torque(torque, notes.get("torque"))
-    found = {field: find_columns(table, field, spec, torque, constant) for field, spec in _specs(columns).items()}
+    torque = _agreed_torque(how.torque, notes.get("torque"))
+    constant = how.torque_constant
+    found = {x: find_columns(table, x, spec, torque, constant) for x, spec in _specs(how.columns).items()}
     arrays = {
-        field: _vector(table, names, n_joints, field) if field in ("q", "dq", "tau") else scalar(table, names)
-        for field, names in found.items()
+        x: _vector(table, names, how.n_joints, x) if x in ("q", "dq", "tau") else scalar(table, names)
+        for x, names in found.items()
         if names
     }
-    if restarting and "trajectory" not in arrays and (anew := restarts(arrays["t"])) is not None:
-        arrays["trajectory"] = anew
-    if not np.any(arrays["tau"]):  # a position-controlled or simulated arm fills the field, with nothing
+    if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
+        arrays["trajectory"] = index
+    if not np.any(arrays["tau"]):  # position-controlled and simulated arms fill the field with zeros
         raise UserError(f"tau ({listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
     if constant is not None:
         arrays["tau"] = arrays["tau"] * _per_joint(constant, arrays["tau"])
@@ -116,18 +119,17 @@ def from_table(
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
     saved = set(table) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
-    if saved:
-        period = notes.get("period") if period is None else period
-    recording = Recording(**arrays, torque=torque, period=period, name=notes["name"] if saved else name)
-    if max_gap_s is not None and not saved:
-        recording = recording.split_at_gaps(max_gap_s)
+    period = notes.get("period") if saved and how.period is None else how.period
+    recording = Recording(**arrays, torque=torque, period=period, name=notes["name"] if saved else how.name)
+    if how.max_gap_s is not None and not saved:
+        recording = recording.split_at_gaps(how.max_gap_s)
     return replace(recording, dq=recording.derivative(recording.q)) if derive_dq else recording
 
 
-def restarts(t: np.ndarray) -> np.ndarray | None:
-    """Return the trajectories (T,) of a clock t (T,) s that starts anew for each: None where it does not.
+def restart_index(t: np.ndarray) -> np.ndarray | None:
+    """Return the trajectory index (T,) of a clock t (T,) s that restarts, or None.
 
-    It goes back to where it began, and then counts on. What goes back otherwise is no restart but a disorder.
+    A restart goes back to the first value. Any other step back is an error in the log, and `Recording` reports it.
     """
     if t.ndim != 1 or not len(back := np.flatnonzero(np.diff(t) < 0) + 1):
         return None
@@ -137,12 +139,13 @@ def restarts(t: np.ndarray) -> np.ndarray | None:
     return np.repeat(np.arange(len(runs)), runs)
 
 
-def _agreed_torque(told: str | None, stored) -> str:
-    """Return what the user and the file say about the torque; they must not contradict each other."""
+def _agreed_torque(declared: str | None, stored) -> str:
+    """Return the kind of torque; the user's declaration must agree with the file's."""
     if not isinstance(stored, str):
-        return declared_torque(told)
-    if told not in (None, "", "???", declared_torque(stored)):
-        raise UserError(f"the file declares torque={stored}, but data.torque={declared_torque(told)} was asked for")
+        return declared_torque(declared)
+    if declared not in (None, "", "???", declared_torque(stored)):
+        declared = declared_torque(declared)
+        raise UserError(f"expected torque={stored}, as the file declares, got data.torque={declared}")
     return stored
 
 
@@ -153,34 +156,34 @@ def _specs(columns: Mapping[str, Spec]) -> dict[str, Spec]:
                 f"unknown key '{key}' in data.columns; allowed: {choices(DEFAULT_COLUMNS)}"
                 f"{nearest(str(key), DEFAULT_COLUMNS)}"
             )
-    return {field: columns.get(field) for field in DEFAULT_COLUMNS}
+    return {x: columns.get(x) for x in DEFAULT_COLUMNS}
 
 
 def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
-    """Return torque constants as floats, () or (n,), or None where there are none."""
+    """Return torque constants in Nm/A, () or (n,), or None if none are given."""
     if value is None:
         return None
     where = "data.torque_constant"
     if torque != "motor":
-        raise UserError(f"{where} is for data.torque=motor, not {torque}; leave it null")
+        raise UserError(f"{where}: expected null unless data.torque=motor, got {value} with data.torque={torque}")
     try:
         constant = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise UserError(f"{where}: {value} is not a number of Nm/A, nor a list of one per joint") from None
+        raise UserError(f"{where}: expected a number of Nm/A or one per joint, got {value}") from None
     if constant.ndim > 1 or not np.all(np.isfinite(constant)) or np.any(constant == 0):
-        raise UserError(f"{where}: {constant.tolist()} must be finite Nm/A, not 0: one per joint, or one for all")
+        raise UserError(f"{where}: expected finite Nm/A other than 0, one or one per joint, got {constant.tolist()}")
     return constant
 
 
 def _per_joint(constant: np.ndarray, tau: np.ndarray) -> np.ndarray:
     joints = tau.shape[-1] if tau.ndim > 1 else 1
     if constant.ndim and constant.shape != (joints,):
-        raise UserError(f"data.torque_constant has {constant.size} values for {joints} joints")
+        raise UserError(f"data.torque_constant: expected {joints} values, one per joint, got {constant.size}")
     return constant
 
 
 def _is_current(name: str) -> bool:
-    """Whether a column's name says that it holds a current: it must not pass for a torque."""
+    """Return whether a column's name denotes a current, which must not be read as a torque."""
     base = name.rsplit("/", 1)[-1].lower()
     return "current" in base or re.fullmatch(r"i(_?(\d+|\{[ij]\})|\[\d+\])?", base) is not None
 
@@ -188,7 +191,7 @@ def _is_current(name: str) -> bool:
 def find_columns(
     table: Table, field: str, spec: Spec, torque: str = "", constant: np.ndarray | None = None
 ) -> list[str]:
-    """Return the columns of a field; [] where an optional one is absent."""
+    """Return the columns of a field; [] if an optional one is absent."""
     candidates = DEFAULT_COLUMNS[field]
     if field == "tau":
         candidates = (TAU[torque], *candidates) if constant is None else CURRENT
@@ -214,7 +217,7 @@ def find_columns(
 
 
 def _match(table: Table, field: str, name: str) -> list[str]:
-    """Return the columns that one name stands for."""
+    """Return the columns that a name stands for."""
     if field in ("t", "trajectory"):
         return [name] if name in table else []
     if name in table and table[name].ndim > 1:
@@ -229,7 +232,7 @@ def _match(table: Table, field: str, name: str) -> list[str]:
 
 
 def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns that `pattern` numbers without a hole, from `first` (None: 0 if there, else 1)."""
+    """Return the columns numbered by `pattern` without a gap, from `first` (None: 0 if present, else 1)."""
     before, _, after = pattern.partition("{}")
     hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
     numbers = sorted(int(hit[1]) for hit in hits if hit)
@@ -238,14 +241,12 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
     numbers = [number for number in numbers if number >= first]
     for expected, number in enumerate(numbers, start=first):
         if number != expected:
-            raise UserError(
-                f"column '{before}{expected}{after}' is missing, though '{before}{number}{after}' is there"
-            )
+            raise UserError(f"expected column '{before}{expected}{after}' before '{before}{number}{after}'")
     return [f"{before}{number}{after}" for number in numbers]
 
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Say which column is missing; never suggest the other kind of torque as a mere typo."""
+    """Return the error for a missing column; another kind of torque is never suggested as a typo."""
     inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
     nested = [key for key, last in inside.items() if last == name]
     hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
@@ -255,13 +256,13 @@ def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError
             hint = f"; {column} is {other} torque"
     in_nm = [column for column in (TAU["motor"], "tau") if _match(table, field, column)]
     if torque == "motor" and name in CURRENT and in_nm:
-        hint = f"; {in_nm[0]} is torque already if it is in Nm: then leave data.torque_constant null"
+        hint = f"; if {in_nm[0]} is in Nm, leave data.torque_constant null"
     of = f" ({torque} torque)" if torque and field == "tau" else ""
     return UserError(f"no column '{name}' for {field}{of}; columns: {listed(table)}{hint} (set data.columns.{field})")
 
 
 def listed(names: Iterable[str], limit: int = 40) -> str:
-    """Return names for an error message, not more than `limit` of them."""
+    """Return at most `limit` names for an error message."""
     names = list(names)
     return choices(names[:limit]) + (f", ... ({len(names)} in all)" if len(names) > limit else "")
 
@@ -271,20 +272,20 @@ def _vector(table: Table, names: list[str], n_joints: int | None, field: str) ->
     parts = [_numbers(table, name) for name in names]
     if len(parts) > 1 and {part.shape for part in parts} != {parts[0].shape[:1]}:
         shapes = choices(f"{name} {part.shape}" for name, part in zip(names, parts, strict=True))
-        raise UserError(f"the columns of {field} must each be (T,) and equally long; they are {shapes}")
+        raise UserError(f"expected columns of {field} of shape (T,) and equal length, got {shapes}")
     value = parts[0] if parts[0].ndim > 1 else np.stack(parts, axis=1)
     if n_joints is not None and value.ndim == 2 and value.shape[1] != n_joints:
         raise UserError(
-            f"{field} has {value.shape[1]} joints ({listed(names)}), the robot has {n_joints}; "
-            f"a list in data.columns.{field} picks columns"
+            f"{field}: expected {n_joints} joints, got {value.shape[1]} ({listed(names)}); "
+            f"a list in data.columns.{field} selects columns"
         )
     return value
 
 
 def scalar(table: Table, names: list[str]) -> np.ndarray:
-    """Return the one column as (T,)."""
+    """Return a single column as (T,)."""
     if len(names) != 1:
-        raise UserError(f"t and trajectory are one column each, not {len(names)}: {listed(names)}")
+        raise UserError(f"expected one column for t and for trajectory, got {len(names)}: {listed(names)}")
     value = _numbers(table, names[0])
     return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
 
@@ -298,24 +299,24 @@ def _numbers(table: Table, name: str) -> np.ndarray:
             float(value)
         except (TypeError, ValueError):
             text = " ".join(str(value).split())[:40]
-            raise UserError(f"column '{name}' is not numeric: '{text}' at row {row}") from None
-    raise UserError(f"column '{name}' is not numeric: its type is {column.dtype}")
+            raise UserError(f"column '{name}': expected numbers, got '{text}' at row {row}") from None
+    raise UserError(f"column '{name}': expected numbers, got type {column.dtype}")
 
 
 def files_of(path: str | os.PathLike) -> list[Path]:
-    """Return the files of a recording: itself, or all files of a ROS 2 bag's folder."""
+    """Return the files of a recording: one, or all files in the folder of a ROS 2 bag."""
     path = Path(path).expanduser()
     return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file, or raise a UserError that names it; `bag` goes to `bag_table`."""
+    """Return all columns of the file; errors name it. `bag` holds the arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
-            raise UserError(f"no file {path}: there is no folder {path.parent}")
+            raise UserError(f"no file {path}: no folder {path.parent}")
         raise UserError(f"no file {path}{nearest(path.name, (p.name for p in path.parent.iterdir()))}")
     if path.is_dir() and not is_bag(path):
-        raise UserError(f"{path} is a folder; a recording is one file ({choices(SUFFIXES)}) or a ROS 2 bag's folder")
+        raise UserError(f"{path}: expected a file ({choices(SUFFIXES)}) or a ROS 2 bag, got another folder")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES and not is_bag(path):
         raise UserError(
@@ -326,7 +327,7 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
             return bag_table(path, **bag)
         for key in ("topic", "joints"):
             if bag[key] is not None:
-                raise UserError(f"data.{key}={bag[key]} is for bags ({choices(BAGS)}); leave it null for {suffix}")
+                raise UserError(f"data.{key}: expected null for {suffix}, got {bag[key]}: it is for {choices(BAGS)}")
         return libfranka_table(_columns(path, suffix))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
@@ -347,7 +348,7 @@ def _columns(path: Path, suffix: str) -> Table:
 def _load_npz(path: Path) -> Table:
     table: Table = {}
     if not zipfile.is_zipfile(path):
-        raise UserError("not an .npz archive (damaged, or not written by numpy.savez)")
+        raise UserError("expected an .npz archive of numpy.savez, got another or a damaged file")
     with np.load(path, allow_pickle=False) as archive:
         for name in archive.files:
             try:
@@ -355,12 +356,12 @@ def _load_npz(path: Path) -> Table:
             except ValueError as error:
                 if "allow_pickle" not in str(error):
                     raise
-                raise UserError(f"'{name}' is pickled, which is never loaded; save plain arrays") from None
+                raise UserError(f"'{name}' is pickled, and r2s loads no pickles; save plain arrays") from None
     return table
 
 
 def _load_hdf5(path: Path) -> Table:
-    """Return every dataset by its path in the file; not the images, which no column can be."""
+    """Return the datasets of up to two dimensions by their paths."""
     try:
         import h5py
     except ImportError:
@@ -377,7 +378,7 @@ def _load_hdf5(path: Path) -> Table:
 
 
 def _column(series: pd.Series) -> np.ndarray:
-    """Return a column as (T,), or as (T, n) where each cell is a list (parquet)."""
+    """Return a column as (T,), or as (T, n) if each cell is a list (parquet)."""
     column = series.to_numpy()
     if column.dtype == object and len(column) and isinstance(column[0], list | np.ndarray):
         return np.array(column.tolist())

@@ -1,7 +1,4 @@
-"""Robot logs as tables of t, q, dq and tau: ROS 1 and ROS 2 bags, MCAP, and the CSV that libfranka writes.
-
-`readers.read` is the front door; what it finds here it treats like the columns of any other file.
-"""
+"""Robot logs as tables of t, q, dq and tau for `readers.read`: ROS 1 and ROS 2 bags, MCAP, and libfranka's CSV."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,35 +10,34 @@ import numpy as np
 from r2s.errors import UserError, choices, nearest
 
 Table = dict[str, np.ndarray]  # column name -> (T,) or (T, n)
-Layouts = dict[tuple[str, ...], list[int] | None]  # names in a message -> where the robot's are; None: as they come
-
+Layouts = dict[tuple[str, ...], list[int] | None]  # names in a message -> indices of the robot's joints; None: all
 
 BAGS = (".bag", ".db3", ".mcap")
 TYPES = ("JointState", "FrankaRobotState", "FrankaState")  # of sensor_msgs and franka_msgs
-CYCLE = 1e-3  # s, of a Franka arm
-LATE_NS = 10**9  # the network delivers a message late by less than this; a clock that goes back further restarted
+CYCLE = 1e-3  # s, control cycle of a Franka arm
+MAX_LATENESS_NS = 10**9  # ns, a message of a network arrives at most so late; a larger step back is a clock restart
 
 
 def is_bag(path: Path) -> bool:
-    """Say whether `path` is a bag: by its suffix, or a folder with metadata.yaml (ROS 2)."""
+    """Return whether `path` is a bag: by its suffix, or a folder with metadata.yaml (ROS 2)."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in BAGS
 
 
 def missing_extra(library: str, extra: str) -> UserError:
-    """Return the error for a file whose reader is an optional part of r2s."""
-    return UserError(f"reading it needs {library}, which is not installed: pip install 'r2s[{extra}]'")
+    """Return the error for a missing optional dependency."""
+    return UserError(f"reading this file needs {library}, which is not installed: pip install 'r2s[{extra}]'")
 
 
 def libfranka_table(table: Table) -> Table:
-    """Add t, q, dq, tau_J and tau_J_d, as (T,) s and (T, 7), to a log of `franka::logToCSV`.
+    """Add t (T,) s and q, dq, tau_J, tau_J_d (T, 7) to a log of `franka::logToCSV`; return other tables unchanged.
 
-    Any other table comes back as it is. There (libfranka, src/log.cpp) `time` is in whole ms, `state.tau_J` is
-    measured, and a row holds the state of cycle k + 1 beside the command `cmd.tau_J_d` of cycle k: see `sent`.
+    In such a log (libfranka, src/log.cpp) `time` is in whole ms, `state.tau_J` is measured, and a row holds the state
+    of cycle k + 1 beside the command `cmd.tau_J_d` of cycle k: see `shift_command`.
     """
     if not {"time", "success_rate", "state.q[0]"} <= table.keys():
         return table
     time = table["time"]
-    numeric = time.dtype.kind in "iuf"  # else the column is shown as it is, and refused by name
+    numeric = time.dtype.kind in "iuf"  # `readers` reports a column of text by its name
     t = time * CYCLE if numeric else time
     found = {"t": t}
     for field, name in (("q", "state.q"), ("dq", "state.dq"), ("tau_J", "state.tau_J"), ("tau_J_d", "cmd.tau_J_d")):
@@ -49,22 +45,22 @@ def libfranka_table(table: Table) -> Table:
         if all(column is not None for column in columns):
             found[field] = np.stack(columns, axis=1)  # type: ignore[arg-type]
     if "tau_J_d" in found and numeric and found["tau_J_d"].dtype.kind in "iuf":
-        found["tau_J_d"] = sent(t, found["tau_J_d"])
+        found["tau_J_d"] = shift_command(t, found["tau_J_d"])
     return found | table
 
 
-def sent(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Return the command (T, n) Nm sent in the cycle of each row.
+def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
+    """Return the command (T, n) Nm sent in the cycle of each row, from the logged one.
 
-    A Franka's state carries the command of the cycle before it, a recording the one that follows from its state
-    (`r2s.arm.tracking`): it is tau_J_d one cycle later, interpolated where the log is slower than the arm.
-    t: (T,) s. tau_J_d: (T, n) Nm, as logged. The last row keeps its own.
+    A Franka state at t (T,) s holds the command of the cycle before; in a recording (`r2s.arm.recorder`) the command
+    follows the state. So this is tau_J_d one cycle later, interpolated in a log slower than the arm; the last row is
+    unchanged.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
 
 class Sample(NamedTuple):
-    """One message: header and bag time in ns, joint names (() where the type has none), values by field (n,)."""
+    """A message: header time and bag time in ns, joint names (() if its type has none), values (n,) by field."""
 
     stamp: int
     received: int
@@ -80,112 +76,111 @@ def bag_table(
     model_joints: Sequence[str] | None = None,
     n_joints: int | None = None,
 ) -> Table:
-    """Return t (T,) s, q, dq and tau (or tau_J and tau_J_d) (T, n) of one topic of a bag.
+    """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) of one topic of a bag.
 
-    t counts from the first message, in header stamps, or in the bag's own time where all stamps are zero. dq is
-    left out where no message has it. Messages without one of the joints (a gripper on the same topic) are passed
-    over; late ones are put back in order, repeated ones dropped.
+    t counts from the first message, by header stamps, or by bag time if all stamps are zero. Messages without one of
+    the joints (a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
         topic: of sensor_msgs/JointState, franka_msgs/FrankaState or FrankaRobotState; None: the only such topic.
-        joints: names, in the robot's order; None: see `choose_joints`.
-        model_joints: what the robot description calls its joints.
-        n_joints: of the robot, if known.
+        joints, model_joints, n_joints: see `choose_joints`.
 
     Raises:
-        UserError: rosbags is not installed, the bag is damaged, or topic, joints or torque are not in it.
-
+        UserError: rosbags is not installed, the bag is damaged, or topic, joints or torque are missing.
     """
     topic, samples = _read(path, topic)
     kept, pick = _pick_joints(topic, samples, joints, model_joints, n_joints)
     table = {field: _stack(topic, kept, field, pick) for field in kept[0].values}
     table = {field: x for field, x in table.items() if x.size and not np.isnan(x).all()}  # ROS 2: NaN is absent
     if "q" not in table or not {"tau", "tau_J", "tau_J_d"} & table.keys():
-        lacking = "position" if "q" not in table else "effort"
-        raise UserError(f"the messages on '{topic}' carry no {lacking}; a recording needs both, position and effort")
+        missing = "position" if "q" not in table else "effort"
+        raise UserError(f"expected position and effort in the messages on '{topic}', got no {missing}")
     stamp = np.array([s.stamp for s in kept])
     if not stamp.any():
         stamp = np.array([s.received for s in kept])
     stamp, table = _in_order(stamp, table)
-    table["t"] = (stamp - stamp[0]) * 1e-9  # as differences of integers: an epoch in seconds keeps only 0.2 us
+    table["t"] = (stamp - stamp[0]) * 1e-9  # integer difference: an epoch in seconds has a resolution of 0.2 us
     if "tau_J_d" in table:
-        table["tau_J_d"] = sent(table["t"], table["tau_J_d"])
+        table["tau_J_d"] = shift_command(table["t"], table["tau_J_d"])
     return table
 
 
 def choose_joints(
-    seen: Sequence[str], joints: Sequence[str] | None, model_joints: Sequence[str] | None, n: int | None
+    logged: Sequence[str], joints: Sequence[str] | None, model_joints: Sequence[str] | None, n: int | None
 ) -> list[str]:
-    """Return which of the joint names `seen` in a log are the robot's, in the robot's order.
+    """Return the robot's joints among the names in a log, in the robot's order.
 
-    The order of a message is not the robot's: ROS 2 brings up drivers that sort by name, or do not sort at all.
-    So, in this order: `joints` as told; `model_joints`, where each is found (also behind a prefix: panda_joint1);
-    n names that differ in one number, by that number; the first n in the order in which they appear, unless
-    `model_joints` speaks against them.
+    A message may have another order: some ROS 2 drivers sort the names, others do not. The rules, in this order:
+    `joints` as given; `model_joints`, if each occurs once (also behind a prefix: panda_joint1); n names that differ
+    in one number, sorted by it; the first n names, but only without `model_joints`.
+
+    Args:
+        logged: names in the messages.
+        joints: the user's names, in the robot's order.
+        model_joints: names in the robot description.
+        n: number of joints of the robot.
     """
-    listed = choices(seen)
+    names = choices(logged)
     if joints is not None:
         for name in joints:
-            if name not in seen:
-                raise UserError(f"no joint '{name}'; joints: {listed}{nearest(str(name), seen)} (set data.joints)")
+            if name not in logged:
+                raise UserError(f"no joint '{name}'; joints: {names}{nearest(str(name), logged)} (set data.joints)")
         distinct = len(set(joints))
         if not distinct or distinct < len(joints) or (n is not None and distinct != n):
-            robot = "at least one" if n is None else f"{n}, as the robot has"
-            raise UserError(
-                f"data.joints names {distinct} different joints ({choices(joints)}); it must name {robot}"
-            )
+            expected = n or max(len(joints), 1)
+            raise UserError(f"data.joints: expected {expected} different names, got {choices(joints) or 'none'}")
         return list(joints)
-    if n is not None and len(seen) < n:
-        raise UserError(f"{len(seen)} joints ({listed}), the robot has {n}")
-    n = len(seen) if n is None else n
-    same = [
-        [s for s in seen if s == m] or [s for s in seen if s.endswith(("_" + m, "/" + m))] for m in model_joints or ()
+    if n is not None and len(logged) < n:
+        raise UserError(f"expected {n} joints, got {len(logged)} ({names})")
+    n = len(logged) if n is None else n
+    found = [
+        [x for x in logged if x == m] or [x for x in logged if x.endswith(("_" + m, "/" + m))]
+        for m in model_joints or ()
     ]
-    if same and all(len(names) == 1 for names in same) and len({names[0] for names in same}) == n:
-        return [names[0] for names in same]
-    families: dict[str, list[str]] = {}
-    for name in seen:
-        families.setdefault(re.sub(r"\d+(?=\D*$)", "#", name), []).append(name)
-    arms = [names for family, names in families.items() if "#" in family and len(names) == n]
+    if found and all(len(same) == 1 for same in found) and len({same[0] for same in found}) == n:
+        return [same[0] for same in found]
+    numbered: dict[str, list[str]] = {}
+    for name in logged:
+        numbered.setdefault(re.sub(r"\d+(?=\D*$)", "#", name), []).append(name)
+    arms = [same for pattern, same in numbered.items() if "#" in pattern and len(same) == n]
     if len(arms) > 1:
-        raise UserError(f"several arms of {n} joints: {listed}; say which: data.joints=[...]")
+        raise UserError(f"several arms of {n} joints: {names}; choose with data.joints=[...]")
     if arms:
         return sorted(arms[0], key=lambda name: int(re.findall(r"\d+", name)[-1]))
     if model_joints and n > 1:
         raise UserError(
-            f"the joints {listed} are not called what the robot calls its own ({choices(model_joints)}); "
-            "say which they are, in that order: data.joints=[...]"
+            f"expected the joints {choices(model_joints)}, got {names}; name them in order: data.joints=[...]"
         )
-    return list(seen[:n])
+    return list(logged[:n])
 
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
-    """Return the topic and all its messages."""
+    """Return a topic and its messages."""
     try:
         import rosbags.rosbag1
         import rosbags.rosbag2
     except ImportError:
         raise missing_extra("rosbags", "bags") from None
     try:
-        # only what is read may fail: other topics of the bag can hold types that nobody understands
+        # only this topic is decoded: others may have unknown message types
         ros1 = path.is_file() and path.suffix.lower() == ".bag"
         with (rosbags.rosbag1 if ros1 else rosbags.rosbag2).Reader(path) as reader:
             topic, connections = _pick_topic(reader.connections, topic)
             samples = list(_samples(reader, connections, ros1))
     except UserError:
         raise
-    except Exception as error:  # a damaged file lets the library stumble anywhere
+    except Exception as error:  # rosbags raises many kinds of error for a damaged file
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        mend = "if it was cut off, rosbag reindex, ros2 bag reindex or mcap recover may mend it"
-        raise UserError(f"cannot be read as a bag: {reason} ({mend})") from None
+        repair = "rosbag reindex, ros2 bag reindex or mcap recover may repair a truncated one"
+        raise UserError(f"cannot be read as a bag: {reason} ({repair})") from None
     if not samples:
         raise UserError(f"no message on '{topic}'")
     return topic, samples
 
 
 def _pick_topic(connections: Sequence[Any], topic: str | None) -> tuple[str, list[Any]]:
-    """Return the topic and its connections."""
+    """Return a topic and its connections."""
     types = {c.topic: c.msgtype.replace("/msg/", "/") for c in connections}
     readable = [t for t, kind in types.items() if kind.rsplit("/")[-1] in TYPES]
     listed = choices(f"{t} ({kind})" for t, kind in types.items()) or "none"
@@ -194,17 +189,17 @@ def _pick_topic(connections: Sequence[Any], topic: str | None) -> tuple[str, lis
             raise UserError(f"no topic of type {choices(TYPES)}; topics: {listed}")
         if len(readable) > 1:
             listed = choices(f"{t} ({types[t]})" for t in readable)
-            raise UserError(f"several topics hold joint states: {listed}; say which: data.topic=...")
+            raise UserError(f"several topics hold joint states: {listed}; choose with data.topic=...")
         topic = readable[0]
     elif topic not in types:
         raise UserError(f"no topic '{topic}'; topics: {listed}{nearest(topic, types)} (set data.topic)")
     elif topic not in readable:
-        raise UserError(f"topic '{topic}' is {types[topic]}; allowed: {choices(TYPES)}; topics: {listed}")
+        raise UserError(f"topic '{topic}': expected {choices(TYPES)}, got {types[topic]}; topics: {listed}")
     return topic, [c for c in connections if (c.topic, c.msgtype.replace("/msg/", "/")) == (topic, types[topic])]
 
 
 def _samples(reader: Any, connections: Sequence[Any], ros1: bool) -> Iterator[Sample]:
-    """Read the messages of one topic."""
+    """Yield the messages of a topic."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -212,12 +207,12 @@ def _samples(reader: Any, connections: Sequence[Any], ros1: bool) -> Iterator[Sa
     if definition.format == MessageDefinitionFormat.MSG:
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(definition.data, kind))
-    else:  # ROS 2 before Iron keeps no definitions in .db3
+    else:  # ROS 2 before Iron stores no definitions in .db3
         store = get_typestore(Stores.LATEST)
     if kind not in store.fielddefs:
         raise UserError(
-            f"it holds no definition of {kind}, as ROS 2 before Iron leaves them out; convert it to MCAP where "
-            "that package is installed (ros2 bag convert), or read a JointState topic"
+            f"no definition of {kind} (ROS 2 before Iron does not store them); convert the bag to MCAP on a machine "
+            "with that package (ros2 bag convert), or read a JointState topic"
         )
     decode = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     for _, received, raw in reader.messages(connections=connections):
@@ -237,14 +232,14 @@ def _joint_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
-    """Return names and values of either of Franka's messages (franka_ros, franka_ros2)."""
+    """Return names and values of a Franka message (franka_ros or franka_ros2)."""
     if hasattr(message, "measured_joint_state"):
         names, values = _joint_state(message.measured_joint_state)
         desired = message.desired_joint_state
         if list(desired.name) not in ([], list(names)):
-            raise UserError(f"measured joints are {choices(names)}, desired ones {choices(desired.name)}")
+            raise UserError(f"expected desired joints {choices(names)}, as measured, got {choices(desired.name)}")
         return names, {"q": values["q"], "dq": values["dq"], "tau_J": values["tau"], "tau_J_d": desired.effort}
-    lower = {name.lower(): value for name, value in vars(message).items()}  # ROS 2 allows lower case only: tau_j
+    lower = {name.lower(): value for name, value in vars(message).items()}  # ROS 2 field names are lower case: tau_j
     missing = [f for f in ("q", "dq", "tau_J", "tau_J_d") if f.lower() not in lower]
     if missing:
         raise UserError(f"FrankaState without {choices(missing)}; fields: {choices(lower)}")
@@ -252,26 +247,26 @@ def _franka_state(message: Any) -> tuple[Sequence[str], dict[str, Any]]:
 
 
 def _pick_joints(topic: str, samples: list[Sample], joints, model_joints, n_joints) -> tuple[list[Sample], Layouts]:
-    """Return the messages that hold all joints, and where."""
+    """Return the messages with all joints of the robot, and the indices of these joints."""
     layouts = dict.fromkeys(s.names for s in samples)
-    seen = list(dict.fromkeys(name for names in layouts for name in names))
-    if not seen:
+    logged = list(dict.fromkeys(name for names in layouts for name in names))
+    if not logged:
         if joints is not None:
-            raise UserError(f"the messages on '{topic}' name no joints: leave data.joints=null")
+            raise UserError(f"data.joints: expected null, as the messages on '{topic}' name no joints, got {joints}")
         return samples, {(): None}
     try:
-        wanted = choose_joints(seen, joints, model_joints, n_joints)
+        robot = choose_joints(logged, joints, model_joints, n_joints)
     except UserError as error:
         raise UserError(f"'{topic}': {error}") from None
-    pick: Layouts = {names: [names.index(name) for name in wanted] for names in layouts if set(wanted) <= set(names)}
+    pick: Layouts = {names: [names.index(name) for name in robot] for names in layouts if set(robot) <= set(names)}
     if not pick:
-        held = " | ".join(choices(names) for names in layouts)
-        raise UserError(f"no message on '{topic}' holds all of {choices(wanted)}; they hold {held} (set data.joints)")
+        got = " | ".join(choices(names) for names in layouts)
+        raise UserError(f"expected {choices(robot)} in one message on '{topic}', got {got} (set data.joints)")
     return [s for s in samples if s.names in pick], pick
 
 
 def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.ndarray:
-    """Return a field as (T, n); empty where no message has it."""
+    """Return a field as (T, n), or an empty array if no message has it."""
     if not any(s.values[field].size for s in samples):
         return np.empty(0)
     rows = []
@@ -279,14 +274,14 @@ def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.n
         x, at = s.values[field], pick[s.names]
         expected = len(s.names) if s.names else len(samples[0].values["q"])
         if len(x) != expected:
-            raise UserError(f"message {k} on '{topic}' holds {len(x)} values of {field} for {expected} joints")
+            raise UserError(f"message {k} on '{topic}': expected {expected} values of {field}, got {len(x)}")
         rows.append(x if at is None else x[at])
     return np.stack(rows)
 
 
 def _in_order(stamp: np.ndarray, table: Table) -> tuple[np.ndarray, Table]:
-    """Put late messages where they belong and drop repeated ones; a clock that restarted is left to be refused."""
-    if len(stamp) < 2 or np.diff(stamp).min() < -LATE_NS:
+    """Sort late messages and drop repeated ones; `Recording` reports a clock that restarted."""
+    if len(stamp) < 2 or np.diff(stamp).min() < -MAX_LATENESS_NS:
         return stamp, table
     order = np.argsort(stamp, kind="stable")
     stamp, table = stamp[order], {field: x[order] for field, x in table.items()}

@@ -1,1 +1,1 @@
-"""What a person looks at: tables, pages, figures, the rerun recording, the comparison of runs."""
+"""Tables, pages, figures, rerun recordings, comparison of runs, trackers."""

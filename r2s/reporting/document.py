@@ -1,4 +1,4 @@
-"""report.md and report.html from the same sections: paragraphs, bullets, tables and pictures."""
+"""report.md and report.html of the same sections: paragraphs, bullets, tables and pictures."""
 
 import os
 from base64 import b64encode
@@ -8,20 +8,17 @@ from pathlib import Path
 import pandas as pd
 from jinja2 import Environment
 
-UNSEEN = "nominal, unseen"
-Item = str | list[str] | pd.DataFrame | Path  # of a report: paragraph, bullets, table, picture
+KEPT = "kept nominal"  # cell of a parameter that the data hardly constrain
+Item = str | list[str] | pd.DataFrame | Path  # paragraph, bullets, table, picture
 
 
 def doubtful(cell: str) -> bool:
-    """Return whether a cell is of a value that the data tell little of."""
-    return cell.split("\n")[0].endswith("?") or cell.endswith(UNSEEN)
+    """Return whether a cell shows a poorly identifiable value."""
+    return cell.split("\n")[0].endswith("?") or cell.endswith(KEPT)
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.md: {heading: paragraphs, bullets, tables and figures}; the first heading is the title.
-
-    Figures are linked relative to the report, so that the run folder can be moved.
-    """
+    """Write report.md from {heading: items}; the first heading is the title, links to figures are relative."""
     lines: list[str] = []
     for i, (heading, items) in enumerate(sections.items()):
         lines += [f"{'#' if i == 0 else '##'} {heading}", ""]
@@ -44,7 +41,7 @@ def _markdown(item: Item, folder: Path) -> str:
 
 
 def _rows(table: pd.DataFrame) -> list[list[str]]:
-    """Return a table's cells, the header first, the index in front."""
+    """Return the cells of a table, header and index included."""
     head = [str(table.index.name or ""), *map(str, table.columns)]
     return [head, *([str(k), *map(str, row)] for k, row in zip(table.index, table.to_numpy(), strict=True))]
 
@@ -68,8 +65,6 @@ td.doubtful, td.doubtful::first-line { color: #8c959f; }
 figure { margin: 1rem 0 1.6rem; }
 img { max-width: 100%; height: auto; }
 """
-
-
 PAGE = """\
 <!DOCTYPE html>
 <html lang="en">
@@ -105,7 +100,7 @@ PAGE = """\
 
 
 def report_html(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:
-    """Write report.html: what `report_markdown` takes as one file, pictures inside; no script, nothing is loaded."""
+    """Write report.html as one file with its pictures; it has no script and loads nothing."""
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
     parts = [(heading, [_for_template(item) for item in items]) for heading, items in sections.items()]
     path.write_text(page.render(sections=parts, style=STYLE, doubtful=doubtful), encoding="utf-8")

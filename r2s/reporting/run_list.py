@@ -1,4 +1,4 @@
-"""The runs below a root: status, what came of them, and how old they are."""
+"""`r2s list`: run folders with their status, key figures and age."""
 
 import csv
 import json
@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.reporting.measures import in_short
+from r2s.reporting.measures import measures_of
 from r2s.runs import status_of
 
 LOST = ("failed", "killed")
+COLUMNS = ["status", "result", "age"]
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
-    """Return a row of strings per run folder of runs/<stage>/<name>, the youngest last.
+    """Return a row of strings per run folder below `root`, the youngest last.
 
     Args:
-        root: where run folders live. stage: only runs of this one. failed: only what failed or was killed.
+        root: parent of <stage>/<name>. stage: only runs of this stage. failed: only failed or killed runs.
     """
     found = []
     for path in Path(root).glob(f"{stage or '*'}/*/meta.json"):
@@ -28,19 +29,14 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
             meta = json.loads(path.read_text())
             start, status = datetime.fromisoformat(meta["start"]), status_of(meta)
         except (ValueError, KeyError, TypeError):
-            continue  # not ours
+            continue  # not a meta.json of r2s
         if not failed or status in LOST:
             found.append((start, path.parent, status, meta))
     rows = {}
     for start, folder, status, meta in sorted(found, key=lambda f: f[0]):
-        age = (datetime.now().astimezone() - start).total_seconds()
-        rows[f"{folder.parent.name}/{folder.name}"] = {
-            "status": status,
-            "what came of it": _figures(folder, meta),
-            "age": ago(age),
-        }
-    table = pd.DataFrame.from_dict(rows, orient="index", columns=["status", "what came of it", "age"])
-    return table.rename_axis("run")
+        cells = status, _result(folder, meta), ago((datetime.now().astimezone() - start).total_seconds())
+        rows[f"{folder.parent.name}/{folder.name}"] = dict(zip(COLUMNS, cells, strict=True))
+    return pd.DataFrame.from_dict(rows, orient="index", columns=COLUMNS).rename_axis("run")
 
 
 def ago(seconds: float) -> str:
@@ -51,36 +47,40 @@ def ago(seconds: float) -> str:
     return f"{max(seconds, 0):.0f} s"
 
 
-def _figures(folder: Path, meta: Mapping[str, Any]) -> str:
-    """Return the key figures of a run; of one that is not done how far it came, or why it ended."""
+def _result(folder: Path, meta: Mapping[str, Any]) -> str:
+    """Return the key figures of a run; of an unfinished run its progress or its error."""
     summary = folder / "summary.json"
     try:
         if summary.is_file():
-            return _last_word(meta.get("stage", ""), json.loads(summary.read_text()))
+            return _key_figures(folder, meta.get("stage", ""), json.loads(summary.read_text()))
         if "error" in meta:
             return str(meta["error"]).splitlines()[0]
         with open(folder / "evaluations.csv", newline="") as file:
             *_, row = csv.DictReader(file)
-        return f"{_success(row)} after {float(row['env_steps']) / 1e3:.0f}k env steps"
+        return f"{_in_words(folder, row)} after {float(row['env_steps']) / 1e3:.0f}k env steps"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return "-"
 
 
-def _last_word(stage: str, document: Mapping[str, Any]) -> str:
+def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
     if stage == "identify":
-        side = document["validation"]
+        side = summary["validation"]
         after, before = (float(np.mean(side[k])) for k in ("torque_rmse_Nm", "nominal_torque_rmse_Nm"))
         return f"torque RMSE {after:.3g} Nm, nominal {before:.3g}"
+    if stage in ("estimate", "watch"):
+        return f"payload {summary['mass_kg']:.3g} ± {summary['mass_kg_half']:.2g} kg"
     if stage == "train":
-        return _success(document["best"])
+        return _in_words(folder, summary["best"])
     if stage == "compare":
-        groups = {row["group"] for row in document["scores"]}
-        return f"{len(groups)} group{'s' * (len(groups) != 1)} of runs"
-    rows = document["reach"] if stage == "pipeline" else document
-    if any("path_rmse_mm" in row for row in rows.values()):
-        return "RMSE " + "; ".join(f"{where} {row['path_rmse_mm']:.2f}" for where, row in rows.items()) + " mm"
-    return "; ".join(f"{where} {100 * row['success_1cm']:.0f} %" for where, row in rows.items()) + " < 1 cm"
+        what, name = ("scores", "group") if "scores" in summary else ("adapter_comparison", "row")
+        count = len({row[name] for row in summary[what]})
+        return f"{count} {'groups of runs' if what == 'scores' else 'adapters'} compared"
+    rows = summary["reach"] if stage == "pipeline" else summary
+    table = measures_of(folder)
+    measure = table[table.transfer[0]]
+    cells = [f"{where} {measure.cell(row.get(measure.key))}" for where, row in rows.items()]
+    return f"{measure.heading}: {', '.join(cells)}"
 
 
-def _success(row: Mapping[str, Any]) -> str:
-    return ", ".join(in_short(row))
+def _in_words(folder: Path, row: Mapping[str, Any]) -> str:
+    return ", ".join(measures_of(folder).in_words(row))

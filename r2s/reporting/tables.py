@@ -1,10 +1,6 @@
-"""What a person reads: tables for the terminal, and the same in report.md and report.html.
+"""Tables of measures as data frames of strings, the same for terminal and reports."""
 
-A table is a DataFrame of strings first, so that the terminal and the reports say the same. What only the report of an
-identification has is in identification_page.py and paper_tables.py, figures are in *_figures.py.
-"""
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -14,93 +10,60 @@ from rich.markup import escape
 from rich.table import Table
 
 from r2s.reporting.document import doubtful
-from r2s.reporting.measures import REACH, shown
-
-SUCCESS = {key: REACH.known[key].short for key in REACH.row if key.startswith("success")}
-
-
-def scores_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Return one row of strings per group: interquartile mean over [95 % interval] of each measure.
-
-    One seed has no interval.
-    """
-    known = shown(set(table["measure"]))
-    out: dict[str, dict[str, str]] = {}
-    for r in table.to_dict("records"):
-        measure = known.known[r["measure"]]
-        cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
-        interval = f"\n[{measure.cell(r['low'])}, {measure.cell(r['high'])}]" if r["seeds"] > 1 else ""
-        cells[measure.short] = f"{measure.cell(r['iqm'], max(1, measure.digits))}{interval}"
-    return pd.DataFrame.from_dict(out, orient="index").rename_axis(known.corner)
+from r2s.tasks.measures import Measure, MeasureTable
 
 
 def number(value: float | None, form: str = "{:.3g}") -> str:
-    """Return a number as tables show it; "-" where there is none."""
+    """Return a formatted number, "-" if it is missing or not finite."""
     return "-" if value is None or not np.isfinite(value) else form.format(value)
 
 
-def reach_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return one row per label from dicts with the keys of evaluations.csv (shares from 0 to 1)."""
-    table, known = {}, shown(key for row in rows.values() for key in row)
-    for label, row in rows.items():
-        cells = {}
-        for key in known.row:
-            measure = known.known[key]
-            value = row.get("return_smooth", row.get(key)) if key == "return_paper" else row.get(key)
-            scaled = None if value is None else measure.scale * value
-            cells[measure.short] = number(scaled, f"{{:.{max(1, measure.digits)}f}}")
-        table[_counted(label, row)] = cells
-    return pd.DataFrame.from_dict(table, orient="index").rename_axis(known.corner)
+def measure_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
+    """Return the table of `rows` {label: row of evaluations.csv}, one line per simulator or arm."""
+    return _table([measures[key] for key in measures.rows], rows, measures.corner, decimals=1)
+
+
+def diagnostic_rows(measures: MeasureTable, rows: Mapping[str, Mapping]) -> pd.DataFrame:
+    """Return the second table of `rows`: gap to the prediction, motion, safety filter, without empty columns."""
+    present = [measures[key] for key in measures.diagnostics if any(key in row for row in rows.values())]
+    return _table(present, rows, "", decimals=0)
+
+
+def _table(columns: Sequence[Measure], rows: Mapping[str, Mapping], corner: str, decimals: int) -> pd.DataFrame:
+    """Return the cells with at least this many decimals."""
+    cells = {
+        _counted(label, row): {m.column: m.cell(row.get(m.key), max(decimals, m.digits)) for m in columns}
+        for label, row in rows.items()
+    }
+    return pd.DataFrame.from_dict(cells, orient="index").rename_axis(corner)
 
 
 def _counted(label: str, row: Mapping) -> str:
-    """Return the label, with how many of the goals it is about where an arm was stopped before all were done."""
+    """Return the label, with the number of completed goals if the arm stopped early."""
     done, asked = row.get("episodes"), row.get("asked")
     return label if done == asked else f"{label}, {done} of {asked} goals done"
 
 
-REACHING = ("time_to_reach_s", "overshoot_m")
+def scores_rows(measures: MeasureTable, scores: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per group of a `summary_table`: interquartile mean over [95 % interval] if it has two seeds."""
+    out: dict[str, dict[str, str]] = {}
+    for r in scores.to_dict("records"):
+        m = measures[r["measure"]]
+        cells = out.setdefault(r["group"], {"seeds": str(r["seeds"])})
+        interval = f"\n[{m.cell(r['low'])}, {m.cell(r['high'])}]" if r["seeds"] > 1 else ""
+        cells[m.column] = f"{m.cell(r['iqm'], max(1, m.digits))}{interval}"
+    return pd.DataFrame.from_dict(out, orient="index").rename_axis(measures.corner)
 
 
-def gap_rows(rows: Mapping[str, Mapping]) -> pd.DataFrame:
-    """Return one row per label: how far from the simulation that the policy was trained in, and how it moved."""
-    columns = {
-        "path from simulation, mm": ("ee_path_rmse_mm", 1, "{:.2g}"),
-        "torque from simulation, Nm": ("tau_rmse_Nm", 1, "{:.2g}"),
-        "time to reach, s": ("time_to_reach_s", 1, "{:.2f}"),
-        "overshoot, mm": ("overshoot_m", 1e3, "{:.1f}"),
-        "limited, %": ("limited", 100, "{:.1f}"),
-        "to position limits, rad": ("q_left_rad", 1, "{:.2f}"),
-        "collisions, %": ("collision", 100, "{:.1f}"),
-        "stops": ("stops", 1, "{:.0f}"),
-    }
-    if shown(key for row in rows.values() for key in row) is not REACH:  # which a path has no use for
-        columns = {title: column for title, column in columns.items() if column[0] not in REACHING}
-    table = {
-        _counted(label, row): {
-            title: number(None if row.get(key) is None else scale * row[key], form)
-            for title, (key, scale, form) in columns.items()
-        }
-        for label, row in rows.items()
-    }
-    return pd.DataFrame.from_dict(table, orient="index").rename_axis("")
-
-
-def reach_table(console: Console, rows: Mapping[str, Mapping], title: str) -> None:
-    """Print what `reach_rows` returns."""
-    print_table(console, reach_rows(rows), title)
+def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, Mapping], title: str) -> None:
+    """Print `measure_rows`."""
+    print_table(console, measure_rows(measures, rows), title)
 
 
 def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str | None = None) -> None:
-    """Print a table of strings; what is uncertain is dimmed."""
-    table = Table(
-        title=title,
-        caption=caption,
-        title_justify="left",
-        caption_justify="left",
-        title_style="bold",
-        box=SIMPLE_HEAD,
-    )
+    """Print a table of strings; uncertain values are dimmed."""
+    left = {"title_justify": "left", "caption_justify": "left"}
+    table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **left)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))
     for column in frame.columns:
         table.add_column(str(column), justify="right")

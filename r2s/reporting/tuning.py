@@ -1,4 +1,4 @@
-"""What a search for settings found, trial by trial, and against a grid at equal compute."""
+"""Report of stage=tune: trials, and the best so far against a grid at equal compute."""
 
 from collections.abc import Sequence
 from glob import glob
@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.reporting.document import report_markdown
-from r2s.reporting.figures import panels
-from r2s.reporting.trainings import read_trainings
+from r2s.reporting.comparison.trainings import read_trainings
+from r2s.reporting.document import Item, report_markdown
+from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
 
-ORDERS = 2000  # in which a grid could have been gone through
-SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)
+ORDERS = 2000  # random orders of a grid: its mean then varies by 1 / 45 of the spread over orders
+SHARES = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the search's compute
 
 
 def trials_table(study: Any, folder: Path) -> pd.DataFrame:
-    """Return a row per trial: what was drawn, what came of it, and the seconds and steps that it took."""
+    """Return a row per trial: settings, value, wall-clock seconds and env steps."""
     rows = []
     for trial in study.trials:
         row = {"trial": trial.number, "state": trial.state.name.lower(), "value": trial.value} | trial.params
@@ -31,9 +31,9 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 
 
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
-    """Return the best value (K,) after each amount of compute `at` (K,) of trials done one after another.
+    """Return the best value (K,) after each compute `at` (K,) s of trials that run one after another.
 
-    A trial counts once it has ended; a value that is nan (pruned, failed) takes its compute and brings nothing.
+    A trial counts from its end; nan (pruned, failed) only takes compute. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))
@@ -42,12 +42,12 @@ def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray,
 
 
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
-    """Return the best so far of the search and of a grid, at shares of the compute that the search took.
+    """Return the best so far of the search and of a grid at `SHARES` of the search's compute.
 
-    The grid's is the mean over `ORDERS` random orders of its jobs: in which order a grid is gone through is chance.
+    The grid's value is the mean over `ORDERS` random orders of its jobs, because its order is arbitrary.
 
     Args:
-        trials: of `trials_table`. measure: of the last evaluation. against: glob of trainings; None: there are none.
+        trials: of `trials_table`. measure: of the last evaluation. against: glob of trainings, or None.
         larger: whether larger is better.
     """
     if not against:
@@ -56,7 +56,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)
-    # of the evaluations, as a trial's: a summary's last policy was judged on other goals
+    # the last evaluation, as for a trial: the summary is of other goals
     spent, values = (np.array([r.curve[k].iloc[-1] for r in grid]) for k in ("wall_clock_s", measure))
     rng = np.random.default_rng(0)
     orders = [rng.permutation(len(grid)) for _ in range(ORDERS)]
@@ -64,25 +64,24 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     known = np.isfinite(each).all(axis=0)
     mean = np.where(known, np.where(np.isfinite(each), each, 0.0).mean(axis=0), np.nan)
     jobs = [float(min(len(grid), x / spent.mean())) for x in at]
-    columns = {"minutes": at / 60, "tune": searched, "grid": mean, "jobs of the grid": jobs}
-    return pd.DataFrame(columns)
+    return pd.DataFrame({"minutes": at / 60, "tune": searched, "grid": mean, "jobs of the grid": jobs})
 
 
 def tuning_page(run: Run, trials: pd.DataFrame, against: pd.DataFrame | None, measure: str) -> None:
-    """Write report.md and its figure: every trial, the best so far, and the grid beside it."""
+    """Write report.md with a figure of all trials and the best so far."""
     ended = trials[trials["state"] == "complete"]
     spent = trials["wall_clock_s"].cumsum() / 60
     path = run.figure("tune")
-    with panels(path, 1, 1, f"{measure} of trials over the compute spent", height=4.0) as (axis,):
-        axis.plot(spent[ended.index], ended["value"], "o", label="trials that came to their end")
+    with panels(path, 1, 1, f"{measure} of the trials over compute", height=4.0) as (axis,):
+        axis.plot(spent[ended.index], ended["value"], "o", label="completed trials")
         if against is not None:
             for name in ("tune", "grid"):
                 axis.plot(against["minutes"], against[name], marker=".", label=f"best so far, {name}")
         axis.set_xlabel("minutes of training, summed over the trials")
     shown = trials.set_index("trial").map(lambda v: f"{v:.4g}" if isinstance(v, float) else str(v))
-    sections: dict[str, list[Any]] = {f"Settings looked for: {run.folder.name}": [path], "Trials": [shown]}
+    sections: dict[str, list[Item]] = {f"Search for settings: {run.folder.name}": [path], "Trials": [shown]}
     if against is not None:
         rows = against.map(lambda v: f"{v:.4g}").set_index("minutes")
-        note = "The best so far at equal compute; the grid's is the mean over random orders of its jobs."
+        note = "Best so far at equal compute; the grid's is the mean over random orders of its jobs."
         sections["Against the grid"] = [rows, note]
     report_markdown(run.folder / "report.md", sections)

@@ -1,132 +1,35 @@
-"""What several stages make from the config: parts by their `_target_`, robot, dynamics, draws, arms, run folders."""
+"""Make robot, dynamics, task, randomization, arm and run folder from the config."""
 
 import inspect
-import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from r2s.errors import UserError, check_number, choices, nearest
+from r2s.stages.parts import called, check_types, part, plain, target
 
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
-BESIDE = ("soft_start_s", "live")  # of conf/arm, how it is driven
-STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "watch")
-COMMON = ("stage", "root", "name", "only_missing", "resume", "experiment", "grid", "seed", "threads", "tracker")
-GROUP = "R2S_GROUP"  # in the environment of the jobs of a sweep: what they are called together
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """`evaluation` of the config.
-
-    Attributes:
-        episodes: goals of an evaluation. env_steps: between two evaluations of a training.
-
-    Raises:
-        UserError: one of them is no positive whole number.
-    """
-
-    episodes: int
-    env_steps: int
-
-    def __post_init__(self):
-        check_number("evaluation.episodes", self.episodes, "[1, inf)", whole=True)
-        check_number("evaluation.env_steps", self.env_steps, "[1, inf)", whole=True)
-
-
-def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
-    """Make the part that a config node names by `_target_`.
-
-    Args:
-        node: of the config; its keys are arguments of the part.
-        group: where the node is in the config, for error messages.
-        given: further arguments, which come from code and go first.
-        beside: keys of the node that are no arguments of the part.
-
-    Raises:
-        UserError: there is no such part, or not with these arguments.
-    """
-    make = target(node, group)
-    settings = plain(node)
-    settings = {k: v for k, v in settings.items() if k not in ("_target_", "name", *beside)}
-    return called(make, group, settings, *given)
-
-
-def target(node: Any, group: str) -> Callable[..., Any]:
-    """Return what a config node's `_target_` names: a class or a function of an importable module."""
-    from hydra.utils import get_object
-
-    path = node.get("_target_") if isinstance(node, Mapping) else None
-    if not isinstance(path, str) or not path:
-        raise UserError(f"{group}: its yaml has no _target_, the dotted path of what makes it")
-    logging.getLogger("hydra.utils").disabled = True  # it would say it, too
-    try:
-        return get_object(path)
-    except Exception as error:  # importing a user's module may fail in any way
-        cause = error.__cause__ or error
-        while cause.__cause__ is not None:
-            cause = cause.__cause__
-        seen = " ".join(str(cause).split())
-        raise UserError(f"{group}._target_: cannot load '{path}': {type(cause).__name__}: {seen}") from None
-
-
-def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *given: Any) -> Any:
-    """Call `make` with arguments from code and with `settings` of a config group, whose mistakes are named as typed.
-
-    Raises:
-        UserError: an argument that it does not take or misses, a word where its annotation asks for a number, or
-            whatever it says itself.
-    """
-    check_words(make, group, settings)
-    try:
-        inspect.signature(make).bind(*given, **settings)
-    except TypeError as error:
-        raise UserError(f"{group}: {getattr(make, '__name__', make)}: {error}") from None
-    try:
-        return make(*given, **settings)
-    except UserError as error:
-        first = str(error).split(":")[0].split(".")[0]
-        if first in settings and first != group:  # a part does not know the name of its group
-            raise UserError(f"{group}.{error}") from None
-        raise
-
-
-def check_words(make: Callable[..., Any], group: str, settings: Mapping[str, Any]) -> None:
-    """Raise UserError where a word stands for what `make` wants as a number or as a list of numbers."""
-    try:
-        hints = get_type_hints(make.__init__ if inspect.isclass(make) else make)
-    except NameError:  # annotations that only a type checker can resolve
-        return
-    for key, value in settings.items():
-        kinds = set(_kinds(hints.get(key)))
-        words = [v for v in (value if isinstance(value, list) else [value]) if isinstance(v, str)]
-        if words and kinds & {int, float} and not kinds & {str, Any}:
-            raise UserError(f"{group}.{key}: '{words[0]}' is not a number")
-
-
-def _kinds(hint: Any) -> Iterator[Any]:
-    inner = get_args(hint)
-    for kind in inner:
-        yield from _kinds(kind)
-    if not inner:
-        yield hint
+DRIVE_KEYS = ("soft_start_s", "live")  # of conf/arm; the policy runner reads them, not the arm
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate")
+COMMON = ("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker")
+GROUP = "R2S_GROUP"  # environment variable: name that the jobs of a sweep share in trackers
 
 
 def unread(name: str, cfg: Any) -> str | None:
-    """Return why the stage of `cfg` does not read the typed key or group `name`; None where it does."""
+    """Return why the stage of `cfg` does not read the key or group `name`; None if it does."""
     from importlib import import_module
 
     stage = import_module(f"r2s.stages.{cfg.stage}")
     keys = stage.reads(cfg)
     if any(name == key or name.startswith(f"{key}.") or key.startswith(f"{name}.") for key in (*COMMON, *keys)):
         head, _, own = name.partition(".")
-        if head != "algo" or not own or "algo" not in keys or is_learner(cfg) or own not in of_trainings():
+        if head != "algo" or not own or "algo" not in keys or is_learner(cfg) or own not in training_keys():
             return None
         return f"{name}: nothing is trained with algo={cfg.algo.name}; leave it out"
     head = name.split(".")[0]
@@ -135,7 +38,7 @@ def unread(name: str, cfg: Any) -> str | None:
 
 
 def make_robot(cfg):
-    """Return the arm of conf/robot; what a task takes from there is checked with it."""
+    """Return the arm of conf/robot."""
     from r2s.physics.robot import OF_TASKS
 
     for key in OF_TASKS:
@@ -147,7 +50,7 @@ def make_robot(cfg):
 
 
 def make_dynamics(cfg, robot):
-    """Return conf/friction and conf/inertia, or what `calibration=` identified."""
+    """Return the dynamics of conf/friction and conf/inertia, or those that `calibration=` identified."""
     from r2s.identification.parameter_file import load_parameters
 
     if cfg.calibration:
@@ -157,23 +60,27 @@ def make_dynamics(cfg, robot):
 
 
 def dynamics_of(robot, friction, inertia):
-    """Return the dynamics that a file of conf/friction and one of conf/inertia describe."""
+    """Return the dynamics of a file of conf/friction and a file of conf/inertia."""
     from r2s.physics.dynamics import nominal_dynamics
 
     for group, settings in (("friction", friction), ("inertia", inertia)):
         if not isinstance(settings, Mapping):
-            raise UserError(f"{group}: {settings!r} is no group of settings")
+            raise UserError(f"{group}: expected settings by name, got {settings!r}")
     if "scale" not in inertia:
-        raise UserError(f"inertia: it has no scale; it has {choices(inertia) or 'nothing'}")
-    check_words(nominal_dynamics, "inertia", {"scale": inertia["scale"]})
+        raise UserError(f"inertia: expected the key scale, got {choices(inertia) or 'no keys'}")
+    check_types(nominal_dynamics, "inertia", {"scale": inertia["scale"]})
     return called(nominal_dynamics, "friction", {**friction, "inertia_scale": inertia["scale"]}, robot)
 
 
 def make_task(cfg, robot, dynamics):
-    """Return conf/task, told of the model; its lists are tuples there, a task is a fixed thing."""
-    make = target(cfg.task, "task")
+    """Return the task of conf/task with the model of the arm and the controller of conf/control."""
+    if "control" not in cfg:
+        raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
-    return called(make, "task", settings).believing(robot, dynamics)
+    task = called(target(cfg.task, "task"), "task", settings).with_model(robot, dynamics)
+    if "_target_" not in cfg.control:  # control=default: the task's own
+        return task
+    return task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
 
 
 def make_draw(cfg, robot, center):
@@ -181,20 +88,26 @@ def make_draw(cfg, robot, center):
     return part(cfg.dr, "dr", robot, center)
 
 
+def _arm_target(cfg) -> Callable[..., Any]:
+    """Return the target of conf/arm; raise UserError for arm=none."""
+    if "_target_" not in cfg.arm:
+        allowed = sorted(p.stem for p in (CONF / "arm").glob("*.yaml") if p.stem != "none")
+        raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(allowed)}")
+    return target(cfg.arm, "arm")
+
+
 @contextmanager
 def opened_arm(cfg, robot, noise=0):
-    """Give the arm of conf/arm inside a `with`; one that has to be closed is a context manager itself.
+    """Yield the arm of conf/arm; close it afterwards if it is a context manager.
 
-    noise: which stream of noise the sensors of a twin have; a real arm has its own.
+    noise: number of the sensor-noise stream of a twin.
     """
     from r2s.arm.interface import ArmStopped
 
-    if "_target_" not in cfg.arm:
-        raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(_arms())}")
+    stream = {"noise": noise} if "noise" in inspect.signature(_arm_target(cfg)).parameters else {}
     with ExitStack() as stack:
         try:
-            stream = {"noise": noise} if "noise" in inspect.signature(target(cfg.arm, "arm")).parameters else {}
-            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=BESIDE)
+            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=DRIVE_KEYS)
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
@@ -202,55 +115,45 @@ def opened_arm(cfg, robot, noise=0):
 
 
 def is_twin(cfg):
-    """Return whether conf/arm is made from a seed, as often as one likes, with streams of noise."""
+    """Return whether conf/arm is simulated from a seed, so that copies of it can run in parallel."""
     made = {"_target_", "seed"} <= cfg.arm.keys()
     return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
 
 
-def arm_maker(cfg, robot):
-    """Return what opens the arm of conf/arm in another process: with `part`, which names mistakes as typed."""
-    if "_target_" not in cfg.arm:
-        raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(_arms())}")
-    target(cfg.arm, "arm")  # what cannot be loaded is said here
-    return partial(part, plain(cfg.arm), "arm", robot, beside=list(BESIDE))
-
-
 @contextmanager
-def opened_arms(cfg, robot, task, dynamics, noise=0, adapter=None):
-    """Give the arm of conf/arm behind its driver, for episodes of `task`: a `DrivenArm`, or a `LiveArm` where
-    `live` says that the arm's clock does not wait. It is stopped at the end whatever happens.
+def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
+    """Yield a `PolicyRunner` of the arm of conf/arm, or a `RealtimeRunner` if `live` is set; stop the arm afterwards.
 
-    dynamics: of one arm, what the policy learned on. adapter: as of `DrivenArm`. noise: as of `opened_arm`.
+    Args:
+        dynamics: the model of one arm that the policy was trained on. noise: see `opened_arm`. adapter: or None.
     """
-    from r2s.arm.deploy import DrivenArm
     from r2s.arm.interface import ArmStopped
-    from r2s.arm.live import LiveArm
+    from r2s.arm.policy_runner import PolicyRunner
+    from r2s.arm.realtime_process import RealtimeRunner
 
     how = {"soft_start_s": cfg.arm.get("soft_start_s", 0.0), "rotors": dynamics.armature, "adapter": adapter}
     if not cfg.arm.get("live", False):
         with opened_arm(cfg, robot, noise) as arm:
             try:
-                yield DrivenArm(arm, task, dynamics.level, **how)
+                yield PolicyRunner(arm, task, dynamics.level, **how)
             finally:
                 arm.stop()
         return
+    _arm_target(cfg)  # errors appear here, not in the process of the arm
+    make = partial(part, plain(cfg.arm), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
-            arms = stack.enter_context(LiveArm(arm_maker(cfg, robot), robot, task, dynamics.level, **how))
+            arms = stack.enter_context(RealtimeRunner(make, robot, task, dynamics.level, **how))
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         yield arms
 
 
-def _arms():
-    return sorted(p.stem for p in (CONF / "arm").glob("*.yaml") if p.stem != "none")
-
-
 @contextmanager
 def opened_source(cfg, robot, noise):
-    """Give what is recorded: conf/arm, or with data=simulated an arm of known truth.
+    """Yield the arm to record: conf/arm, or with data=simulated an arm with known parameters.
 
-    noise: 0, 1, 2, ... for each recording of a run: each has noise of its own.
+    noise: 0, 1, 2, ... for the recordings of a run, so that each has its own sensor noise.
     """
     if cfg.data.kind != "simulated":
         with opened_arm(cfg, robot, noise) as arm:
@@ -264,17 +167,17 @@ def opened_source(cfg, robot, noise):
 
 
 def check_source(cfg, robot):
-    """Say what is wrong with an arm that is recorded before there is a run folder; a real one is not touched."""
+    """Raise UserError if a simulated arm to record cannot be made; does not touch a real one."""
     if cfg.data.kind == "simulated" or is_twin(cfg):
         with opened_source(cfg, robot, 0):
             pass
 
 
 def make_truth(cfg, robot):
-    """Return the dynamics of data.truth: a file of conf/friction, with the one of conf/inertia of that name.
+    """Return the dynamics of the files of conf/friction and conf/inertia that data.truth names.
 
     Raises:
-        UserError: there is no such file.
+        UserError: a file is missing.
     """
     from omegaconf import OmegaConf
 
@@ -289,53 +192,38 @@ def make_truth(cfg, robot):
 
 
 def is_learner(cfg):
-    """Return whether conf/algo is trained; what is not is a controller made of robot, task and dynamics."""
+    """Return whether conf/algo is trained; otherwise it is a controller made of robot, task and dynamics."""
     from r2s.learning.learner import Learner
 
     kind = target(cfg.algo, "algo")
     return inspect.isclass(kind) and issubclass(kind, Learner)
 
 
-def of_trainings():
-    """Return the keys of conf/algo that say how to train, which an experiment may set for a controller, too."""
+def training_keys():
+    """Return the keys of conf/algo that only trainings use; an experiment may set them for a controller, too."""
     from r2s.learning.train import Loop
 
     return ("n_envs", "hidden", *(f.name for f in fields(Loop)))
 
 
 def make_controller(cfg, robot, task, dynamics):
-    """Return the controller of conf/algo, with the model that it believes in."""
-    return part(cfg.algo, "algo", robot, task, dynamics, beside=of_trainings())
+    """Return the controller of conf/algo, with these dynamics as its model."""
+    return part(cfg.algo, "algo", robot, task, dynamics, beside=training_keys())
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
-    """Return the run folder of this job, open."""
+    """Return the open run folder of this job, with its trackers started; a resumed run keeps its group."""
     from omegaconf import OmegaConf
 
-    from r2s.runs import Run
+    from r2s.runs import Job, Run
 
     trackers = {k: part(node, f"tracker.{k}") for k, node in (cfg.get("tracker") or {}).items() if node}
-    run = Run(
-        Path(cfg.root),
-        cfg.stage,
-        cfg.name,
-        config=OmegaConf.to_yaml(cfg),
-        overrides=overrides,
-        seed=cfg.seed,
-        threads=cfg.threads,
-        inputs=inputs,
-        parents=parents,
-        resume=cfg.resume,
-        only=cfg.only_missing,
-    )
-    if trackers:
-        run.watcher = watched(cfg, run, trackers)
-    return run
-
-
-def watched(cfg, run, trackers):
-    """Return the trackers of a run, started; a resumed run stays in the group that it was in."""
-    from r2s.reporting.trackers.behind import Trackers
+    config = OmegaConf.to_yaml(cfg)
+    job = Job(cfg.stage, cfg.name, config, list(overrides), cfg.seed, cfg.threads, inputs, parents)
+    run = Run(Path(cfg.root), job, resume=cfg.resume, exact_name=cfg.skip_completed)
+    if not trackers:
+        return run
+    from r2s.reporting.trackers.async_tracker import Trackers
     from r2s.reporting.trackers.tracker import Tracked
 
     tracked = Tracked(run.folder, cfg.stage, os.environ.get(GROUP), plain(cfg), run.meta, bool(cfg.resume))
@@ -343,30 +231,15 @@ def watched(cfg, run, trackers):
         tracked = replace(tracked, group=tracked.kept("group"))
     else:
         tracked.keep("group", tracked.group)
-    return Trackers(trackers, tracked)
-
-
-def plain(node):
-    """Return a config node as dicts, lists and numbers."""
-    from omegaconf import OmegaConf
-
-    if not OmegaConf.is_config(node):
-        return node
-    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
-
-
-def console():
-    """Return where tables go."""
-    from rich.console import Console
-
-    return Console(width=None if sys.stdout.isatty() else 110)
+    run.tracker = Trackers(trackers, tracked)
+    return run
 
 
 def loaded(path):
     """Return a YAML file of a run folder as a config.
 
     Raises:
-        UserError: it cannot be read, or is no YAML.
+        UserError: the file cannot be read or is no YAML.
     """
     import yaml
     from omegaconf import OmegaConf
@@ -378,8 +251,15 @@ def loaded(path):
         raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
 
 
+def console():
+    """Return the console that prints tables."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 110)
+
+
 def set_threads(cfg):
-    """Give torch its threads and seed; the physics gets its own from cfg.threads."""
+    """Set torch's threads and seed; the physics takes cfg.threads itself."""
     import torch
 
     torch.set_num_threads(cfg.threads or os.cpu_count() or 1)
@@ -387,11 +267,11 @@ def set_threads(cfg):
 
 
 def device(cfg):
-    """Return where learner and replay buffer live; the physics stays on the processor."""
+    """Return the device of learner and replay buffer; the physics stays on the processor."""
     import torch
 
     if cfg.device not in ("cpu", "cuda"):
-        raise UserError(f"device: '{cfg.device}' is not allowed; cpu and cuda are")
+        raise UserError(f"device: expected cpu or cuda, got {cfg.device!r}")
     if cfg.device == "cuda" and not torch.cuda.is_available():
-        raise UserError("device: cuda is not there; torch sees no GPU, device=cpu works")
+        raise UserError("device: torch finds no GPU for device=cuda; device=cpu works")
     return cfg.device

@@ -1,15 +1,12 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
+import copy
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from r2s.errors import check_number
-from r2s.stages.adapting import is_taught, is_told, make_lessons, teach, teach_latent, told_draw, told_of
 from r2s.stages.build import (
-    Evaluation,
-    called,
-    check_words,
     console,
     device,
     is_learner,
@@ -19,255 +16,226 @@ from r2s.stages.build import (
     make_robot,
     make_task,
     open_run,
-    plain,
     set_threads,
-    target,
 )
+from r2s.stages.parts import called, part, plain, target
 
 WHY = {
-    "friction": "calibration= says what friction is",
-    "inertia": "calibration= says what the links are",
+    "friction": "the friction comes from calibration=",
+    "inertia": "the link parameters come from calibration=",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
-    "adapt": "adapters work on an arm, with stage=transfer; of them history is trained, osi and rma with a policy",
-    "arm": "a training meets no arm; stage=transfer does",
-    "simulator": "it trains in MuJoCo; stage=transfer goes to another engine",
+    "adapt": "adapters work on an arm, with stage=transfer",
+    "arm": "a training uses no arm; stage=transfer does",
+    "simulator": "it trains in MuJoCo; stage=transfer uses other engines",
     "data": "only stage=identify records or reads a motion",
-    "identify": "only stage=identify does that; calibration= brings what it found",
-    "search": "only stage=identify searches; calibration= brings what it found",
+    "identify": "only stage=identify identifies; calibration= loads its result",
+    "search": "only stage=identify searches; calibration= loads its result",
 }
-CALIBRATION = ("parameters.yaml", "posterior.npz")  # of an identification, kept by what was trained on it
+CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification that a training copies
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
-    if is_taught(cfg):
-        return {"robot", "task", "calibration", "adapt"}
-    keys = {"robot", "dr", "algo", "task", "evaluation.episodes", "calibration"}
+    """Return the config keys of this stage."""
+    keys = {"robot", "dr", "algo", "task", "control", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
-    if "n_envs" in cfg.algo:  # else it is a controller
+    if "n_envs" in cfg.algo:  # an algorithm that learns
         keys |= {"budget", "reward", "evaluation", "compile", "matmul", "device"}
-        keys |= {"adapt"} if is_told(cfg) else set()
     return keys
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a training is made of. What a config says wrongly of it is said while they are made, before any folder."""
+    """The parts of a training, made before its run folder, so that a config error leaves no folder.
+
+    An algo without training has only the first five, with `algo` as its controller.
+    """
 
     robot: Any
-    center: Any
     task: Any
-    identified: Any
     draw: Any
-    told: Any
-    weights: Any
-    env: Any
-    evaluate: Any
-    algo: Any
-    loop: Any
-    budget: Any
     episodes: int
-    device: str
+    algo: Any
+    env: Any = None
+    evaluate: Any = None
+    loop: Any = None
+    budget: Any = None
 
 
 def make_parts(cfg):
-    """Return the parts of the training that a config asks for.
+    """Return the parts of the training of a config.
 
     Raises:
-        UserError: it asks for none that there can be.
+        UserError: a setting is wrong.
     """
     import torch
 
     from r2s.learning.env import TaskEnv
-    from r2s.learning.evaluate import SELECTED, make_evaluation
-    from r2s.learning.policy import observation_scale
-    from r2s.tasks.rewards import Curriculum
+    from r2s.learning.evaluate import SELECTION, make_evaluation
+    from r2s.learning.policy import normalization
+    from r2s.learning.train import Budget
 
-    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
-    n_envs, loop, settings = split(cfg)
-    budget = make_budget(cfg)
-    robot, model = make_robot(cfg), own_model(cfg)
+    episodes, learns = cfg.evaluation.episodes, is_learner(cfg)
+    check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
+    if learns:
+        n_envs, loop, settings = split_algo(cfg)
+        budget = called(Budget, "budget", plain(cfg.budget))
+    robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
-    identified, told = draw, told_of(cfg, robot)
-    if told:
-        draw = told_draw(cfg, robot, center, draw)
-    weights = called(Curriculum, "reward", plain(cfg.reward))
+    if not learns:
+        return Parts(robot, task, draw, episodes, make_controller(cfg, robot, task, center))
+    reward = part(cfg.reward, "reward")
     set_threads(cfg)
-    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True)
-    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads, seed=SELECTED)
-    torque = torch.from_numpy(task.share * task.torque(robot))
-    scale = observation_scale(robot, task, told)
-    given = (scale, torque, told) if told else (scale, torque)
-    algo = called(target(cfg.algo, "algo"), "algo", settings, *given)
-    many, on = evaluation.episodes, device(cfg)
-    return Parts(robot, center, task, identified, draw, told, weights, env, evaluate, algo, loop, budget, many, on)
+    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True, reward=reward)
+    evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)
+    action_scale = torch.from_numpy(task.control(robot).action_scale)
+    algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
+    return Parts(robot, task, draw, episodes, algo.to(device(cfg)), env, evaluate, loop, budget)
 
 
-def check(cfg):
-    """Raise UserError where stage=train would refuse this config before it makes a run folder."""
-    if is_taught(cfg):
-        make_lessons(cfg)
-    elif is_learner(cfg):
-        make_parts(cfg)
-    else:
-        make_reference(cfg)
+class Selection:
+    """The best and the last of a training's evaluations; of equal scores the later is better."""
+
+    def __init__(self, task):
+        self._task, self.best, self.last = task, {}, {}
+
+    def add(self, row):
+        """Add a row of evaluations.csv; return whether it is the best so far."""
+        self.last = row
+        better = not self.best or self._task.score(row) >= self._task.score(self.best)
+        self.best = row if better else self.best
+        return better
 
 
 def train(cfg, overrides):
-    """Train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
-    import copy
-
+    """Train one policy in simulation, evaluate it, and save it."""
     from r2s.learning.checkpoint import Checkpoint
-    from r2s.learning.evaluate import make_evaluation
-    from r2s.learning.policy import export_onnx, load_policy, save_policy
-    from r2s.learning.train import Listeners
+    from r2s.learning.policy import save_policy
+    from r2s.learning.train import Callbacks
     from r2s.learning.train import train as run_train
     from r2s.progress import Progress
-    from r2s.reporting import pages
-    from r2s.reporting.measures import in_short
-    from r2s.reporting.tables import reach_table
+    from r2s.tasks.measures import write_measures
 
-    if is_taught(cfg):
-        return teach(cfg, overrides, keep_calibration)
-    if not is_learner(cfg):
-        return reference(cfg, overrides)
-    made = make_parts(cfg)
-    robot, task, algo = made.robot, made.task, made.algo.to(made.device)
-    best: dict = {}
-    last: dict = {}
-
-    def is_best(row):
-        nonlocal best, last
-        last = row
-        better = not best or task.score(row) >= task.score(best)
-        best = row if better else best
-        return better
-
+    parts = make_parts(cfg)
+    if parts.env is None:
+        return evaluate_reference(cfg, overrides, parts)
+    algo, measures, selection = parts.algo, parts.task.measure_table, Selection(parts.task)
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         keep_calibration(cfg, run.folder)
+        write_measures(run.folder, measures)
         progress = Progress(f"train {cfg.algo.name}")
         checkpoint = Checkpoint(run.folder / "checkpoints")
         if cfg.resume:
             run.rewind("metrics", "env_steps", checkpoint.env_steps)
             for row in run.rewind("evaluations", "env_steps", checkpoint.env_steps):
-                is_best(row)
+                selection.add(row)
 
         def evaluated(row):
-            if is_best(run.log("evaluations", row)):
+            if selection.add(run.log("evaluations", row)):
                 save_policy(run.folder, copy.deepcopy(algo.policy).cpu())
 
         def show(share, row):
             text = f"{row['env_steps'] / 1e3:.0f}k env steps, {row['updates']} updates"
-            progress(share, ", ".join([text, *in_short(row)]))
+            progress(share, ", ".join([text, *measures.in_words(row)]))
 
+        callbacks = Callbacks(lambda row: run.log("metrics", row), evaluated, show)
+        dump = run.folder / "dump.pt"
         run_train(
-            made.env,
+            parts.env,
             algo,
-            made.evaluate,
-            made.weights,
-            made.loop,
-            made.budget,
+            parts.evaluate,
+            parts.loop,
+            parts.budget,
             checkpoint=checkpoint,
-            dump=run.folder / "dump.pt",
-            listeners=Listeners(lambda row: run.log("metrics", row), evaluated, show),
+            dump=dump,
+            callbacks=callbacks,
         )
         progress.close()
-        policy = load_policy(run.folder, robot, task)
-        export_onnx(run.folder / "policy.onnx", policy, robot, task)
-        judge = make_evaluation(robot, task, made.draw, episodes=made.episodes, nthread=cfg.threads)
-        judged = {"best": best | task.measures(judge(policy))}
-        judged["last"] = last | task.measures(judge(copy.deepcopy(algo.policy).cpu()))
-        more = {"best on the goals it was chosen on": best}
-        if made.told and made.told.latent:
-            arms = made.center, made.identified
-            more["student"] = teach_latent(cfg, run.folder, robot, task, *arms, policy)
+        conclude(cfg, run, parts, selection)
         checkpoint.clear()
-        run.summary(judged | more)
-        pages.training(run, robot)
-        reach_table(console(), judged, f"{title(cfg)}; on goals that nothing was chosen on")
     print(f"written: {run.folder}")
 
 
-def split(cfg):
-    """Return what conf/algo says of the environment, of the loop, and of the learner: arms, `Loop`, dict."""
+def conclude(cfg, run, parts, selection):
+    """Evaluate the best and the last policy on the goals of reports; write policy.onnx, summary.json and the page."""
+    from r2s.learning.evaluate import make_evaluation
+    from r2s.learning.policy import export_onnx, load_policy
+    from r2s.reporting import pages
+    from r2s.reporting.tables import print_measures
+
+    robot, task = parts.robot, parts.task
+    policy = load_policy(run.folder, robot, task)
+    export_onnx(run.folder / "policy.onnx", policy, robot, task)
+    evaluate = make_evaluation(robot, task, parts.draw, episodes=parts.episodes, nthread=cfg.threads)
+    rows = {"best": selection.best | task.measures(evaluate(policy))}
+    rows["last"] = selection.last | task.measures(evaluate(copy.deepcopy(parts.algo.policy).cpu()))
+    run.summary(rows | {"best on the selection goals": selection.best})
+    pages.training(run, robot)
+    print_measures(console(), task.measure_table, rows, f"{title(cfg)}; on goals without selection")
+
+
+def split_algo(cfg):
+    """Return number of arms, `Loop` and the learner's settings of conf/algo."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
     n_envs = settings.pop("n_envs", 32)
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
-    words = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
-    check_words(Loop, "algo", words)
-    words |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
-    return n_envs, Loop(**words), settings
+    loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
+    loop |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
+    return n_envs, Loop(**loop), settings
 
 
-def make_budget(cfg):
-    """Return when the training ends."""
-    from r2s.learning.train import Budget
-
-    return called(Budget, "budget", plain(cfg.budget))
-
-
-def own_model(cfg):
-    """Return the config that says what the arm is: of a training that goes on, with the calibration that it kept."""
+def with_own_calibration(cfg):
+    """Return the config with `calibration=` of a resumed training in its own folder: the original may be gone."""
     if not (cfg.calibration and cfg.resume and (Path(cfg.resume) / CALIBRATION[0]).is_file()):
         return cfg
     model = cfg.copy()
-    model.calibration = cfg.resume  # its first place may be gone
+    model.calibration = cfg.resume
     return model
 
 
 def keep_calibration(cfg, folder):
-    """Copy what was identified into the run folder: it transfers without the one that it came from."""
+    """Copy the identified parameters into the run folder, so that it transfers without its parent."""
     import shutil
 
-    from r2s.files import whole
+    from r2s.files import atomic_write
 
     if not cfg.calibration or (folder / CALIBRATION[0]).is_file():
         return
     source = Path(cfg.calibration)
-    for name in reversed(CALIBRATION):  # where the first is, all are
+    for name in reversed(CALIBRATION):  # `with_own_calibration` looks for the first, so that is written last
         path = source / name if source.is_dir() else source.with_name(name)
         path = source if name == CALIBRATION[0] and not source.is_dir() else path
         if path.is_file():
-            with whole(folder / name) as part:
+            with atomic_write(folder / name) as part:
                 shutil.copyfile(path, part)
 
 
 def title(cfg):
-    """Return what the table of a training says above it."""
+    """Return the title of a training's table."""
     spread = ", ".join(f"{k} {v}" for k, v in plain(cfg.dr).items() if k != "_target_" and v is not None)
     return f"{cfg.algo.name} in MuJoCo, dr: {spread}"
 
 
-def make_reference(cfg):
-    """Return robot, task, controller, and how it is evaluated: of an algo that is not trained."""
+def evaluate_reference(cfg, overrides, parts):
+    """Evaluate an algo without training in the same way as a trained policy."""
     from r2s.learning.evaluate import make_evaluation
-
-    evaluation = called(Evaluation, "evaluation", plain(cfg.evaluation))
-    robot = make_robot(cfg)
-    center = make_dynamics(cfg, robot)
-    task, draw = make_task(cfg, robot, center), make_draw(cfg, robot, center)
-    controller = make_controller(cfg, robot, task, center)
-    evaluate = make_evaluation(robot, task, draw, episodes=evaluation.episodes, nthread=cfg.threads)
-    return robot, task, controller, evaluate
-
-
-def reference(cfg, overrides):
-    """Evaluate the model-based controller, which is not trained, as a training is evaluated."""
     from r2s.reporting import pages
-    from r2s.reporting.tables import reach_table
+    from r2s.reporting.tables import print_measures
+    from r2s.tasks.measures import write_measures
 
-    name, (robot, task, controller, evaluate) = cfg.algo.name, make_reference(cfg)
+    robot, task, name = parts.robot, parts.task, cfg.algo.name
+    evaluate = make_evaluation(robot, task, parts.draw, episodes=parts.episodes, nthread=cfg.threads)
     with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
         keep_calibration(cfg, run.folder)
-        done = evaluate(controller)
+        write_measures(run.folder, task.measure_table)
+        done = evaluate(parts.algo)
         row = {"env_steps": 0, "updates": 0, "wall_clock_s": 0.0} | task.measures(done)
         run.log("evaluations", row)
         run.summary({"best": row, "last": row})
-        pages.transfer(run, robot, {name: done}, {name: row}, task.torque(robot))
-        reach_table(console(), {name: row}, title(cfg))
+        pages.transfer(run, robot, {name: done}, {name: row}, task.torque_limit(robot))
+        print_measures(console(), task.measure_table, {name: row}, title(cfg))
     print(f"written: {run.folder}")

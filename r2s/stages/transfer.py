@@ -1,16 +1,16 @@
-"""stage=transfer: the same policy and goals in simulators and on an arm."""
+"""stage=transfer: the same policy on the same goals in simulators and on an arm."""
 
 import os
 import shutil
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.progress import Progress
-from r2s.stages.adapting import is_told, make_adapter, trained_minutes
+from r2s.stages.adapter_factory import make_adapter
 from r2s.stages.build import (
     console,
     is_learner,
@@ -23,32 +23,26 @@ from r2s.stages.build import (
     make_task,
     open_run,
     opened_arm,
-    opened_arms,
-    part,
+    opened_runner,
     set_threads,
 )
+from r2s.stages.parts import part
 
-RESTLESS = 0.05  # of the episodes: this many more than predicted that do not end at rest are told
-FROM_POLICY = "it comes from the policy's run"
-WHY = {k: FROM_POLICY for k in ("robot", "friction", "inertia", "calibration", "dr", "task", "algo", "reward")}
+REST_GAP = 0.05  # share of the episodes; a larger gap in `rest` between prediction and arm raises a warning
+FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward")
+WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
 
 
-def some(episodes, which):
-    """Return those of these episodes that `which` (., ) numbers."""
-    of_each = {f.name for f in fields(episodes)} - {"t"}
-    return replace(episodes, **{name: getattr(episodes, name)[which] for name in of_each})
-
-
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
+    """Return the config keys of this stage."""
     return {"policy", "simulator", "arm", "adapt", "evaluation.episodes"}
 
 
-def trained_config(cfg, what="policy"):
-    """Return the run folder of `policy=` and the config that it was made with; `what` names it in an error.
+def trained_config(cfg, option="policy"):
+    """Return the run folder of `policy=` and its config; `option` names it in errors.
 
-    What it was calibrated with lies in that folder too, so that it needs no other.
+    The folder also holds the calibration of the training, so it needs no other folder.
 
     Raises:
         UserError: it is no finished training.
@@ -57,23 +51,23 @@ def trained_config(cfg, what="policy"):
     if source is None or not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
         names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
         near = nearest(source.name, names) if source else ""
-        raise UserError(f"{what}: '{cfg.policy}' is no finished run folder of stage=train{near}")
+        raise UserError(f"{option}: '{cfg.policy}' is no finished run folder of stage=train{near}")
     trained = loaded(source / "config.yaml")
     if trained.stage != "train":
-        raise UserError(f"{what}: {source} is a run of stage={trained.stage}; allowed: train")
+        raise UserError(f"{option}: expected a run of stage=train, got stage={trained.stage} ({source})")
     if trained.calibration:
         trained.calibration = str(source)
     return source, trained
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is taken where: one policy, on the same goals everywhere.
+class Request:
+    """A policy and the episodes that it runs everywhere.
 
     Attributes:
-        robot, task, center: the arm and task of its training, and the centre of the arms that it was trained on.
-        source: its run folder. policy: it, or a controller. starts, goals: of all episodes.
-        draw: the arms of its training; None where nothing is asked of a simulator. fade: s, `arm.soft_start_s`.
+        robot, task, center: of the training; center of its randomization.
+        source: run folder of the policy. policy: trained, or a controller. starts, goals: of all episodes.
+        draw: randomization of the training; None with simulator=none. soft_start_s: s, of the arm.
     """
 
     robot: Any
@@ -84,17 +78,17 @@ class Asked:
     starts: Any
     goals: Any
     draw: Any
-    fade: float
+    soft_start_s: float
 
 
-def asked_for(cfg):
-    """Return what a transfer is asked for, checked: an arm is not moved before every start is known to be reached.
+def make_request(cfg):
+    """Return the request, after a check that a safe path leads to every start.
 
     Raises:
-        UserError: no finished training, nowhere to go, or a start that no safe way leads to.
+        UserError: no finished training, neither simulator nor arm, or a start without a safe path.
     """
+    from r2s.excitation.motion_checks import Space
     from r2s.excitation.paths import approach
-    from r2s.excitation.safety import Space
     from r2s.learning.evaluate import fixed_episodes
     from r2s.learning.policy import load_policy
 
@@ -108,162 +102,182 @@ def asked_for(cfg):
     policy = load_policy(source, robot, task) if learned else make_controller(trained, robot, task, center)
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
-        raise UserError("simulator=none and arm=none leave nothing to do; allowed is one of both")
+        raise UserError("simulator: expected a simulator or an arm, got simulator=none and arm=none")
     if cfg.arm.name != "none":
         space = Space(robot)
         for k, start in enumerate(starts, 1):
             approach(robot, robot.q_home, start, what=f"the start of episode {k}", space=space)
-    fade = cfg.arm.get("soft_start_s", 0.0)
-    check_number("arm.soft_start_s", fade, "[0, inf)")
+    soft_start_s = cfg.arm.get("soft_start_s", 0.0)
+    check_number("arm.soft_start_s", soft_start_s, "[0, inf)")
     draw = make_draw(trained, robot, center) if cfg.simulator.name != "none" else None
-    return Asked(robot, task, center, source, policy, starts, goals, draw, fade)
+    return Request(robot, task, center, source, policy, starts, goals, draw, soft_start_s)
 
 
 @contextmanager
-def counted(what):
-    """Show how many goals are done while it is open."""
-    progress = Progress(what)
+def goal_progress(label):
+    """Yield a callback (goals done, total) that shows progress."""
+    progress = Progress(label)
     yield lambda k, n: progress(k / n, f"{k} goals")
     progress.close()
 
 
-def in_simulators(cfg, asked, engine):
-    """Return {name: measures} and {name: Episodes} of MuJoCo and, where there is an engine, of that beside it."""
+def run_in_simulators(cfg, request, engine):
+    """Return {name: measures} and {name: Episodes} of MuJoCo and of the second engine, if any."""
     from r2s.engines.episodes import EngineArms
     from r2s.learning.evaluate import make_evaluation
-    from r2s.tasks.episode import gap, rollout
+    from r2s.tasks.rollout import gap, rollout
 
-    robot, task, count = asked.robot, asked.task, len(asked.goals)
-    first = make_evaluation(robot, task, asked.draw, episodes=count, nthread=cfg.threads)(asked.policy)
+    robot, task, count = request.robot, request.task, len(request.goals)
+    first = make_evaluation(robot, task, request.draw, episodes=count, nthread=cfg.threads)(request.policy)
     rows, episodes = {"mujoco": task.measures(first)}, {"mujoco": first}
     if engine is not None:
-        with counted(f"in {cfg.simulator.name}") as shown:
-            arms = EngineArms(engine, robot, task, asked.draw, count)
-            done = rollout(asked.policy, arms, task, asked.starts, asked.goals, shown)
+        with goal_progress(f"in {cfg.simulator.name}") as progress:
+            arms = EngineArms(engine, robot, task, request.draw, count)
+            done = rollout(request.policy, arms, task, request.starts, request.goals, progress)
         rows[cfg.simulator.name] = task.measures(done) | gap(done, first)
         episodes[cfg.simulator.name] = done
     return rows, episodes
 
 
 @dataclass(frozen=True)
-class OnArm:
-    """What came of the episodes on an arm.
+class ArmResult:
+    """Result of the episodes on an arm.
 
     Attributes:
-        tried: (k,) numbers of the goals that were begun. episodes: theirs; None where there are none.
-        stops: what ended episodes. timing: of the cycles, None where nothing is known of it.
-        halted: why no more was done; None where all was.
+        tried: (k,) numbers of the goals that began. episodes: (k) of them, None without any.
+        stops: reasons why episodes ended early. timing: of the 1 kHz cycles, None if unknown.
+        halted: reason why the remaining goals did not run; None: all ran.
     """
 
-    tried: Any
-    episodes: Any
-    stops: list
-    timing: Any
-    halted: Any
+    tried: Any = ()
+    episodes: Any = None
+    stops: Any = ()
+    timing: Any = None
+    halted: Any = None
 
 
-def on_arm(cfg, asked, driven, predicted):
-    """Return what an arm did with the goals at which it is predicted to touch nothing."""
+def run_on_arm(cfg, request, runner, predicted):
+    """Return the result of the goals for which the prediction has no contact."""
     import numpy as np
 
-    from r2s.tasks.episode import rollout
+    from r2s.tasks.rollout import rollout, select_episodes
 
     tried = np.flatnonzero(predicted.collision == "")
-    for e, what in enumerate(predicted.collision, 1):
-        if what:
-            print(f"episode {e} is left out: the arm would touch something, {what}")
+    for e, contact in enumerate(predicted.collision, 1):
+        if contact:
+            print(f"episode {e} is skipped: predicted contact, {contact}")
     if not len(tried):
-        return OnArm(tried, None, [], None, None)
-    with counted(f"on {cfg.arm.name}") as shown:
-        done = rollout(asked.policy, driven, asked.task, asked.starts[tried], asked.goals[tried], shown)
-    stops = [replace(stop, episode=int(tried[stop.episode])) for stop in driven.stops]
-    tried = tried[: driven.done]  # what was not done is no failure
-    return OnArm(tried, some(done, slice(len(tried))), stops, driven.timing, driven.halted)
+        return ArmResult(tried)
+    with goal_progress(f"on {cfg.arm.name}") as progress:
+        done = rollout(request.policy, runner, request.task, request.starts[tried], request.goals[tried], progress)
+    stops = [replace(stop, episode=int(tried[stop.episode])) for stop in runner.stops]
+    tried = tried[: runner.done]  # goals that did not begin are no failures
+    return ArmResult(tried, select_episodes(done, slice(len(tried))), stops, runner.timing, runner.halted)
 
 
-def on_twin(cfg, asked, opens):
-    """Return what twins of the same arm, one in each process, did with the goals."""
+def run_on_twins(cfg, request, open_runner):
+    """Return the result of copies of one twin in parallel processes."""
     import numpy as np
 
-    from r2s.arm.spread import spread
+    from r2s.arm.parallel_episodes import run_parallel_episodes
 
-    with counted(f"on {cfg.arm.name}") as shown:
+    with goal_progress(f"on {cfg.arm.name}") as progress:
         workers = cfg.threads or os.cpu_count() or 1
-        done, stops, timing = spread(opens, asked.policy, asked.task, asked.starts, asked.goals, workers, shown)
-    return OnArm(np.arange(len(asked.goals)), done, stops, timing, None)
+        done, stops, timing = run_parallel_episodes(
+            open_runner, request.policy, request.task, request.starts, request.goals, workers, progress
+        )
+    return ArmResult(np.arange(len(request.goals)), done, stops, timing)
 
 
-def restless(rows, name):
-    """Return a line where a policy rests less on an arm than was predicted; else None.
+def predict(cfg, request, robot):
+    """Return the episodes that the model of the training predicts for the arm."""
+    from r2s.learning.vector_arms import VectorArms
+    from r2s.tasks.rollout import rollout
 
-    Success and path gap do not see a policy that shakes: the hand hardly moves (docs/transfer.md).
+    task, goals = request.task, request.goals
+    model = VectorArms(robot, task, request.center, len(goals), cfg.threads, request.soft_start_s)
+    return rollout(request.policy, model, task, request.starts, goals)
+
+
+def save_arm_result(run, request, name, result, predicted):
+    """Write stops.txt, timing.csv and a row per episode to episodes_<arm>.csv; return the measures of the arm.
+
+    predicted: episodes to compare with, or None.
+    """
+    import pandas as pd
+
+    from r2s.tasks.rollout import episode_measures, gap, select_episodes
+
+    task = request.task
+    row = {"stops": len(result.stops), "episodes": len(result.tried), "asked": len(request.goals)}
+    if len(result.tried):
+        expected = None if predicted is None else select_episodes(predicted, result.tried)
+        row = task.measures(result.episodes) | row | (gap(result.episodes, expected) if expected else {})
+        measures = pd.DataFrame(episode_measures(task, result.episodes, expected))
+        measures.to_csv(run.folder / f"episodes_{name}.csv", index=False)
+    for line in result.timing.table() if result.timing else []:
+        run.log("timing", line)
+    (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in result.stops) or "none\n")
+    return row
+
+
+def rest_warning(rows, name):
+    """Return a warning if a policy rests less on an arm than predicted, else None.
+
+    Success and path gap do not show a shaking policy, because its end effector hardly moves
+    (benchmarks/results/transfer.md).
     """
     seen, expected = (rows.get(k, {}).get("rest") for k in (name, "predicted"))
-    if seen is None or expected is None or seen >= expected - RESTLESS:
+    if seen is None or expected is None or seen >= expected - REST_GAP:
         return None
     return (
-        f"warning: {100 * (1 - seen):.0f} % of the episodes on arm={name} end with a joint that still moves, "
-        f"{100 * (1 - expected):.0f} % were predicted: the policy creeps or shakes there. Look at its torques first"
+        f"warning: {100 * (1 - seen):.0f} % of the episodes on arm={name} end with a moving joint, "
+        f"{100 * (1 - expected):.0f} % were predicted: the policy creeps or shakes. Check its torques first"
     )
 
 
 def transfer(cfg, overrides):
-    """Evaluate a trained policy in simulators and on an arm, on the same goals; adapters act on the arm alone."""
-    from r2s.learning.batch import ArmBatch
+    """Evaluate a trained policy in simulators and on an arm, on the same goals; adapters act on the arm only."""
     from r2s.reporting import pages
-    from r2s.reporting.tables import reach_table
-    from r2s.tasks.episode import gap, rollout
+    from r2s.reporting.tables import print_measures
+    from r2s.tasks.measures import write_measures
 
-    asked = asked_for(cfg)
-    robot, task, goals, name = asked.robot, asked.task, asked.goals, cfg.arm.name
-    adapter = make_adapter(cfg, robot, asked.source)
-    if is_told(cfg) and asked.policy.told and asked.policy.told.latent:
-        asked = replace(asked, policy=asked.policy.by_latent())
+    request = make_request(cfg)
+    robot, task, goals, name = request.robot, request.task, request.goals, cfg.arm.name
+    adapter = make_adapter(cfg, robot, request.source)
     engine = part(cfg.simulator, "simulator", robot) if "_target_" in cfg.simulator else None
     if twin := is_twin(cfg):
         with opened_arm(cfg, robot):
-            pass  # what is wrong with it is said before there is a run folder
-    opens = partial(opened_arms, cfg, robot, task, asked.center, adapter=adapter)
-    opened = nullcontext() if name == "none" or twin else opens()
-    rows: dict = {}
-    episodes: dict = {}
-    there = OnArm([], None, [], None, None)
-    with opened as driven, open_run(cfg, overrides, parents=[str(asked.source)]) as run:
-        shutil.copyfile(asked.source / "config.yaml", run.folder / "policy.yaml")
-        if twin:  # first: it forks, and then there are no threads yet
-            there = on_twin(cfg, asked, opens)
-        if asked.draw is not None:
-            rows, episodes = in_simulators(cfg, asked, engine)
-        if name != "none" and (asked.draw is not None or driven):  # what the model says of this arm
-            model = ArmBatch(
-                driven.robot if driven else robot, task, asked.center, len(goals), cfg.threads, asked.fade
-            )
-            predicted = rollout(asked.policy, model, task, asked.starts, goals)
-            if asked.draw is not None:
-                rows["predicted"], episodes["predicted"] = task.measures(predicted) | {"stops": 0}, predicted
-            if driven:
-                there = on_arm(cfg, asked, driven, predicted)
+            pass  # a wrong setting of the twin raises before there is a run folder
+    open_runner = partial(opened_runner, cfg, robot, task, request.center, adapter=adapter)
+    opened = nullcontext() if name == "none" or twin else open_runner()
+    rows, episodes, predicted, result = {}, {}, None, ArmResult()
+    with opened as runner, open_run(cfg, overrides, parents=[str(request.source)]) as run:
+        shutil.copyfile(request.source / "config.yaml", run.folder / "policy.yaml")
+        write_measures(run.folder, task.measure_table)
+        if twin:  # first, because it forks: there are no threads yet
+            result = run_on_twins(cfg, request, open_runner)
+        if request.draw is not None:
+            rows, episodes = run_in_simulators(cfg, request, engine)
+        if name != "none" and (request.draw is not None or runner):
+            predicted = predict(cfg, request, runner.robot if runner else robot)
+        if runner:
+            result = run_on_arm(cfg, request, runner, predicted)
+        if request.draw is None:
+            predicted = None  # it served the check for contacts only
+        if predicted is not None:
+            rows["predicted"], episodes["predicted"] = task.measures(predicted) | {"stops": 0}, predicted
         if name != "none":
-            row: dict = {"stops": len(there.stops), "episodes": len(there.tried), "asked": len(goals)}
-            if adapter is not None:
-                row["adapter_minutes"] = trained_minutes(cfg, asked.source)
-            if len(there.tried):
-                row = task.measures(there.episodes) | row
-                episodes[name] = there.episodes
-                if "predicted" in rows:
-                    row |= gap(there.episodes, some(predicted, there.tried))
-            rows[name] = row
-            for line in there.timing.table() if there.timing else []:
-                run.log("timing", line)
-            (run.folder / "stops.txt").write_text("".join(f"{stop}\n" for stop in there.stops) or "none\n")
+            rows[name] = save_arm_result(run, request, name, result, predicted)
+            episodes |= {name: result.episodes} if len(result.tried) else {}
         run.summary(rows)
         if episodes:
-            limits = task.torque(robot)
-            pages.transfer(run, robot, episodes, rows, limits, there.timing, there.stops, there.halted)
-        reach_table(console(), rows, f"{asked.source.name} on {len(goals)} goals")
-        if warning := restless(rows, name):
+            limits = task.torque_limit(robot)
+            pages.transfer(run, robot, episodes, rows, limits, result.timing, result.stops, result.halted)
+        print_measures(console(), task.measure_table, rows, f"{request.source.name} on {len(goals)} goals")
+        if warning := rest_warning(rows, name):
             print(warning)
-        if there.halted is not None:
-            count = rows[name]["episodes"]
-            raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {there.halted}; see {run.folder}")
+        if result.halted is not None:
+            count = len(result.tried)
+            raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {result.halted}; see {run.folder}")
     print(f"written: {run.folder}")

@@ -1,30 +1,31 @@
-"""stage=tune: look for settings of a training; each trial is a run of stage=train in a folder of its own."""
+"""stage=tune: search the settings of a training with Optuna; each trial is a run folder of stage=train."""
 
+import csv
 import os
 import re
 import signal
 import subprocess
-import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from glob import glob
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.stages import train
-from r2s.stages.build import called, console, open_run, plain, unread
-from r2s.stages.pipeline import composed, front_door, handed_on
+from r2s.stages.build import console, make_dynamics, make_robot, make_task, open_run, unread
+from r2s.stages.parts import called, plain
+from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
-MEASURES = {"return_paper": "maximize", "success_1cm": "maximize", "success_5mm": "maximize"}
-MEASURES |= {"distance_median_m": "minimize", "path_rmse_mm": "minimize", "within_5mm": "maximize"}
-PATIENCE = 3  # times that a training is begun which the system ended
+MOST_STARTS = 3  # of a training that the system ends, for example because memory is short
+POLL_S = 0.2
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage or its trainings read."""
+    """Return the config keys of this stage and its trainings."""
     return {"tune", *train.reads(cfg)}
 
 
@@ -33,14 +34,14 @@ class Tune:
     """`tune` of the config.
 
     Attributes:
-        trials: in all. workers: trainings at once, of one thread each; None: as many as threads=.
-        startup: trials drawn at random before any is modelled or pruned.
-        measure: of the last evaluation, what is looked for.
-        space: {option: [values], or the text that `span` reads}.
-        against: glob of trainings to be compared with, such as those of a grid.
+        trials: total number. workers: parallel trainings of one thread each; None: as threads=.
+        startup: random trials before TPE and the pruner start.
+        measure: of the last evaluation, a measure of the task.
+        space: {option: [values], or a range that `parse_range` reads}.
+        against: glob of trainings to compare with, for example of a grid.
 
     Raises:
-        UserError: a number outside its range, a space that is none, or a glob that finds nothing.
+        UserError: a number out of its range, an invalid space, or a glob without a match.
     """
 
     trials: int
@@ -55,30 +56,22 @@ class Tune:
         check_number("tune.startup", self.startup, "[1, inf)", whole=True)
         if self.workers is not None:
             check_number("tune.workers", self.workers, "[1, inf)", whole=True)
-        if self.measure not in MEASURES:
-            raise UserError(
-                f"tune.measure: '{self.measure}' is not allowed; {choices(MEASURES)} are"
-                f"{nearest(str(self.measure), MEASURES)}"
-            )
         if self.against is not None and not (isinstance(self.against, str) and glob(self.against)):
-            raise UserError(
-                f"tune.against: {self.against!r} finds nothing; run folders of stage=train are allowed, such as "
-                "'runs/train/grid_*'"
-            )
+            raise UserError(f"tune.against: {self.against!r} matches no folder; example: 'runs/train/grid_*'")
         if not isinstance(self.space, Mapping) or not self.space:
-            raise UserError(f"tune.space: {self.space!r} is no space; {{option: [values] or log(low, high)}} is")
+            raise UserError(f"tune.space: expected {{option: [values] or log(low, high)}}, got {self.space!r}")
         for key, axis in self.space.items():
             if not isinstance(axis, list):
-                span(key, axis)
+                parse_range(key, axis)
             elif not axis or any(isinstance(value, list | dict) for value in axis):
-                raise UserError(f"tune.space.{key}: {axis} is not allowed; [values] are, as in [128, 256]")
+                raise UserError(f"tune.space.{key}: expected a list of values such as [128, 256], got {axis}")
 
 
-def span(key: str, axis: Any) -> tuple[float, float, bool]:
-    """Return (low, high, logarithmic) of an axis as it is typed: "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
+def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
+    """Return (low, high, logarithmic) of an axis "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
 
     Raises:
-        UserError: it is no such text.
+        UserError: it is neither.
     """
     found = re.fullmatch(r"(log|interval)\(([^,]+),([^,]+)\)", str(axis).replace(" ", ""))
     try:
@@ -86,213 +79,216 @@ def span(key: str, axis: Any) -> tuple[float, float, bool]:
             raise ValueError
         low, high, log = float(found[2]), float(found[3]), found[1] == "log"
     except ValueError:
-        allowed = "[values], log(low, high) and interval(low, high) are"
-        raise UserError(f"tune.space.{key}: {axis!r} is not allowed; {allowed}") from None
+        allowed = "[values], log(low, high) or interval(low, high)"
+        raise UserError(f"tune.space.{key}: expected {allowed}, got {axis!r}") from None
     check_number(f"tune.space.{key}", low, "(0, inf)" if log else "(-inf, inf)")
     check_number(f"tune.space.{key}", high, f"({low}, inf)")
     return low, high, log
 
 
-def suggested(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a trial: {option: value}."""
+def suggest(trial: Any, space: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings {option: value} of an Optuna trial."""
     out = {}
     for key, axis in space.items():
         if isinstance(axis, list):
             out[key] = trial.suggest_categorical(key, axis)
         else:
-            low, high, log = span(key, axis)
+            low, high, log = parse_range(key, axis)
             out[key] = float(f"{trial.suggest_float(key, low, high, log=log):.4g}")
     return out
 
 
 def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return settings that hold every value of each axis, and both ends of an interval, at least once."""
-    values = {key: axis if isinstance(axis, list) else [*span(key, axis)[:2]] for key, axis in space.items()}
+    """Return settings that contain every listed value and both ends of every range at least once."""
+    values = {key: axis if isinstance(axis, list) else [*parse_range(key, axis)[:2]] for key, axis in space.items()}
     first = {key: own[0] for key, own in values.items()}
     return [first, *({**first, key: value} for key, own in values.items() for value in own[1:])]
 
 
-def check_trainings(cfg, overrides, space):
-    """Raise UserError where a training would refuse what was typed, or an axis of the space."""
-    typed = {o.lstrip("+~").split("=")[0] for o in overrides}
-    if both := sorted(typed & set(space)):
-        raise UserError(
-            f"{both[0]}: tune.space looks for it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}"
-        )
-    for settings in corners(space):
-        step = composed(handed(cfg, overrides, settings), "tune.space")
-        for key in space:
-            if why := unread(key, step):
-                raise UserError(f"tune.space: {why}")
-        train.check(step)
-
-
-class Training:
-    """One trial: a training that runs beside this process, and what its evaluations said."""
-
-    def __init__(self, trial: Any, folder: Path, words: Sequence[str]):
-        self.trial, self.folder, self.words = trial, folder, list(words)
-        self.begun, self.told = 0, set(trial.study.trials[trial.number].intermediate_values)
-        self.begin()
-
-    def begin(self) -> None:
-        """Start it, or let it go on; a process of an earlier, killed tune may still be at it."""
-        from r2s.runs import is_done
-
-        while (self.folder / "meta.json").is_file():
-            try:
-                is_done(self.folder)
-                break
-            except UserError:
-                time.sleep(1.0)
-        self.begun += 1
-        # a file without a name: into one that has it, a training that a killed tune left running would write too
-        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed in `ended`)
-        self.process = subprocess.Popen(self.words, stdout=subprocess.DEVNULL, stderr=self.log)
-
-    def rows(self) -> list[dict[str, float]]:
-        """Return its evaluations so far."""
-        import pandas as pd
-
-        path = self.folder / "evaluations.csv"
-        try:
-            text = path.read_text()
-        except OSError:
-            return []
-        from io import StringIO
-
-        whole = text[: text.rfind("\n") + 1]  # the last row may be on its way
-        return [] if not whole else pd.read_csv(StringIO(whole)).to_dict("records")  # type: ignore[return-value]
-
-    def ended(self) -> str:
-        """Return the last line that it said."""
-        self.log.seek(0)
-        lines = [line.strip() for line in self.log if line.strip()]
-        self.log.close()
-        return lines[-1] if lines else "no output"
-
-    def stop(self) -> None:
-        """End it as Ctrl-C does: its folder says that it was stopped."""
-        self.process.send_signal(signal.SIGINT)
-        self.process.wait()
-        self.ended()
-
-
-def tune(cfg, overrides):
-    """Ask for settings, train with them, tell what came of it; prune by evaluations; report the best."""
-    try:
-        import optuna
-    except ImportError:
-        raise UserError("stage=tune needs optuna, which is not installed: pip install 'r2s[tune]'") from None
-    from r2s.progress import Progress
-    from r2s.reporting.tuning import against_table, trials_table, tuning_page
-
-    given = {k: v for k, v in plain(cfg.tune).items() if k in {f.name for f in fields(Tune)}}
-    how = called(Tune, "tune", given)
-    check_trainings(cfg, overrides, how.space)
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    with open_run(cfg, overrides) as run:
-        study = optuna.create_study(
-            study_name="tune",
-            storage=f"sqlite:///{run.folder / 'study.db'}",
-            sampler=None,
-            direction=MEASURES[how.measure],  # type: ignore[arg-type]
-            load_if_exists=True,
-        )
-        # what was drawn is in the storage; the stream of a tune that goes on is another one
-        seed = cfg.seed + 1000 * len(study.trials)
-        study.sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=how.startup)
-        study.pruner = optuna.pruners.MedianPruner(n_startup_trials=how.startup, n_warmup_steps=1)
-        search(study, how, lambda trial: training(cfg, overrides, run, trial, how.space), Progress("tune"), cfg)
-        trials = trials_table(study, run.folder)
-        trials.to_csv(run.folder / "trials.csv", index=False)
-        against = against_table(trials, how.measure, how.against, MEASURES[how.measure] == "maximize")
-        done = trials[trials["state"] == "complete"]
-        if done.empty:
-            raise UserError(f"tune: none of {len(trials)} trials came to its end")
-        order = done["value"] if MEASURES[how.measure] == "maximize" else -done["value"]
-        best = done.sort_values("value", key=lambda _: order).iloc[-1]
-        run.summary({"best": best.to_dict(), "trials": trials["state"].value_counts().to_dict()})
-        tuning_page(run, trials, against, how.measure)
-    out = console()
-    words = " ".join(f"{k}={best[k]}" for k in how.space if k in best.index)
-    out.print(f"best of {len(trials)} trials: {how.measure} {best['value']:.4g} with {words}", highlight=False)
-    print(f"written: {run.folder} (look: {run.folder / 'report.md'})")
-
-
-def handed(cfg, overrides, settings):
-    """Return the words of a training: what was typed and it reads, and the settings {option: value}."""
+def training_words(cfg, overrides, settings):
+    """Return the words of a training: the typed overrides that it reads, and the settings {option: value}."""
     step = cfg.copy()
     step.stage = "train"
-    typed = [o for o in handed_on(overrides, step) if not o.startswith(("resume=", "only_missing="))]
+    typed = [o for o in overrides_for(overrides, step) if not o.startswith(("resume=", "skip_completed="))]
     return [*typed, *(f"{k}={v}" for k, v in settings.items()), "stage=train", "threads=1"]
 
 
-def training(cfg, overrides, run, trial, space):
-    """Return the started training of a trial."""
-    name = f"{run.folder.name}_{trial.number}"
-    words = handed(cfg, overrides, suggested(trial, space))
-    folder = Path(cfg.root) / "train" / name
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    return Training(trial, folder, [*front_door(), *words, f"root={cfg.root}", f"name={name}", "only_missing=true"])
+def check_trainings(cfg, overrides, space):
+    """Raise UserError if a training would refuse an override or an axis of the space."""
+    typed = {o.lstrip("+~").split("=")[0] for o in overrides}
+    if both := sorted(typed & set(space)):
+        raise UserError(f"{both[0]}: tune.space searches it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}")
+    for settings in corners(space):
+        step = compose_step(training_words(cfg, overrides, settings), "tune.space")
+        for key in space:
+            if why := unread(key, step):
+                raise UserError(f"tune.space: {why}")
+        train.make_parts(step)
 
 
-def search(study, how, start, progress, cfg):
-    """Run trials side by side until there are `how.trials`; those that were running before go on first."""
+class TrialRun:
+    """The training of an Optuna trial: a run folder of stage=train, and the process that writes it.
+
+    A training that a killed tune left running may still write its folder; then there is no process to start.
+
+    Args:
+        trial: of Optuna. folder: run folder. words: command of the training. log: file for its stderr.
+    """
+
+    def __init__(self, trial: Any, folder: Path, words: Sequence[str], log: Path):
+        self.trial, self.folder, self.log = trial, folder, log
+        self._words, self.starts = list(words), 0
+        self._process: subprocess.Popen | None = None
+        self._reported = len(trial.study.trials[trial.number].intermediate_values)
+
+    def start(self) -> None:
+        """Start the training, or resume it."""
+        self.starts += 1
+        self.log.parent.mkdir(exist_ok=True)
+        with open(self.log, "a") as log:
+            self._process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=log)
+
+    def stop(self) -> None:
+        """End the training as Ctrl-C does, so that its folder has the status stopped."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGINT)
+            self._process.wait()
+
+    def status(self) -> str:
+        """Return started (by this tune, running), left (by another, running), or the status of the run folder."""
+        from r2s.runs import is_locked, read_meta
+
+        if self._process is not None and self._process.poll() is None:
+            return "started"
+        if not (self.folder / "meta.json").is_file():
+            return "none"
+        return "left" if is_locked(self.folder) else read_meta(self.folder)["status"]
+
+    def report(self, measure: str) -> list[float]:
+        """Report new evaluations to Optuna; return the measure of all."""
+        path = self.folder / "evaluations.csv"
+        text = path.read_text() if path.is_file() else ""
+        complete = text[: text.rfind("\n") + 1]  # the training may be writing the last row
+        values = [float(row[measure]) for row in csv.DictReader(complete.splitlines())]
+        for k in range(self._reported, len(values)):
+            self.trial.report(values[k], k)
+        self._reported = max(self._reported, len(values))
+        return values
+
+
+def follow(study: Any, one: TrialRun, measure: str) -> bool:
+    """Report evaluations, start the training if necessary, and prune it; return whether the trial is finished.
+
+    Raises:
+        UserError: the training failed before its first evaluation, or ended MOST_STARTS times.
+    """
     import optuna
 
-    states = optuna.trial.TrialState
-    left = [optuna.trial.Trial(study, t._trial_id) for t in study.get_trials(states=[states.RUNNING])]
-    running: list[Training] = []
-    workers = how.workers or cfg.threads or os.cpu_count() or 1
+    from r2s.runs import read_meta
+
+    status, values = one.status(), one.report(measure)
+    if status == "left" or (status == "started" and not one.trial.should_prune()):
+        return False
+    if status == "started":
+        one.stop()
+        study.tell(one.trial, state=optuna.trial.TrialState.PRUNED)
+    elif status == "done":
+        study.tell(one.trial, values[-1])
+    elif status == "failed":  # for example a loss that is not finite
+        study.tell(one.trial, state=optuna.trial.TrialState.FAIL)
+        if not values:
+            raise UserError(f"tune: training {one.folder.name} failed: {read_meta(one.folder).get('error')}")
+    elif one.starts < MOST_STARTS:
+        one.start()
+        return False
+    else:
+        study.tell(one.trial, state=optuna.trial.TrialState.FAIL)
+        raise UserError(f"tune: training {one.folder.name} ended {one.starts} times before its end; see {one.log}")
+    return True
+
+
+def search(study: Any, how: Tune, make: Callable[[Any], TrialRun], workers: int) -> None:
+    """Run trials in parallel until there are `how.trials`; unfinished trials of a stopped search come first."""
+    import optuna
+
+    from r2s.progress import Progress
+
+    states, progress = optuna.trial.TrialState, Progress("tune")
+    unfinished = [optuna.trial.Trial(study, t._trial_id) for t in study.get_trials(states=[states.RUNNING])]
+    running: list[TrialRun] = []
     try:
         while True:
-            while len(running) < workers and (left or len(study.trials) < how.trials):
-                running.append(start(left.pop(0) if left else study.ask()))
+            while len(running) < workers and (unfinished or len(study.trials) < how.trials):
+                running.append(make(unfinished.pop(0) if unfinished else study.ask()))
             if not running:
                 break
-            time.sleep(0.2)
             for one in list(running):
-                if followed(study, one, how.measure):
+                if follow(study, one, how.measure):
                     running.remove(one)
             finished = sum(t.state.is_finished() for t in study.get_trials(deepcopy=False))
-            ended = study.get_trials(deepcopy=False, states=[states.COMPLETE])
-            best = f", best {how.measure} {study.best_value:.4g}" if ended else ""
+            complete = study.get_trials(deepcopy=False, states=[states.COMPLETE])
+            best = f", best {how.measure} {study.best_value:.4g}" if complete else ""
             progress(finished / how.trials, f"{finished} of {how.trials} trials{best}")
+            time.sleep(POLL_S)
     finally:
         for one in running:
             one.stop()
     progress.close()
 
 
-def followed(study, one, measure):
-    """Report a training's evaluations; return whether it has ended, by itself or pruned."""
+def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize", "maximize"]) -> Any:
+    """Return the Optuna study of a run folder, study.db; a resumed search draws from another seed."""
     import optuna
 
-    status = one.process.poll()
-    rows = one.rows()
-    for k, row in enumerate(rows):
-        if k not in one.told:
-            one.trial.report(row[measure], k)
-            one.told.add(k)
-    if status is None:
-        if not one.trial.should_prune():
-            return False
-        one.stop()
-        study.tell(one.trial, state=optuna.trial.TrialState.PRUNED)
-        return True
-    said = one.ended()
-    if "is still at it" in said or "is taken" in said:  # a training that a killed tune left running was faster
-        one.begin()
-        return False
-    if status == 0:
-        study.tell(one.trial, rows[-1][measure])
-    elif status < 0 and one.begun < PATIENCE:  # the system ended it, as where memory is short
-        one.begin()
-        return False
-    elif not rows:
-        study.tell(one.trial, state=optuna.trial.TrialState.FAIL)
-        raise UserError(f"tune: {one.folder.name} ended with exit status {status}: {said.removeprefix('error: ')}")
-    else:  # a number that is not finite: so these settings do
-        study.tell(one.trial, state=optuna.trial.TrialState.FAIL)
-    return True
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    storage = f"sqlite:///{run.folder / 'study.db'}"
+    study = optuna.create_study(study_name="tune", storage=storage, direction=direction, load_if_exists=True)
+    # the storage keeps the drawn settings, not the state of the generator
+    study.sampler = optuna.samplers.TPESampler(seed=seed + 1000 * len(study.trials), n_startup_trials=startup)
+    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=startup, n_warmup_steps=1)
+    return study
+
+
+def tune(cfg, overrides):
+    """Search settings: ask for a trial, train, report its evaluations, prune; write trials.csv and the page."""
+    try:
+        import optuna  # noqa: F401
+    except ImportError:
+        raise UserError("stage=tune needs optuna, which is not installed: pip install 'r2s[tune]'") from None
+    from r2s.reporting.tuning import against_table, trials_table, tuning_page
+
+    given = {k: v for k, v in plain(cfg.tune).items() if k in {f.name for f in fields(Tune)}}
+    how = called(Tune, "tune", given)
+    check_trainings(cfg, overrides, how.space)
+    robot = make_robot(cfg)
+    known = make_task(cfg, robot, make_dynamics(cfg, robot)).measure_table.known
+    if how.measure not in known:
+        near = nearest(str(how.measure), known)
+        raise UserError(f"tune.measure: the task has no measure '{how.measure}'; allowed: {choices(known)}{near}")
+    measure = known[how.measure]
+    workers = how.workers or cfg.threads or os.cpu_count() or 1
+    with open_run(cfg, overrides) as run:
+        study = open_study(run, cfg.seed, how.startup, "minimize" if measure.lower_is_better else "maximize")
+        search(study, how, partial(make_trial, cfg, overrides, run, how.space), workers)
+        trials = trials_table(study, run.folder)
+        trials.to_csv(run.folder / "trials.csv", index=False)
+        against = against_table(trials, how.measure, how.against, not measure.lower_is_better)
+        done = trials[trials["state"] == "complete"]
+        if done.empty:
+            raise UserError(f"tune: no trial of {len(trials)} is complete")
+        best = done.sort_values("value", key=lambda values: measure.sign * values).iloc[-1]
+        run.summary({"best": best.to_dict(), "trials": trials["state"].value_counts().to_dict()})
+        tuning_page(run, trials, against, how.measure)
+    settings = " ".join(f"{k}={best[k]}" for k in how.space if k in best.index)
+    line = f"best of {len(trials)} trials: {how.measure} {best['value']:.4g} with {settings}"
+    console().print(line, highlight=False)
+    print(f"written: {run.folder} (report: {run.folder / 'report.md'})")
+
+
+def make_trial(cfg, overrides, run, space, trial):
+    """Return the training of an Optuna trial."""
+    name = f"{run.folder.name}_{trial.number}"
+    words = training_words(cfg, overrides, suggest(trial, space))
+    words += [f"root={cfg.root}", f"name={name}", "skip_completed=true"]
+    folder = Path(cfg.root) / "train" / name
+    return TrialRun(trial, folder, [*command_prefix(), *words], run.folder / "logs" / f"{name}.txt")

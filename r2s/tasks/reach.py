@@ -1,7 +1,8 @@
-"""Reach a point and stay there: the region of goals, what a policy observes, its scale, and what a step is worth."""
+"""Task reach: move the end effector to a point and hold it there. Goals, observations and reward terms."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -11,36 +12,65 @@ from r2s.errors import UserError, check_number
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks import rewards
-from r2s.tasks.episode import measures
-from r2s.tasks.task import Entry, Episodes, State, Usual
+from r2s.tasks.measures import Measure, MeasureTable
+from r2s.tasks.rollout import measures
+from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 
-FINE_M = 0.02  # tanh scales of the observation: the last centimetres fill the range of a network's input
-FINE_RAD = 0.015
-FINE_DQ = 0.1  # rad/s: a joint that creeps would hardly be seen, and one that the hand turns on is not missed
-OBSERVED = (  # by `observe`, in words
+FINE_M = 0.02  # m, tanh scale of the observed error: the last centimetres span a network's input range
+FINE_RAD = 0.015  # m^2/rad, tanh scale of the observed J^T error
+FINE_DQ = 0.1  # rad/s, tanh scale of observed speeds: makes creeping joints visible
+OBSERVED = (  # terms of `observe`, for metadata
     f"q dq ee goal error effort tanh(error/{FINE_M:g}) J'error tanh(J'error/{FINE_RAD:g}) tanh(dq/{FINE_DQ:g})"
 )
-CALM = 0.05  # rad/s, which is also what counts as rest
-CLOSE_M = 1e-3  # at least this is a distance that others are divided by
-MIDDLE = 0.05, 0.95  # of random postures: between these quantiles of their distances goals lie by default
-POSTURES = 500  # that those are told from
+SPEED_NOISE = 0.05  # rad/s, of trainings for an identified arm: the speed that counts as rest
+CLOSE_M = 1e-3  # m, smallest initial distance that the reward divides by
+MIDDLE = 0.05, 0.95  # quantiles of the distances of random postures that bound the default goal region
+POSTURES = 500  # random postures for these quantiles
+
+REACH = MeasureTable(
+    measures=(
+        Measure("success_5cm", "5 cm", "success at 5 cm", "%", 100, 0),
+        Measure("success_2cm", "2 cm", "success at 2 cm", "%", 100, 0),
+        Measure("success_1cm", "1 cm", "success at 1 cm", "%", 100, 0),
+        Measure("success_5mm", "5 mm", "success at 5 mm", "%", 100, 0),
+        Measure("distance_median_m", "median\ndistance", "median distance", "mm", 1e3, 1, lower_is_better=True),
+        Measure("return_paper", "return", "return (eq. 2)"),
+        Measure("return_smooth", "return", "return (eq. 2) without measurement noise"),
+        Measure("rest", "at rest", "episodes that end at rest", "%", 100, 0),
+        Measure("time_to_reach_s", "time to reach", "time to reach 2 cm", "s", 1, 2, lower_is_better=True),
+        Measure("overshoot_m", "overshoot", "overshoot beyond 2 cm", "mm", 1e3, 1, lower_is_better=True),
+    ),
+    selection=("success_1cm", "return_paper"),
+    rows=("success_5cm", "success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_smooth", "rest"),
+    comparison=("success_2cm", "success_1cm", "success_5mm", "distance_median_m", "return_paper"),
+    curves=("success_5cm", "success_2cm", "success_1cm", "return_paper"),
+    scores=("success_1cm", "success_5mm", "distance_median_m", "return_paper"),
+    transfer=("success_1cm",),
+    diagnostics=(
+        *("ee_path_rmse_mm", "tau_rmse_Nm", "time_to_reach_s", "overshoot_m"),
+        *("limited", "q_left_rad", "collision", "stops"),
+    ),
+    corner="success within",
+    description="It moves the end effector to a point and holds it there.",
+    reward="reward, eq. (2)",
+)
 
 
 @dataclass(frozen=True)
-class ReachTask(Usual):
+class ReachTask(BaseTask):
     """Reach a point; a `Task` (r2s/tasks/task.py) from conf/task/reach.yaml.
 
     Attributes:
         ctrl_hz: policy rate. episode_s: length of an episode, s.
-        torque_fraction: an action of 1 asks for this much of tau_max; one for all joints, or one each.
+        torque_fraction: share of tau_max that an action of 1 commands; one for all joints, or one per joint.
         cutoff_hz: low-pass on the torque.
         start_spread: rad, episodes start at q_home + U(-spread, spread).
         reach: (low, high) m, distance of goals from the shoulder (the second joint, or the only one); None: the
-            MIDDLE of what the arm reaches.
+            quantiles MIDDLE of random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
-        speed_noise: rad/s, see `Task`; None: CALM where the model knows of noise, as that of an identified arm does,
-            else 0. A policy that has to bear it does not answer every tremor with torque; gears that swing, which no
-            rigid model has, then find nothing to swing with (docs/transfer.md).
+        speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
+            else 0. A policy trained with noise does not answer it with torque, so it does not excite oscillations of
+            elastic gears, which no rigid model has (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50
@@ -52,6 +82,7 @@ class ReachTask(Usual):
     height: float = 0.1
     azimuth: float = 1.57
     speed_noise: float | None = None
+    measure_table: ClassVar[MeasureTable] = REACH
 
     def __post_init__(self):
         cycles = round(1 / SIM_DT)
@@ -63,27 +94,30 @@ class ReachTask(Usual):
         if self.speed_noise is not None:
             check_number("task.speed_noise", self.speed_noise, "[0, 1]")
 
-    def believing(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
-        """Return the task, with the noise that a training for an arm with these dynamics shows."""
+    def with_model(self, robot: Robot, dynamics: Dynamics) -> "ReachTask":
+        """Return the task with the speed noise of a training for an arm with these dynamics."""
         if self.speed_noise is not None:
             return self
-        return replace(self, speed_noise=CALM if np.any(dynamics.speed_noise) else 0.0)
+        return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
-    def torque(self, robot: Robot) -> np.ndarray:
-        """(n,) Nm that an action of 1 asks for."""
+    def torque_limit(self, robot: Robot) -> np.ndarray:
+        """Return (n,) Nm, the torque of an action of 1."""
         share = np.array(self.torque_fraction, dtype=float)
         if share.ndim and share.shape != (robot.n,):
-            raise UserError(f"task.torque_fraction: {share.size} values for the {robot.n} joints of {robot.name}")
+            raise UserError(
+                f"task.torque_fraction: expected {robot.n} values, for the {robot.n} joints of {robot.name}, "
+                f"got {share.size}"
+            )
         return share * robot.tau_max
 
     @property
-    def observed(self) -> str:
-        """What is in an observation."""
+    def observation_summary(self) -> str:
+        """Terms and units of an observation."""
         return f"{OBSERVED}; rad, rad/s, m"
 
     @property
     def paper_weights(self) -> np.ndarray:
-        """(4,), of the terms that make eq. (2)."""
+        """(5,), weights of the terms of eq. (2)."""
         return rewards.PAPER
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -91,18 +125,18 @@ class ReachTask(Usual):
         return robot.q_home + rng.uniform(-self.start_spread, self.start_spread, (count, robot.n))
 
     def region(self, robot: Robot) -> tuple[float, float]:
-        """Return (low, high) m, how far from the shoulder goals lie."""
+        """Return (low, high) m, distance of goals from the shoulder."""
         if self.reach is not None:
             return self.reach
         postures = zip(range(POSTURES), _postures(robot, np.random.default_rng(0)), strict=False)
         low, high = np.quantile([away for _, (_, away) in postures], MIDDLE)
-        return float(low) - 1e-6, float(high) + 1e-6  # of one joint all are as far
+        return float(low) - 1e-6, float(high) + 1e-6  # with one joint all distances are equal
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, 3) m: end-effector positions of random joint angles, so that every goal can be reached.
+        """Return (count, 3) m: end-effector positions of random joint angles, so that every goal is reachable.
 
         Raises:
-            UserError: hardly any position of the arm lies within the task's region.
+            UserError: hardly any position of the arm lies in the task's region.
         """
         reach = self.region(robot)
         found: list[np.ndarray] = []
@@ -121,8 +155,8 @@ class ReachTask(Usual):
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (6 n + 12,) to normalise `observe` by: the task's own scales.
 
-        Statistics of random torques would not do: they whirl the wrist at 10 rad/s, next to which the 0.1 rad/s that
-        decide about stopping at a goal vanish.
+        Statistics of random torques are unsuitable: they spin the wrist at 10 rad/s, whereas 0.1 rad/s matter for
+        stopping at a goal.
         """
         n, far = robot.n, self.region(robot)[1]
         centre = np.zeros(6 * n + 12)
@@ -134,46 +168,46 @@ class ReachTask(Usual):
         return centre, np.concatenate(scale)
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, 6 n + 12) float32 of goals (m, 3) m; `torque` (n,) Nm: an action of 1."""
+        """Return the observations (m, 6 n + 12) float32 of goals (m, 3) m; see `Task.observe`."""
         return observe(state.q, state.dq, state.ee, goals, state.jacobian, state.effort, torque)
 
-    def layout(self, robot: Robot) -> list[Entry]:
-        """Return what `observe` puts where, in its order."""
-        return layout(self.torque(robot))
+    def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
+        """Return the terms of an observation, in the order of `observe`."""
+        return observation_terms(self.torque_limit(robot))
 
-    def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
+    def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, the distances at the start, at least CLOSE_M."""
         return np.maximum(np.linalg.norm(goals - state.ee, axis=-1), CLOSE_M)
 
     def judge(
-        self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+        self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the distance (m,) m and the reward terms (m, 5) of r2s/tasks/rewards.py; see `Task.judge`."""
-        return _judge(state.ee, goals, reference, state.dq, ddq, state.limited)
+        return _judge(state.ee, goals, scale, state.dq, ddq, state.limited)
 
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
         return measures(episodes)
 
 
-def layout(torque: np.ndarray) -> list[Entry]:
-    """Return what `observe` puts where, in its order; torque (n,) Nm: what an effort is divided by."""
+def observation_terms(torque: np.ndarray) -> list[ObservationTerm]:
+    """Return the terms of an observation, in the order of `observe`; torque (n,) Nm: the torque limit."""
     return [
-        Entry("q", "rad", "q"),
-        Entry("dq", "rad/s", "dq"),
-        Entry("ee", "m", "ee"),
-        Entry("goal", "m", "goal"),
-        Entry("error", "m", "error"),
-        Entry("effort / torque", "1", "effort", divided_by=tuple(torque.tolist())),
-        Entry(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
-        Entry("J'error", "m^2/rad", "pull"),
-        Entry(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
-        Entry(f"tanh(dq / {FINE_DQ:g} rad/s)", "1", "dq", divided_by=FINE_DQ, tanh=True),
+        ObservationTerm("q", "rad", "q"),
+        ObservationTerm("dq", "rad/s", "dq"),
+        ObservationTerm("ee", "m", "ee"),
+        ObservationTerm("goal", "m", "goal"),
+        ObservationTerm("error", "m", "error"),
+        ObservationTerm("effort / torque", "1", "effort", divided_by=tuple(torque.tolist())),
+        ObservationTerm(f"tanh(error / {FINE_M:g} m)", "1", "error", divided_by=FINE_M, tanh=True),
+        ObservationTerm("J'error", "m^2/rad", "pull"),
+        ObservationTerm(f"tanh(J'error / {FINE_RAD:g})", "1", "pull", divided_by=FINE_RAD, tanh=True),
+        ObservationTerm(f"tanh(dq / {FINE_DQ:g} rad/s)", "1", "dq", divided_by=FINE_DQ, tanh=True),
     ]
 
 
 def _postures(robot: Robot, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield end effectors (3,) m of random joint angles, and how far they are from the shoulder, m; without end."""
+    """Yield end-effector positions (3,) m of random postures and their distances from the shoulder, m."""
     model = robot.model(gravity=False)
     data, site = mujoco.MjData(model), model.site(robot.ee_site).id
     data.qpos = robot.q_home
@@ -201,14 +235,14 @@ def observe(
     """Return the observation (m, 6 n + 12) float32 in SI units; the same on the arm as in simulation.
 
     q, dq, ee, goal, error, effort / torque, tanh(error / 2 cm), J^T error, tanh(J^T error / 1.5 cm),
-    tanh(dq / 0.1 rad/s). J^T error tells a network which joint moves the hand towards the goal, which it would
-    otherwise have to learn. The effort is state, because the rate limit lets a torque change by 1 Nm per ms only.
+    tanh(dq / 0.1 rad/s). J^T error shows which joints move the end effector towards the goal, which a network would
+    otherwise have to learn. The effort is part of the state, because torque changes by at most 1 Nm per ms.
 
     Args:
         q, dq: (m, n) rad, rad/s.
         ee, goal: (m, 3) m.
         jacobian: (m, 3, n) m/rad.
-        effort: (m, n) Nm, the target as it has come through the low-pass. torque: (n,) Nm, an action of 1.
+        effort: (m, n) Nm, the target torque after the low-pass. torque: (n,) Nm, the torque limit.
     """
     m, n = q.shape
     out = np.empty((m, 6 * n + 12), np.float32)

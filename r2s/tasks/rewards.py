@@ -1,12 +1,14 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
-A reward is a weighted sum of terms. Three of them are not in the paper: a bonus for precision, a price of moving
-where precision is, and a price of asking for what the law does not let through. The replay buffer keeps the terms. So
-when the curriculum moves its weights, every stored transition is worth what the present weights say.
+A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update weights them with the
+present weights. So a curriculum can move its weights without making stored transitions stale. Three terms are not in
+the paper: a bonus for precision, a penalty for motion close to the goal, and a penalty for commands that the safety
+filter changes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +16,9 @@ from r2s.compiled import njit
 from r2s.errors import UserError, check_number
 
 K1, K2, K3, K4, K5, K6 = 2.0, 0.03, 0.05, 1.15, 0.03, 0.15  # eq. (2)
-PRECISION_M = (0.03, 0.01)  # lengths of the bonus: within them, closer still pays
-STILL = (0.2, 0.05)  # rad/s, of the fastest joint, as a hand can lie on the axis of one that turns
-TERMS = ("distance", "smoothness", "precision", "stillness", "limited")
+PRECISION_M = (0.03, 0.01)  # m, tanh scales of the bonus
+STILL = (0.2, 0.05)  # rad/s, tanh scales of the fastest joint: the end effector can lie on a rotating axis
+TERMS = ("distance", "smoothness", "precision", "stillness", "filter_penalty")
 
 
 @njit(cache=True)
@@ -25,17 +27,17 @@ def terms(
 ) -> np.ndarray:
     """Return (m, 5): the two halves of eq. (2), which add up to it, and the three terms that are not in the paper.
 
-    distance    -k1 d, with d the distance over the initial one
-    smoothness  -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
-    precision   1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2
-    stillness   -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2)
-    limited     -limited
+    distance        -k1 d, with d the distance over the initial one
+    smoothness      -k2 sum tanh|dq| - k3 sum tanh|ddq| / |k4 - min(1, d)| - k5 sum tanh|ddq| / (k6 + d)
+    precision       1 - tanh(distance / 3 cm) / 2 - tanh(distance / 1 cm) / 2
+    stillness       -precision (tanh(max|dq| / 0.2 rad/s) / 2 + tanh(max|dq| / 0.05 rad/s) / 2)
+    filter_penalty  -limited
 
     Args:
         distance, distance0: (m,) m, now and at the start of the episode.
         dq: (m, n) rad/s.
         ddq: (m, n) rad/s^2, mean over the last control period.
-        limited: (m,), in which share of it the driver's law changed what was asked for.
+        limited: (m,), share of its cycles in which the safety filter changed the command.
     """
     out = np.empty((len(distance), 5))
     for i in range(len(distance)):
@@ -58,26 +60,55 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq
 
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
-PATIENCE = 50_000  # env steps in which the price of `limited` grows e-fold where twice the share allowed is limited
-DEAREST = 4.0  # the most that it grows
+PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold at twice max_filter_rate
+MAX_FACTOR = 4.0  # largest penalty factor
+
+
+class Reward:
+    """A weighted sum of named terms; `reward._target_` names a subclass, made with the other keys of its yaml.
+
+    This one has the task's own terms and weights: `reward=task`.
+    """
+
+    def terms(self, task: Any) -> tuple[str, ...]:
+        """Return the names of the terms, in the order of `judge`."""
+        return task.reward_terms
+
+    def judge(
+        self, task: Any, state: Any, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance (m,) m and the terms (m, k); arguments as in `Task.judge`."""
+        return task.judge(state, ddq, goals, reference)
+
+    def weights(self, task: Any, progress: float, factor: float = 1.0) -> np.ndarray:
+        """Return the (k,) weights.
+
+        Args:
+            task: in training. progress: fraction of the training budget that is spent. factor: of `adapt`.
+        """
+        return task.paper_weights
+
+    def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
+        """Return the factor after env_steps more of a training, whose mean terms were `seen` (k,); 1 at its start."""
+        return factor
 
 
 @dataclass(frozen=True)
-class Curriculum:
-    """The weights of the terms over a training.
+class Curriculum(Reward):
+    """Weights that move over a training.
 
     Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
-    with light smoothness and a bonus for precision, then moves linearly towards eq. (2) between the two `anneal`
-    fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
+    with light smoothness and a bonus for precision. Then the weights move linearly towards eq. (2) between the two
+    `anneal` fractions of the budget. reward=paper is the same with constant pairs (1 and 0).
 
     Attributes:
-        smoothness, precision, stillness, limited: weights before and after.
+        smoothness, precision, stillness, filter_penalty: weights before and after.
         anneal: fractions of the budget where the change starts and ends.
-        limited_most: share of the cycles; None: any. From the first of `anneal` on, while the law changes what is
-            asked for in more of them, the price of `limited` grows; and falls back, never below the curriculum's. One
-            price does not hold a share: policies of the same make of training that differ in their seed alone are
-            limited in 1 to 6 % of the cycles (docs/minutes.md). This is a Lagrange multiplier's integral control
-            (Stooke, Achiam and Abbeel, ICML 2020), of the price's logarithm.
+        max_filter_rate: largest share of the cycles, exploration included, in which the safety filter may change the
+            command; None: any. From the first of `anneal` on, a higher share raises the filter penalty, and a lower
+            one reduces it, down to the curriculum's weight. One fixed weight does not hold a share: policies that
+            differ in their seed alone are limited in 1 to 6 % of the cycles (benchmarks/results/minutes.md). This is
+            integral control of a Lagrange multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: no pair of numbers, or a number outside its range.
@@ -86,9 +117,9 @@ class Curriculum:
     smoothness: Sequence[float]
     precision: Sequence[float]
     stillness: Sequence[float]
-    limited: Sequence[float]
+    filter_penalty: Sequence[float]
     anneal: Sequence[float]
-    limited_most: float | None = None
+    max_filter_rate: float | None = None
 
     def __post_init__(self):
         for name, interval in (*WEIGHTS, ("anneal", "[0, 1]")):
@@ -97,31 +128,31 @@ class Curriculum:
                 raise UserError(f"reward.{name}: {pair} is not allowed; two numbers are, before and after")
             for number in pair:
                 check_number(f"reward.{name}", number, interval)
-        if self.limited_most is not None:
-            check_number("reward.limited_most", self.limited_most, "(0, 1]")
+        if self.max_filter_rate is not None:
+            check_number("reward.max_filter_rate", self.max_filter_rate, "(0, 1]")
 
-    def __call__(self, progress: float, dearer: float = 1.0) -> np.ndarray:
-        """Return the (5,) weights at `progress`, the fraction of the training budget that is spent.
+    def terms(self, task: Any) -> tuple[str, ...]:
+        """Return TERMS; raise UserError if the task has others."""
+        if task.reward_terms != TERMS:
+            raise UserError(
+                f"reward: a curriculum weights {', '.join(TERMS)}; {type(task).__name__} has "
+                f"{', '.join(task.reward_terms)}; reward=task is allowed"
+            )
+        return TERMS
 
-        Args:
-            dearer: the factor on the price of `limited`, of `dearer`.
-        """
+    def weights(self, task: Any, progress: float, factor: float = 1.0) -> np.ndarray:
+        """Return the (5,) weights; `factor` multiplies that of the filter penalty."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
         pairs = (getattr(self, name) for name in TERMS[1:])
         moving = [before + at * (after - before) for before, after in pairs]
-        moving[-1] *= dearer
+        moving[-1] *= factor
         return np.array([1.0, *moving])
 
-    def dearer(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
-        """Return the factor on the price of `limited` after env_steps more of a training.
-
-        Args:
-            factor: before. progress: fraction of the budget that is spent.
-            seen: (5,), the mean terms of those steps, of `terms`.
-        """
-        if self.limited_most is None or progress < self.anneal[0]:
+    def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
+        """Return the factor of the filter penalty; see `Reward.adapt`."""
+        if self.max_filter_rate is None or progress < self.anneal[0]:
             return factor
-        limited = -seen[TERMS.index("limited")]
-        beyond = min(limited / self.limited_most - 1.0, 1.0)
-        return float(np.clip(factor * np.exp(beyond * env_steps / PATIENCE), 1.0, DEAREST))
+        limited = -seen[TERMS.index("filter_penalty")]
+        beyond = min(limited / self.max_filter_rate - 1.0, 1.0)
+        return float(np.clip(factor * np.exp(beyond * env_steps / PATIENCE), 1.0, MAX_FACTOR))

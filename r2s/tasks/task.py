@@ -1,19 +1,26 @@
-"""What a task has to say, and what it is told: the protocol that environment, rollout and policies depend on.
+"""The task protocol, which environment, rollout and policies depend on.
 
-A new task is one file beside reach.py and one yaml: where episodes start, what is asked, what a policy sees of it,
-and what that is worth.
+A task defines where episodes start, the goal, the observation, the reward terms, and how episodes are measured. A new
+task is one file beside reach.py and one yaml (docs/how_to/extending.md).
 """
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
+from r2s.control.controller import Controller
+from r2s.control.torque import torque
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.tasks.measures import MeasureTable
+from r2s.tasks.rewards import TERMS
 
-OFTEN = 0.04  # of the cycles: policies that the driver's law limits in more are no better for what they gain by it
+# share of the cycles that the safety filter may change before it costs score: below it, policies are no better for it
+MAX_FILTER_RATE = 0.04
+TORQUE_STD = 0.3  # of the torque limit, to normalise an observed controller torque by
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,14 +28,13 @@ class State:
     """m arms of n joints at one moment. Its arrays may be views that the next step overwrites.
 
     Attributes:
-        t: (m,) s since their episodes began. q, dq: (m, n) rad, rad/s.
+        t: (m,) s since the episodes began. q, dq: (m, n) rad, rad/s.
         ee: (m, 3) m, the end effector. jacobian: (m, 3, n) m/rad, its translational Jacobian.
-        tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target as it has come through the low-pass.
+        tau: (m, n) Nm, the last command (tau_J_d). effort: (m, n) Nm, the target torque after the low-pass.
         stopped: (m,), whether the arm has ended its motion.
-        limited: (m,), in which share of the last control period the driver's law changed what was asked for.
-        told: (m, c), what a policy is told of its arm (r2s/adaptation/telling.py); None: nothing.
-        noise: (m, n) rad/s, what sensors would add to dq where that is the truth; None: dq is what they say, or they
-            are exact.
+        limited: (m,), share of the last control period in which the safety filter changed the command.
+        noise: (m, n) rad/s, sensor noise that `measured` adds where dq is the true speed; None: dq is the measured
+            speed, or sensors are exact.
     """
 
     t: np.ndarray
@@ -40,16 +46,15 @@ class State:
     effort: np.ndarray
     stopped: np.ndarray
     limited: np.ndarray
-    told: np.ndarray | None = None
     noise: np.ndarray | None = None
 
-    def seen(self) -> "State":
-        """Return the state as sensors say it, which is all that a policy or a controller has."""
+    def measured(self) -> "State":
+        """Return the state as the sensors measure it: what a policy or a controller uses."""
         return self if self.noise is None else replace(self, dq=self.dq + self.noise, noise=None)
 
     @staticmethod
-    def still(robot: Robot) -> "State":
-        """Return one arm at rest at home, without kinematics: what functions are compiled on."""
+    def at_home(robot: Robot) -> "State":
+        """Return one arm at rest at home, without kinematics, to compile functions with."""
         rest, ee, jacobian = np.zeros((1, robot.n)), np.zeros((1, 3)), np.zeros((1, 3, robot.n))
         none = np.zeros(1, dtype=bool), np.zeros(1)
         return State(np.zeros(1), robot.q_home[None], rest, ee, jacobian, rest, rest, *none)
@@ -60,13 +65,13 @@ class Episodes:
     """E finished episodes of T control steps; row k is the state after step k.
 
     Attributes:
-        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves, as of
-        `Task.places`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m. reward: (E, T),
-        under `Task.paper_weights`: of reaching, eq. (2).
-        reward_smooth: (E, T), the same with the noise of the speeds taken out, where an arm measured them.
-        q_left: (E,) rad, how close any joint came to a position limit.
-        limited: (E,), in which share of the cycles the driver's law changed what was asked for.
-        collision: (E,) words: when it touched what, which ended it; "" where it touched nothing.
+        t: (T,) s. q, dq: (E, T, n). ee: (E, T, 3) m. goal: (E, 3) m, or (E, T, 3) where it moves; see
+            `Task.goal_positions`. tau: (E, T, n) Nm, the command at the end of the step. distance: (E, T) m.
+        reward: (E, T), under `Task.paper_weights`; for reaching, eq. (2).
+        reward_smooth: (E, T), the same without the noise of measured speeds.
+        q_left: (E,) rad, smallest distance of any joint from its position limits.
+        limited: (E,), share of the cycles in which the safety filter changed the command.
+        collision: (E,) words: when the episode ended by which contact; "" without contact.
     """
 
     t: np.ndarray
@@ -84,15 +89,15 @@ class Episodes:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """What a stretch of an observation is, for a program that has to make it without r2s.
+class ObservationTerm:
+    """One term of an observation, described so that a program without r2s can compute it.
 
     Attributes:
-        name: of it. unit: SI, "1" where it has none.
-        of: what it is made of: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). Of a plan `goal` is
-            where the hand is to be now, and there are ahead (the next places - ee), velocity (the path's), limited,
-            q_off and dq_off (the plan's less the arm's), and base (the torque that an action is added to).
-        divided_by: one number, or one for each element; None: nothing. tanh: whether tanh is taken then.
+        name: of the term. unit: SI, "1" if dimensionless.
+        of: its source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
+            current reference position, and there are ahead (the next positions - ee), velocity (of the path),
+            limited, q_off and dq_off (plan minus arm). A controller that observes its torque adds control.
+        divided_by: one number, or one per element; None: nothing. tanh: whether tanh follows.
     """
 
     name: str
@@ -103,20 +108,22 @@ class Entry:
 
 
 class Task(Protocol):
-    """What is asked of an arm in episodes of `steps` control steps.
+    """What an arm has to do in episodes of `steps` control steps.
 
     Attributes:
         ctrl_hz: policy rate. cutoff_hz: low-pass on the torque. steps: control steps of an episode.
         substeps: physics steps of a control step.
-        observed: what is in an observation, in words and units, for whoever deploys the policy.
-        paper_weights: (k,), of the reward terms in `Episodes.reward`.
-        share: of `torque`, what an action of 1 changes a target by. pool: how many goals a training draws from.
-        speed_noise: rad/s; speeds that a training shows are at least as noisy as U(0, speed_noise), a draw for each
-            arm. None or 0: as the arm's own sensors are.
+        observation_summary: terms and units of an observation, for the metadata of policy.onnx.
+        reward_terms: names of the reward terms. paper_weights: (k,), their weights in `Episodes.reward`.
+        pool: number of goals that a training draws from.
+        speed_noise: rad/s; in training, measured speeds are at least as noisy as U(0, speed_noise), drawn per arm.
+            None or 0: the noise of the arm's own sensors.
+        measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
+        may_touch: pairs of body names that may touch, or of one and "table"; other contacts end an episode.
     """
 
     @property
-    def ctrl_hz(self) -> int: ...  # noqa: D102 (said above)
+    def ctrl_hz(self) -> int: ...  # noqa: D102 (see the class)
     @property
     def cutoff_hz(self) -> float: ...  # noqa: D102
     @property
@@ -124,23 +131,34 @@ class Task(Protocol):
     @property
     def substeps(self) -> int: ...  # noqa: D102
     @property
-    def observed(self) -> str: ...  # noqa: D102
+    def observation_summary(self) -> str: ...  # noqa: D102
+    @property
+    def reward_terms(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
     def paper_weights(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def share(self) -> float: ...  # noqa: D102
     @property
     def pool(self) -> int: ...  # noqa: D102
     @property
     def speed_noise(self) -> float | None: ...  # noqa: D102
+    @property
+    def measure_table(self) -> MeasureTable: ...  # noqa: D102
+    @property
+    def may_touch(self) -> tuple[tuple[str, str], ...]: ...  # noqa: D102
 
-    def torque(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the most that a target asks for."""
+    def torque_limit(self, robot: Robot) -> np.ndarray:
+        """Return (n,) Nm, the largest target torque."""
         ...
 
-    def believing(self, robot: Robot, dynamics: Dynamics) -> "Task":
-        """Return the task, told what the arm is believed to be: for targets that a model has a part in."""
+    def with_model(self, robot: Robot, dynamics: Dynamics) -> "Task":
+        """Return the task with the identified model of one arm, for what depends on it."""
+        ...
+
+    def controlled_by(self, controller: Controller) -> "Task":
+        """Return the task with this controller."""
+        ...
+
+    def control(self, robot: Robot) -> Controller:
+        """Return the controller, which defines the action space; by default `control=torque`."""
         ...
 
     def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -148,15 +166,15 @@ class Task(Protocol):
         ...
 
     def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, ...), what is asked in that many episodes: a point, or a path with its times."""
+        """Return (count, ...), the goals of that many episodes: points, or timed paths."""
         ...
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, n) rad, where the episodes with these goals start, of what `starts` said."""
+        """Return (m, n) rad, where the episodes with these goals start; `starts` is a proposal."""
         ...
 
-    def places(self, goals: np.ndarray) -> np.ndarray:
-        """Return what is asked, to look at: points (m, 3) m, or (m, steps, 3) where the hand belongs after a step."""
+    def goal_positions(self, goals: np.ndarray) -> np.ndarray:
+        """Return the goals as positions to plot: (m, 3) m, or (m, steps, 3) for a reference after each step."""
         ...
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -164,25 +182,21 @@ class Task(Protocol):
         ...
 
     def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the observations (m, d) float32; `torque` as of `Task.torque`."""
+        """Return the observations (m, d) float32; torque: `torque_limit`, to scale efforts by."""
         ...
 
-    def target(self, action: np.ndarray, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return (m, n) Nm, what actions (m, n) in [-1, 1] ask for at this state; `torque` as of `Task.torque`."""
-        ...
-
-    def reference(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) m, what the distances of the episodes that begin at `state` are measured by."""
+    def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Return (m,) m, by which the reward divides the distances of the episodes that begin at `state`."""
         ...
 
     def judge(
-        self, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+        self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distance (m,) m from what is asked, and the reward terms (m, k).
+        """Return the distance (m,) m from the goal, and the reward terms (m, k).
 
         Args:
             state: after a step. ddq: (m, n) rad/s^2, mean over that control period.
-            goals: (m, ...). reference: (m,), see there.
+            goals: (m, ...). scale: (m,) m, of `distance_scale`.
         """
         ...
 
@@ -191,24 +205,43 @@ class Task(Protocol):
         ...
 
     def score(self, row: Mapping[str, float]) -> float:
-        """Return what makes one row of `measures` better than another."""
+        """Return the score that selects the best of several rows of `measures`."""
         ...
 
 
-def observed(task: Task, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return what a policy is shown (m, d) float32: the task's observations, and then what is told of the arm."""
-    own = task.observe(state.seen(), goals, torque)
-    return own if state.told is None else np.concatenate([own, state.told], axis=1, dtype=np.float32)
+def observe(task: Task, controller: Controller, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
+
+    Args:
+        task, goals: see `Task.observe`. controller: of the task. state: the true state, whose noise is added here.
+        torque: (n,) Nm, `Task.torque_limit`.
+    """
+    state = state.measured()
+    own = task.observe(state, goals, torque)
+    if not controller.observes_torque:
+        return own
+    rest = controller.command(np.zeros((len(goals), controller.action_dim)), task, state.t, goals)
+    return np.concatenate([own, controller.torque(state.q, state.dq, rest) / torque], axis=1, dtype=np.float32)
 
 
-class Usual:
-    """What most tasks have in common: an action is a share of the torque, and a goal is what there is to look at."""
+def observation_scale(task: Task, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation (d,) of what `observe` returns."""
+    mean, std = task.observation_scale(robot)
+    if not task.control(robot).observes_torque:
+        return mean, std
+    return np.concatenate([mean, np.zeros(robot.n)]), np.concatenate([std, np.full(robot.n, TORQUE_STD)])
+
+
+class BaseTask:
+    """Defaults that most tasks share: torque control, goals that are positions, no model."""
 
     ctrl_hz: int
     episode_s: float
-    share = 1.0
     pool = 2048
+    reward_terms: tuple[str, ...] = TERMS
     speed_noise: float | None = None
+    may_touch: tuple[tuple[str, str], ...] = ()
+    controller: Controller | None = None
 
     @property
     def steps(self) -> int:
@@ -220,26 +253,33 @@ class Usual:
         """Physics steps of a control step."""
         return round(1.0 / (self.ctrl_hz * SIM_DT))
 
-    def believing(self, robot: Robot, dynamics: Dynamics) -> "Usual":
-        """Return the task: it has no use for a model."""
+    def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
+        """Return the task itself: it needs no model."""
         return self
+
+    def controlled_by(self, controller: Controller) -> Self:
+        """Return the task with this controller."""
+        task = copy.copy(self)
+        object.__setattr__(task, "controller", controller)  # tasks are frozen dataclasses
+        return task
+
+    def control(self, robot: Robot) -> Controller:
+        """Return the controller of `controlled_by`, else `control=torque`."""
+        return self.controller or torque(robot, self)  # type: ignore[arg-type]
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the starts: they do not depend on the goals."""
         return starts
 
-    def places(self, goals: np.ndarray) -> np.ndarray:
+    def goal_positions(self, goals: np.ndarray) -> np.ndarray:
         """Return the goals."""
         return goals
 
-    def target(self, action: np.ndarray, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return (m, n) Nm, action x torque."""
-        return action * torque
-
     def score(self, row: Mapping[str, float]) -> float:
-        """Return what makes one evaluation better than another.
+        """Return the score of one evaluation.
 
-        1 % more within 1 cm, or at rest, is worth 1 of the return; 1 % more cycles that the driver's law limits cost
-        10 of it, from OFTEN on.
+        1 % more success within 1 cm, or at rest, is worth 1 of the return. Above MAX_FILTER_RATE, 1 % more cycles
+        that the safety filter changes cost 10.
         """
-        return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - 1e3 * max(row["limited"] - OFTEN, 0.0)
+        price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)
+        return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - price

@@ -2,6 +2,7 @@
 
 import contextlib
 import ipaddress
+import os
 import select
 import socket
 import time
@@ -9,44 +10,44 @@ from collections.abc import Callable
 
 import numpy as np
 
-from r2s.arm import fci
+from r2s.arm.clients import fci
 from r2s.arm.emulator.control import Control
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
-IDLE_MS = 20  # between states while nothing moves, in lock-step: nobody needs a thousand a second
-BACKOFF_S = (1e-3, 0.4)  # between states that wait for a motion's first answer; a client gives up after 1 s
+IDLE_MS = 20  # between states of an idle arm in lock-step; the clients do not need 1 kHz there
+BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
 
 
 class Server:
-    """Serves one client after the other, in one thread.
+    """Serves one client at a time, in one thread.
 
-    A motion begins when the client has answered the newest state; until then the arm stands still and states are
-    repeated, because a client may skip some while it starts. That answer is not applied: the first command of a
-    motion is the answer to the first state whose control_command_success_rate is above zero.
+    A motion begins when the client has answered the newest state. Until then the arm stands still and the server
+    repeats states, because a client may skip some while it starts. That answer is not executed: a motion's first
+    command is the answer to the first state whose control_command_success_rate is above zero.
     """
 
-    def __init__(self, listener: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
-        self.address: str = listener.getsockname()[0]
-        self._listener, self._control, self._urdf = listener, control, urdf.encode()
+    def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):
+        self.address: str = server.getsockname()[0]
+        self._socket, self._control, self._urdf = server, control, urdf.encode()
         self._version, self._realtime = version, realtime
         self._tcp: socket.socket | None = None
         self._udp: socket.socket | None = None
-        self._forget()
+        self._reset()
 
     def serve(self, parent: int | None = None, note: Callable[[str], None] = lambda line: None) -> None:
-        """Run until the pipe `parent` closes (None: for good); `note` gets a line per event."""
+        """Run until the pipe `parent` closes (None: forever); `note` receives a line per event."""
         self._note = note
         while True:
             due = None if self._due is None else max(0.0, self._due - time.monotonic())
-            watched = [x for x in (parent, self._listener, self._tcp, self._udp) if x is not None]
+            watched = [x for x in (parent, self._socket, self._tcp, self._udp) if x is not None]
             ready = select.select(watched, [], [], due)[0]
             if parent in ready:
                 return
             try:
                 if self._tcp in ready:
                     self._requests()
-                if self._listener in ready:
+                if self._socket in ready:
                     self._accept()
                 if self._udp is not None and self._udp in ready:
                     self._commands()
@@ -56,11 +57,11 @@ class Server:
                 self._disconnect()
 
     def _accept(self) -> None:
-        tcp, client = self._listener.accept()
-        if self._tcp is not None and _closed(self._tcp):  # one that left and came back within a moment
+        tcp, client = self._socket.accept()
+        if self._tcp is not None and _is_closed(self._tcp):  # the client reconnects before its end was processed
             self._disconnect()
         if self._tcp is not None:
-            tcp.close()  # one client at a time
+            tcp.close()
             self._note(f"{client[0]} refused, another client is connected")
             return
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -72,19 +73,19 @@ class Server:
             if s is not None:
                 s.close()
         self._tcp = self._udp = None
-        self._forget()
-        self._note("client gone")
+        self._reset()
+        self._note("client disconnected")
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._received = b""
         self._client: tuple[str, int] | None = None
-        self._move: int | None = None  # the id of the Move request that waits for its end
+        self._move: int | None = None  # id of the Move request whose motion is active
         self._started = False  # whether that motion has had its first answer
-        self._answer: np.ndarray | None = None  # Nm, to the newest state; in real time it waits for the cycle's end
-        self._due: float | None = None  # when the next state is sent unless something else sends it
+        self._answer: np.ndarray | None = None  # Nm, to the newest state; in real time applied at the cycle's end
+        self._due: float | None = None  # when the next state is sent; None: only after an answer
         self._message_id = 0
 
-    # --- requests, by TCP ---------------------------------------------------------------------------------------
+    # --- requests, by TCP
 
     def _requests(self) -> None:
         assert self._tcp is not None
@@ -99,7 +100,7 @@ class Server:
             payload, self._received = self._received[fci.HEADER.itemsize : size], self._received[size:]
             names = fci.REQUESTS[self._version]
             if size < fci.HEADER.itemsize or command >= len(names):
-                raise ConnectionResetError  # not libfranka
+                raise ConnectionResetError  # the client is not libfranka
             self._request(names[command], number, payload)
 
     def _request(self, name: str, number: int, payload: bytes) -> None:
@@ -117,18 +118,20 @@ class Server:
         elif name == "GetRobotModel":
             self._reply(name, number, fci.DONE, self._urdf)
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
-            self._reply(name, number, fci.NOT_POSSIBLE)  # the library would be machine code; ask the URDF
+            self._reply(name, number, fci.NOT_POSSIBLE)  # that library is machine code
         else:
             if name == "SetCollisionBehavior":
-                self._control.watch_for(np.frombuffer(payload, fci.COLLISION, 1)[0]["upper_torque"].copy())
-            self._reply(name, number, fci.DONE)  # impedances, loads: nothing here depends on them
+                self._control.set_collision_thresholds(
+                    np.frombuffer(payload, fci.COLLISION, 1)[0]["upper_torque"].copy()
+                )
+            self._reply(name, number, fci.DONE)  # impedances and loads have no effect here
 
     def _connect(self, number: int, payload: bytes) -> None:
         assert self._tcp is not None
         version, port = np.frombuffer(payload, fci.CONNECT, 1)[0].tolist()
         ours = np.array(self._version, "<u2").tobytes()
         if version != self._version:
-            self._note(f"a client of version {version}, this is {self._version}")
+            self._note(f"expected a client of version {self._version}, got {version}")
             self._reply("Connect", number, fci.NOT_POSSIBLE, ours)
             return
         self._client = self._tcp.getpeername()[0], port
@@ -142,8 +145,8 @@ class Server:
     def _begin(self, number: int, payload: bytes) -> None:
         controller, generator = np.frombuffer(payload, fci.MOVE, 1)[0].tolist()
         status = fci.MOVE_STATUS[self._version]
-        if (controller, generator) != (fci.EXTERNAL_CONTROLLER, fci.GENERATOR_ASKED[self._version]):
-            self._note(f"Move with modes {controller}, {generator}: only torque control is served")
+        if (controller, generator) != (fci.EXTERNAL_CONTROLLER, fci.GENERATOR_REQUESTED[self._version]):
+            self._note(f"Move with modes {controller}, {generator}: only torque control is available")
             self._reply("Move", number, status["InvalidArgument"])
         elif not self._control.can_move:
             self._reply("Move", number, status["NotPossible"])
@@ -160,10 +163,10 @@ class Server:
         size = fci.HEADER.itemsize + 1 + len(more)
         self._tcp.sendall(np.array((command, number, size), fci.HEADER).tobytes() + bytes([status]) + more)
 
-    # --- the cycle, by UDP --------------------------------------------------------------------------------------
+    # --- the cycle, by UDP
 
     def _commands(self) -> None:
-        """Take what the client sent; only an answer to the newest state counts."""
+        """Process the client's commands; only an answer to the newest state counts."""
         assert self._udp is not None
         kind = fci.COMMAND[self._version]
         with contextlib.suppress(BlockingIOError):
@@ -187,9 +190,9 @@ class Server:
                     self._cycle(command["tau_J_d"].copy())
 
     def _cycle(self, tau: np.ndarray | None) -> None:
-        """One cycle, and those after it whose states are lost: nobody can answer them."""
+        """Run one cycle, and the following ones whose states are dropped, because the client cannot answer them."""
         self._control.cycle(tau)
-        while self._control.lost and not self._realtime:
+        while self._control.dropped and not self._realtime:
             self._message_id += 1
             self._control.cycle(None)
         if self._control.running:
@@ -199,7 +202,7 @@ class Server:
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
-        """Send the state that is due, at a motion's pace or an idle one's."""
+        """Send the state that is due, and set the time of the next one."""
         assert self._due is not None
         if self._started and self._realtime:
             answer, self._answer = self._answer, None
@@ -207,7 +210,7 @@ class Server:
         else:
             self._send()
         if self._realtime:
-            # after a stall of this machine the robot's time goes on from here: states in a burst help nobody
+            # after a stall of this computer the robot's time resumes here, without a burst of states
             self._due = max(self._due, time.monotonic() - SIM_DT) + SIM_DT
         elif self._move is None:
             self._due = time.monotonic() + IDLE_MS * SIM_DT
@@ -222,46 +225,41 @@ class Server:
         self._message_id += passed
         if self._move is None:
             self._control.idle(passed)
-        if self._control.lost:
+        if self._control.dropped:
             return
         if self._started and not self._realtime:
-            self._due = None  # now only an answer makes time pass
+            self._due = None  # in lock-step only an answer advances time
         self._control.state["message_id"] = self._message_id
-        with contextlib.suppress(BlockingIOError):  # a full socket drops a packet, as a full cable would
+        with contextlib.suppress(BlockingIOError):  # a full socket drops a packet, as a network would
             self._udp.sendto(self._control.state.tobytes(), self._client)
 
     def _finish(self, status: str) -> None:
-        """Tell the client by both ways that the motion is over."""
+        """Report the end of the motion by TCP, and by UDP with the next state."""
         assert self._move is not None
         move, self._move, self._started = self._move, None, False
-        self._due = time.monotonic()  # the state of an arm that holds
+        self._due = time.monotonic()  # the state of an arm at rest
         self._reply("Move", move, fci.MOVE_STATUS[self._version][status])
 
 
-def listen(address: str | None = None) -> socket.socket:
-    """Return a socket that listens at the FCI's port of a loopback address, the first free one by default.
+def open_port(address: str | None = None) -> socket.socket:
+    """Open the FCI's port on a loopback address, the first free one by default; return the server socket.
 
     Raises:
-        UserError: the address is not a loopback one, or taken.
+        UserError: not a loopback address, or the port is in use.
 
     """
     if address is not None:
         check_loopback(address)
     candidates = [address] if address is not None else [f"127.0.0.{i}" for i in range(1, 255)]
     for candidate in candidates:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((candidate, fci.PORT))
-            listener.listen()
-            return listener
+            return socket.create_server((candidate, fci.PORT))
         except OSError as error:
-            listener.close()
-            reason = error.strerror
+            reason = os.strerror(error.errno) if error.errno else str(error)
     raise UserError(f"emulator: port {fci.PORT} is not free on {address or 'any loopback address'} ({reason})")
 
 
-def _closed(tcp: socket.socket) -> bool:
+def _is_closed(tcp: socket.socket) -> bool:
     try:
         return tcp.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
     except BlockingIOError:
@@ -271,8 +269,8 @@ def _closed(tcp: socket.socket) -> bool:
 
 
 def check_loopback(address: str) -> None:
-    """Raise UserError unless address is an IPv4 loopback one."""
+    """Raise UserError unless the address is an IPv4 loopback address."""
     with contextlib.suppress(ValueError):
         if ipaddress.IPv4Address(address).is_loopback:
             return
-    raise UserError(f"emulator: address '{address}' must be a loopback one, 127.0.0.1 to 127.255.255.254")
+    raise UserError(f"emulator: address '{address}'; allowed: loopback, 127.0.0.1 to 127.255.255.254")

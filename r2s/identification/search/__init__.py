@@ -1,1 +1,1 @@
-"""One file per search; each minimises a Problem on the unit cube and knows nothing of arms."""
+"""One file per search; each minimizes a `Problem` on the unit cube. Their solver: levenberg_marquardt.py."""

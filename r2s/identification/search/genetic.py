@@ -1,7 +1,7 @@
-"""The paper's genetic algorithm (Alg. 1): select, mutate, update, until converged or G_max; pymoo's GA.
+"""The paper's genetic algorithm (Alg. 1: select, mutate, update until convergence or G_max), as pymoo's GA.
 
-The population starts around the nominal model, not anywhere in the bounds: default operators on all genes of a
-uniform population converge long before the friction curves do.
+The population starts around the nominal model: with default operators a population that is uniform in the bounds
+converges long before the friction curves do.
 """
 
 import time
@@ -23,9 +23,9 @@ class Genetic:
 
     Attributes:
         population: individuals, all simulated at once.
-        generations: G_max. minutes: wall-clock bound, whichever comes first.
+        generations: G_max. minutes: time limit.
         spread: standard deviation of the first population about the nominal model, of the unit cube.
-        patience, tolerance: converged once the best error improved by less than `tolerance` (relative) over
+        patience, tolerance: it has converged if the best cost improved by less than `tolerance` (relative) over
             `patience` generations.
         seed: of every draw.
     """
@@ -52,13 +52,8 @@ class Genetic:
             def _evaluate(self, x, out, *args, **kwargs):
                 out["F"] = (problem.residual(x) ** 2).sum(-1, keepdims=True)
 
-        algorithm = GA(
-            pop_size=self.population,
-            sampling=first,
-            crossover=SBX(eta=10, prob=0.9),
-            mutation=PM(eta=15),
-            eliminate_duplicates=True,
-        )
+        operators = {"crossover": SBX(eta=10, prob=0.9), "mutation": PM(eta=15), "eliminate_duplicates": True}
+        algorithm = GA(pop_size=self.population, sampling=first, **operators)
         algorithm.setup(Replay(), termination=NoTermination(), seed=self.seed)
         began, costs = time.perf_counter(), []
         for generation in range(1, self.generations + 1):

@@ -1,13 +1,13 @@
-"""Least squares as a search, on replays or on the level of torque (levenberg_marquardt.py does the work)."""
+"""Least squares on replays or on torque (solver: levenberg_marquardt.py)."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from r2s.identification.levenberg_marquardt import minimise
 from r2s.identification.problem import Problem, Report
+from r2s.identification.search.levenberg_marquardt import minimize
 
-ROUNDS = 4  # the first weights are those of a nominal arm, and say little
+ROUNDS = 4  # reweighted fits on torque; the first weights are those of the nominal arm
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class LeastSquares:
     """The search.
 
     Attributes:
-        max_evaluations: Jacobians at most. ftol: relative gain that ends it. minutes: of wall clock at most.
-        level: "residual", or "torque" for the residual on the level of torque: a linear-regressor start in seconds.
+        max_evaluations: largest number of Jacobians. ftol: relative gain of a step that ends it. minutes: time limit.
+        level: "residual" for the problem's data, or "torque" for its torque residual, a regression in seconds.
     """
 
     max_evaluations: int = 40
@@ -27,10 +27,10 @@ class LeastSquares:
 
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
         """Return u (P,) from `start` (P,)."""
-        how = (self.max_evaluations, self.ftol, self.minutes, report)
-        if self.level == "torque":
-            for _ in range(ROUNDS):  # each with weights from what the one before could not explain
-                start = minimise(problem.quick, problem.quick_jacobian, start, *how, "torque")
-                problem.quick_data.adapt(problem.space.from_unit(start), fitted=True)
-            return start
-        return minimise(problem.residual, lambda u: problem.jacobian(u)[1], start, *how)
+        limits = (self.max_evaluations, self.ftol, self.minutes, report)
+        if self.level != "torque":
+            return minimize(problem.residual, lambda u: problem.linearize(u)[1], start, *limits)
+        for _ in range(ROUNDS):  # iteratively reweighted
+            start = minimize(problem.torque_residual, problem.torque_jacobian, start, *limits, "torque")
+            problem = problem.torque_reweighted(start)
+        return start

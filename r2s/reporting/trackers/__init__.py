@@ -1,1 +1,1 @@
-"""Trackers: what shows a run elsewhere than in its folder, while it goes on. One file each; behind.py calls them."""
+"""Trackers show a run outside its folder while it is running; async_tracker.py calls them."""

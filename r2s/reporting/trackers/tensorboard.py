@@ -5,43 +5,36 @@ from pathlib import Path
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from r2s.reporting.trackers.tracker import Tracked, needs
+from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
 
 
-class Tensorboard:
-    """Scalars, settings and figures; files that it cannot hold are named in its texts."""
+class Tensorboard(LoggerTracker):
+    """Scalars, settings and figures; other files are listed as text, because event files hold none."""
 
     def __init__(self) -> None:
         needs("tensorboard", "tensorboard")
 
     def start(self, run: Tracked) -> None:
         """Write into <run folder>/tensorboard."""
-        from torch.utils.tensorboard.summary import hparams
-
-        self._again = run.resumed
+        self._run, self._resumes, self._begins = run, run.resumed, not run.resumed
         self._logger = TensorboardLogger("tensorboard", str(run.folder))
         if not run.resumed:
-            for summary in hparams(
-                run.settings, {"summary/best/success_1cm": 0}
-            ):  # add_hparams makes another run of it
-                self._logger.experiment.file_writer.add_summary(summary)
             self._logger.experiment.add_text("group", run.group or "none")
         self._logger.flush()
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
         """Show a row of <table>.csv."""
-        if self._again:
-            self._again = False
-            self._forget_from(step)
-        self._logger.log_metrics({f"{table}/{k}": v for k, v in numbers.items()}, step)
-        self._logger.flush()  # else a killed run loses two minutes
-
-    def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the last word."""
-        self._logger.log_metrics({f"summary/{k}": v for k, v in numbers.items()}, 0)
+        if self._resumes:
+            self._resumes = False
+            self._hide_from(step)
+        if self._begins:
+            self._begins = False
+            self._settings()
+        super().log(table, numbers, step)
+        self._logger.flush()  # without it a killed run loses two minutes
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Show the figures, name the files."""
+        """Show the figures and list the files."""
         import numpy as np
         from PIL import Image
 
@@ -53,8 +46,16 @@ class Tensorboard:
         writer.add_text("status", status)
         self._logger.shutdown()
 
-    def _forget_from(self, step: int) -> None:
-        """Hide what a stopped run wrote from here on: it comes again."""
+    def _settings(self) -> None:
+        """Write the settings with the measure that runs are compared by; add_hparams would begin another run."""
+        from torch.utils.tensorboard.summary import hparams
+
+        metric = {f"summary/best/{self._run.measures.selection[0]}": 0}
+        for summary in hparams(self._run.settings, metric if self._run.stage == "train" else {}):
+            self._logger.experiment.file_writer.add_summary(summary)
+
+    def _hide_from(self, step: int) -> None:
+        """Hide the rows of the stopped run from this step on, which the resumed run writes again."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         begin = Event(step=step, session_log=SessionLog(status=SessionLog.START))

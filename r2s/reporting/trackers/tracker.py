@@ -1,4 +1,4 @@
-"""What a tracker is, and what it is told of a run. One of your own is such a class and a file of conf/tracker."""
+"""The tracker interface and the run that it shows. Your own tracker is such a class and a file of conf/tracker."""
 
 import importlib
 import json
@@ -9,10 +9,12 @@ from threading import Lock
 from typing import Any, Protocol
 
 from r2s.errors import UserError
+from r2s.reporting.measures import measures_of
 from r2s.runs import write_json
+from r2s.tasks.measures import MeasureTable
 
-KEPT = "trackers.json"  # in the run folder: what a resumed run is called by its trackers
-ONE = Lock()  # thread at a time writes it
+FILE = "trackers.json"  # in the run folder: ids that a resumed run continues
+WRITING = Lock()  # trackers run in threads of their own and share FILE
 
 
 @dataclass(frozen=True)
@@ -20,10 +22,9 @@ class Tracked:
     """A run, for its trackers.
 
     Attributes:
-        folder: of the run, runs/<stage>/<name>. stage: that made it.
-        group: the sweep that it is a job of, None for a run by itself.
-        config: whole, as dicts. meta: its meta.json: git commit, versions, machine.
-        resumed: whether it goes on where it was stopped.
+        folder: runs/<stage>/<name>. stage: of the run. group: the sweep that it belongs to, or None.
+        config: composed config as dicts. meta: meta.json: git commit, versions, machine.
+        resumed: whether the run continues a stopped one.
     """
 
     folder: Path
@@ -35,49 +36,68 @@ class Tracked:
 
     @property
     def name(self) -> str:
-        """<stage>/<name>, which no other run of the same root has."""
+        """<stage>/<name>, unique in a root."""
         return f"{self.stage}/{self.folder.name}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The config without levels, {"algo.lr": 5e-4, ...}, with the git commit: numbers, words and truth values."""
+        """The flat config, {"algo.lr": 5e-4, ...}, and the git commit; values are numbers, strings and booleans."""
         git = self.meta["git"]
         plain = {k: v if isinstance(v, bool | int | float) else str(v) for k, v in flat(self.config)}
         return plain | {"git_commit": str(git["commit"]), "git_dirty": str(git["dirty"])}
 
+    @property
+    def measures(self) -> MeasureTable:
+        """The measures of the run's task; a training and a transfer write them before their first row."""
+        return measures_of(self.folder)
+
     def kept(self, key: str) -> str | None:
-        """Return what `keep` kept of this run when it was stopped; None where there is nothing."""
-        path = self.folder / KEPT
+        """Return what `keep` stored before the run was stopped, or None."""
+        path = self.folder / FILE
         return json.loads(path.read_text()).get(key) if path.is_file() else None
 
     def keep(self, key: str, value: str | None) -> None:
-        """Remember `value` in the run folder, for `kept` of a resumed run."""
-        path = self.folder / KEPT
-        with ONE:
+        """Store `value` in the run folder for `kept` of the resumed run."""
+        path = self.folder / FILE
+        with WRITING:
             write_json(path, (json.loads(path.read_text()) if path.is_file() else {}) | {key: value})
 
 
 class Tracker(Protocol):
-    """Shows runs somewhere. Made from its yaml before the run folder is; the calls come from one thread, in order.
+    """Shows a run elsewhere. Hydra constructs it before the run folder exists; one thread makes all calls in order.
 
-    Whatever it raises ends its part in the run, with one warning; the run goes on.
+    An exception ends the tracker with one warning; the run continues.
     """
 
     def start(self, run: Tracked) -> None:
-        """Begin to show a run, or go on with it where `run.resumed`."""
+        """Begin to show a run, or continue it if `run.resumed`."""
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv; `step` is its env_steps, or the row's number where there are none."""
+        """Show a row of <table>.csv; `step` is its env_steps, else the row's number."""
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the last word, {"best/success_1cm": 0.93, ...}."""
+        """Show the numbers of summary.json, {"best/success_1cm": 0.93, ...}."""
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Keep figures (PNG) and other files, and end: done, stopped or failed."""
+        """Store figures (PNG) and other files, and end the run as done, stopped or failed."""
+
+
+class LoggerTracker:
+    """The rows and the summary of a tracker on a logger of TorchRL, which its `start` sets as `_logger`."""
+
+    _logger: Any
+
+    def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
+        """Show a row of <table>.csv."""
+        self._logger.log_metrics({f"{table}/{k}": v for k, v in numbers.items()}, step)
+
+    def summary(self, numbers: Mapping[str, float]) -> None:
+        """Show the numbers of summary.json."""
+        self._logger.log_metrics({f"summary/{k}": v for k, v in numbers.items()}, 0)
 
 
 def needs(package: str, tracker: str) -> None:
-    """Import what a tracker needs, before there is a run folder.
+    """Import a package of a tracker before the run folder exists.
 
     Raises:
         UserError: it is not installed.
@@ -86,12 +106,12 @@ def needs(package: str, tracker: str) -> None:
         importlib.import_module(package)
     except ImportError as error:
         raise UserError(
-            f"tracker={tracker}: {package} cannot be imported ({error}); pip install 'r2s[{tracker}]' brings it"
+            f"tracker={tracker}: cannot import {package} ({error}); install it with pip install 'r2s[{tracker}]'"
         ) from None
 
 
 def flat(node: Any, prefix: str = "", between: str = ".") -> Iterator[tuple[str, Any]]:
-    """Give ("a.b", value) of nested dicts."""
+    """Yield ("a.b", value) of nested dicts."""
     for key, value in node.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{prefix}{key}{between}", between)

@@ -13,27 +13,27 @@ class Trackio:
     """A run of a project.
 
     Args:
-        folder: of the databases, one a project, for a whole process; TRACKIO_DIR in the environment goes before it.
-        project: that the runs belong to.
+        folder: of the databases, one per project; the environment variable TRACKIO_DIR overrides it.
+        project: of the run.
     """
 
     def __init__(self, folder: str, project: str = "r2s"):
         os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
-        os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # read when it is imported
+        os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # read at import
         needs("trackio", "trackio")
         self._project = project
 
     def start(self, run: Tracked) -> None:
-        """Begin a run, or go on with the one that the run folder names."""
+        """Begin a run, or continue the one stored in the run folder."""
         import trackio
 
         for module in (trackio, trackio.run, trackio.utils):
-            vars(module)["print"] = lambda *words, **how: None  # it talks into the output of the run
+            vars(module)["print"] = lambda *args, **kwargs: None  # keep its messages out of the output
         resume = "must" if run.resumed and run.kept("trackio") else "never"
         config = run.settings | {"folder": str(run.folder.absolute())}
         quiet = {"auto_log_gpu": False, "auto_log_cpu": False}
-        how = {"resume": resume, "group": run.group, "config": config, "embed": False, **quiet}
-        self._logger = TrackioLogger(run.name, self._project, **how)
+        start = {"resume": resume, "group": run.group, "config": config, "embed": False, **quiet}
+        self._logger = TrackioLogger(run.name, self._project, **start)
         run.keep("trackio", run.name)
 
     def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
@@ -41,11 +41,11 @@ class Trackio:
         self._logger.experiment.log({f"{table}/{k}": v for k, v in numbers.items()}, step=step)
 
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the last word."""
+        """Show the numbers of summary.json."""
         self._logger.experiment.log({f"summary/{k}": v for k, v in numbers.items()})
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Keep figures and files."""
+        """Store figures and files."""
         import trackio
 
         run = self._logger.experiment

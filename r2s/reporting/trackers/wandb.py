@@ -1,4 +1,4 @@
-"""tracker=wandb: Weights & Biases, offline in the run folder; `wandb sync runs/*/*/wandb/offline-run-*` sends it."""
+"""tracker=wandb: Weights & Biases, offline in the run folder; upload: `wandb sync runs/*/*/wandb/offline-run-*`."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -7,14 +7,14 @@ from uuid import uuid4
 
 from torchrl.record.loggers.wandb import WandbLogger
 
-from r2s.reporting.trackers.tracker import Tracked, needs
+from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
 
 
-class Wandb:
+class Wandb(LoggerTracker):
     """A run of a project.
 
     Args:
-        project, entity: where it belongs; None is your own entity. offline: whether nothing leaves this computer.
+        project, entity: of the run; None is your own entity. offline: store the run on this computer only.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):
@@ -24,7 +24,7 @@ class Wandb:
         self._where, self._offline = {"project": project, "entity": entity}, offline
 
     def start(self, run: Tracked) -> None:
-        """Begin a run, or go on with the one that the run folder names."""
+        """Begin a run, or continue the one stored in the run folder."""
         import wandb
 
         known = run.kept("wandb") if run.resumed else None
@@ -44,16 +44,12 @@ class Wandb:
             settings=wandb.Settings(console="off"),
         )
 
-    def log(self, table: str, numbers: Mapping[str, float], step: int) -> None:
-        """Show a row of <table>.csv."""
-        self._logger.log_metrics({f"{table}/{k}": v for k, v in numbers.items()}, step)
-
     def summary(self, numbers: Mapping[str, float]) -> None:
-        """Show the last word."""
+        """Show the numbers of summary.json."""
         self._logger.experiment.summary.update({f"summary/{k}": v for k, v in numbers.items()})
 
     def finish(self, status: str, pictures: Sequence[Path], files: Sequence[Path]) -> None:
-        """Keep figures and files."""
+        """Store figures and files."""
         import wandb
 
         run = self._logger.experiment
@@ -63,4 +59,4 @@ class Wandb:
             run.save(str(path), base_path=str(self._folder), policy="now")
         run.summary["status"] = status
         run.finish(exit_code=0 if status == "done" else 1)
-        wandb.teardown()  # its service would outlive the run
+        wandb.teardown()  # its service process would outlive the run

@@ -1,0 +1,94 @@
+"""The identified arm as arrays for compiled functions: links, friction, latency.
+
+A table per joint holds friction of any family: a part with the sign of the sliding direction, one row per direction,
+and a part that depends on speed alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.adaptation.tuning import BREAKAWAY_SPEED, LEVEL_SPEED, TABLE_END
+from r2s.compiled import njit
+from r2s.physics.actuation import steps_late
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import PRESLIDING
+from r2s.physics.newton_euler import links_of
+from r2s.physics.payload import ee_pose
+from r2s.physics.robot import Robot
+
+POINTS = 401  # per direction of a table, denser towards rest
+FORWARD, BACKWARD, SPEED_ONLY = range(3)  # rows of a table
+
+
+class ArmModel(NamedTuple):
+    """The arm of n joints without a payload, as float arrays.
+
+    No identification fits `angle_friction` and `compliance`; see model_correction.py.
+    """
+
+    links: np.ndarray  # (n, LINK)
+    compensated: np.ndarray  # (n, 4) kg and kg m, mass and first moment that gravity compensation uses
+    payload_frame: np.ndarray  # (12,), position and axes in the last link
+    gravity: np.ndarray  # (3,) m/s^2
+    armature: np.ndarray  # (n,) kg m^2
+    offset: np.ndarray  # (n,) Nm; for this and the next two see `Dynamics`
+    load: np.ndarray  # (n,)
+    drag: np.ndarray  # (n, 2)
+    angle_friction: np.ndarray  # (n, 2) Nm, friction with sin q and cos q
+    compliance: np.ndarray  # (n,) rad/Nm, of the gears
+    table: np.ndarray  # (n, 3, 2 POINTS - 1) Nm
+    max_speed: np.ndarray  # (n,) rad/s, at the end of the table
+    presliding: np.ndarray  # (n,) rad
+    level: np.ndarray  # (n,) Nm, sliding friction
+    breakaway: np.ndarray  # (n,) Nm, the most that stiction carries
+    latency: np.ndarray  # (2,) cycles, delay and lag
+
+
+def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
+    """Return the arrays of one arm with dynamics `d`, without a batch shape."""
+    position, axes = ee_pose(robot)
+    compensated = np.column_stack([robot.mass, robot.mass[:, None] * robot.com])
+    compensated[-1] += d.declared_payload
+    max_speed = TABLE_END * robot.dq_max
+    grid = np.linspace(-1, 1, 2 * POINTS - 1)
+    speed = (np.sign(grid) * grid**2)[:, None] * max_speed
+    speed_only = d.family.torque(speed, d.phi, np.zeros_like(speed))
+    forward = d.family.torque(speed, d.phi, np.ones_like(speed)) - speed_only
+    backward = speed_only - d.family.torque(speed, d.phi, -np.ones_like(speed))
+    names = d.family.names[: d.phi.shape[-1]]
+    presliding = d.phi[:, names.index("presliding")] if "presliding" in names else np.full(robot.n, PRESLIDING)
+    slow = np.full(robot.n, BREAKAWAY_SPEED)
+    slow_friction = np.abs([d.friction(slow), d.friction(-slow)]).max(0)
+    sliding = np.full(robot.n, LEVEL_SPEED)
+    latency = [float(x) for x in steps_late(d.delay, d.lag)]
+    return ArmModel(
+        links=links_of(robot, d.mass, d.com, d.inertia),
+        compensated=compensated,
+        payload_frame=np.concatenate([position, axes.ravel()]),
+        gravity=np.array(robot.gravity, dtype=float),
+        armature=np.array(d.armature, dtype=float),
+        offset=np.array(d.offset, dtype=float),
+        load=np.array(d.load, dtype=float),
+        drag=np.array(d.drag, dtype=float),
+        angle_friction=np.zeros((robot.n, 2)),
+        compliance=np.zeros(robot.n),
+        table=np.ascontiguousarray(np.stack([forward, backward, speed_only]).transpose(2, 0, 1)),
+        max_speed=max_speed,
+        presliding=np.array(presliding, dtype=float),
+        level=0.5 * np.abs(d.friction(sliding) - d.friction(-sliding)),
+        breakaway=np.maximum(np.abs(d.breakaway).max(-1), slow_friction),
+        latency=np.array(latency),
+    )
+
+
+@njit(cache=True, inline="always")
+def friction_torque(table, max_speed, v, z):
+    """Return friction in Nm at v rad/s with presliding deflection z in [-1, 1]; table (3, 2 POINTS - 1)."""
+    u = min(abs(v) / max_speed, 1.0) ** 0.5
+    at = (u if v >= 0.0 else -u) * (POINTS - 1) + (POINTS - 1)
+    k = min(int(at), 2 * POINTS - 3)
+    share = at - k
+    side = FORWARD if z >= 0.0 else BACKWARD
+    sign = table[side, k] + share * (table[side, k + 1] - table[side, k])
+    return sign * z + table[SPEED_ONLY, k] + share * (table[SPEED_ONLY, k + 1] - table[SPEED_ONLY, k])

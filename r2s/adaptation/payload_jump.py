@@ -1,0 +1,140 @@
+"""Test for sudden payload changes, and their entry into the Kalman filter; compiled.
+
+A generalised likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). For each of the last ONSETS spans it
+keeps the filter's signature of a payload jump that began there, and computes the odds of that jump under a prior.
+Without a jump the mean odds have expectation 1, so odds above x have probability 1 / x at most (Markov's inequality):
+a threshold equal to the number of tests in ten hours allows one false alarm in that time. Model errors have heavier
+tails than the filter's noise; hence ten hours for a target of one alarm per hour.
+"""
+
+import numpy as np
+
+from r2s.adaptation.momentum import BODY
+from r2s.adaptation.momentum_residual import STEP_RESPONSE
+from r2s.adaptation.tuning import NEW_PAYLOAD, ONSETS
+from r2s.compiled import njit
+
+JUMP = 4  # parameters of a jump: mass and first moments
+# `Filter.counts`: onsets in use, the next onset, spans that still contain the last jump
+USED, NEXT, SINCE_JUMP = range(2, 5)
+MEAN, ONSET = range(2)  # `Filter.log_odds`
+
+
+@njit(cache=True)
+def begin_onset(filter):
+    """Replace the oldest onset by a jump that begins with this span."""
+    at = filter.counts[NEXT]
+    filter.signature[at] = 0.0
+    filter.information[at] = 0.0
+    filter.vector[at] = 0.0
+    filter.counts[NEXT] = (at + 1) % ONSETS
+    filter.counts[USED] = min(filter.counts[USED] + 1, ONSETS)
+
+
+@njit(cache=True, error_model="numpy")
+def update_onsets(filter, residual, j, v, S):
+    """Add joint j's innovation v with variance S to all onsets; filter.work[0]: (N,), P h^T."""
+    g, h, payload, N, n = np.empty(JUMP), filter.work[0], residual.payload, len(filter.x), len(residual.y)
+    friction, offset, error, rate = BODY + j, BODY + n + j, BODY + 2 * n + j, BODY + 3 * n + j
+    for k in range(filter.counts[USED]):
+        f, C, d = filter.signature[k], filter.information[k], filter.vector[k]
+        age = (filter.counts[NEXT] - 1 - k) % ONSETS
+        share = STEP_RESPONSE[age] if age < len(STEP_RESPONSE) else 1.0
+        for c in range(JUMP):
+            s = share * payload[j, c] - f[friction, c] * residual.friction[j] - f[offset, c]
+            s -= f[error, c] + f[rate, c] * residual.rate[j]
+            for i in range(BODY):
+                s -= payload[j, i] * f[i, c]
+            g[c] = s
+        for c in range(JUMP):
+            d[c] += g[c] * v / S
+            for i in range(JUMP):
+                C[c, i] += g[c] * g[i] / S
+            for i in range(N):
+                f[i, c] += h[i] / S * g[c]
+
+
+@njit(cache=True, error_model="numpy")
+def detect(filter, noise):
+    """Write the log odds of a jump; of one onset they are d (C + P0^-1)^-1 d / 2 - log(det(1 + P0 C)) / 2."""
+    best, at, mean, total = -np.inf, -1, -np.inf, 0.0
+    A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
+    logs = np.empty(ONSETS)
+    for k in range(filter.counts[USED]):
+        logs[k] = _solve(filter.information[k], filter.vector[k], noise.prior, A, b)
+        if logs[k] > best:
+            best, at = logs[k], k
+    if at >= 0:
+        mean = best
+        for k in range(filter.counts[USED]):
+            total += np.exp(logs[k] - best)
+        mean += np.log(total / filter.counts[USED])
+    filter.log_odds[MEAN], filter.log_odds[ONSET] = mean, at
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(C, d, prior, A, b):
+    """Return the log odds; leave the Cholesky factor of C + P0^-1 in A, diagonal inverted, and the solution in b."""
+    log = 0.0
+    for i in range(JUMP):
+        for k in range(i + 1):
+            s = C[i, k] + (1.0 / prior[i] ** 2 if i == k else 0.0)
+            for c in range(k):
+                s -= A[i, c] * A[k, c]
+            A[i, k] = s * A[k, k] if k < i else 1.0 / np.sqrt(s)
+        log += np.log(A[i, i]) - np.log(prior[i])
+    for i in range(JUMP):
+        s = d[i]
+        for c in range(i):
+            s -= A[i, c] * b[c]
+        b[i] = s * A[i, i]
+        log += 0.5 * b[i] * b[i]
+    for i in range(JUMP - 1, -1, -1):
+        s = b[i]
+        for c in range(i + 1, JUMP):
+            s -= A[c, i] * b[c]
+        b[i] = s * A[i, i]
+    return log
+
+
+@njit(cache=True, error_model="numpy")
+def apply_jump(filter, noise):
+    """Add the likeliest jump to the estimate, and discard all onsets."""
+    k, N = int(filter.log_odds[ONSET]), len(filter.x)
+    A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
+    _solve(filter.information[k], filter.vector[k], noise.prior, A, b)
+    B = -filter.signature[k]
+    for c in range(JUMP):
+        B[c, c] += 1.0
+    inverse = np.zeros((JUMP, JUMP))  # of the Cholesky factor
+    for c in range(JUMP):
+        inverse[c, c] = A[c, c]
+        for i in range(c + 1, JUMP):
+            s = 0.0
+            for m in range(c, i):
+                s -= A[i, m] * inverse[m, c]
+            inverse[i, c] = s * A[i, i]
+    root = np.zeros((N, JUMP))  # B (C + P0^-1)^-1 B^T = root root^T
+    for i in range(N):
+        for m in range(JUMP):
+            for c in range(m + 1):
+                root[i, m] += B[i, c] * inverse[m, c]
+        for c in range(JUMP):
+            filter.x[i] += B[i, c] * b[c]
+    for i in range(N):
+        for k2 in range(N):
+            for m in range(JUMP):
+                filter.P[i, k2] += root[i, m] * root[k2, m]
+    widen_payload(filter.P, noise)  # the jump may have happened within the span
+    for c in range(JUMP, BODY):
+        filter.P[c, c] += noise.prior[c] ** 2
+    filter.counts[USED] = 0
+    filter.counts[NEXT] = 0
+    filter.counts[SINCE_JUMP] = len(STEP_RESPONSE)
+
+
+@njit(cache=True)
+def widen_payload(P, noise):
+    """Raise the variances of mass and first moments to those of a new payload."""
+    for c in range(JUMP):
+        P[c, c] += (NEW_PAYLOAD * noise.prior[c]) ** 2

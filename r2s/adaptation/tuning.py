@@ -1,0 +1,77 @@
+"""Tuning constants of the room adaptation, each with its unit and source.
+
+A constant without a named source is an order of magnitude. benchmarks/payload.py measured the room with all of them
+on development twins (seeds 0 to 9); it also compares other values: NAME=VALUE on its command line.
+"""
+
+import numpy as np
+from scipy.stats import chi2
+
+from r2s.physics.payload import FARTHEST_M, MOST_KG
+from r2s.physics.robot import SIM_DT
+from r2s.physics.safety_filter import RATE
+
+# friction tables (arm_model.py)
+TABLE_END = 1.5  # of dq_max: speed at the end of a friction table
+BREAKAWAY_SPEED = 0.02  # rad/s: friction there replaces a breakaway that was not measured
+LEVEL_SPEED = 0.1  # rad/s, where the friction level is read
+
+# momentum residual (momentum_residual.py)
+SPAN = 20  # cycles: triangles of two spans remove 97.6 % of a gear vibration at 60 Hz
+T = SPAN * SIM_DT  # s
+SLIDING_DEFLECTION = 0.9  # of the presliding deflection: a joint slides beyond it
+SLIDING_SPEED = 0.02  # rad/s: stiction may hold a slower joint
+
+# standard deviations of the model correction's priors (model_correction.py)
+LINK_MASS_SHARE, LINK_CENTRE_M = 0.02, 0.002  # of a link's mass; m
+LOAD_FRICTION, CABLE_TORQUE = 0.01, 0.15  # Nm per Nm; Nm
+FRICTION_LAW_SHARE, ANGLE_FRICTION_SHARE = 0.2, 0.03  # of the friction level
+FRICTION_SHARE = OFFSET_NM = 0.3  # of friction; Nm
+ROTOR_INERTIA, LATENCY_S = 0.1, 0.002  # kg m^2; s
+GEAR_COMPLIANCE = 1e-4  # rad/Nm: gears of 10 kNm/rad
+STRIBECK_SPEED = 0.03  # rad/s, of the term that falls with speed
+LEAST_SPANS = 50  # sliding spans that a fit needs
+CORRELATED_SPANS = 15  # spans that share one error: 0.3 s, see CORRELATION_S
+
+# noise model (noise_model.py)
+PAYLOAD_MASS = MOST_KG / np.sqrt(3)  # kg, root mean square of a uniform mass up to MOST_KG
+PAYLOAD_MOMENT = PAYLOAD_MASS * FARTHEST_M / np.sqrt(5)  # kg m per axis, for centres uniform in the ball
+PAYLOAD_TENSOR = 4e-3  # kg m^2: 0.87 kg of 5 cm size, 5 cm from the payload frame
+WARMED = 0.07  # share of friction that may have changed by temperature since the identification
+FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
+OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # of the friction level; per sqrt(s)
+REST_DRIFT = 0.02  # kg^2/s: after 1 s the mass interval spans what stiction hides, b / (r g), 0.1 to 0.25 kg
+PAYLOAD_DRIFT = 0.003  # 1/sqrt(s), share of the payload's prior
+NOISE_ADAPTATION = 0.04  # per span: persistent innovations become noise within 0.5 s
+CORRELATION_S = 0.3  # s, of the model error
+PAYLOAD_FRICTION = 0.015  # Nm per Nm of payload torque: load-dependent friction
+# shares of the friction level without recordings: white noise, model error; the other two of what they scale with
+WHITE_SHARE, MOMENTUM_SHARE, MODEL_SHARE, REVERSAL_SHARE = 0.2, 0.1, 0.1, 0.1
+LAGS = range(3, 16)  # spans, at which residuals no longer share the noise of measured speeds
+FINEST_SHARE = 0.03  # of the friction level: the smallest error that a model gets
+SECOND_HALF = 0.7  # scale of a noise fitted from half of the motion; benchmarks/payload.py part=events,quiet
+LEAST_SCALE, MOST_SCALE, SCALINGS = 0.5, 1.5, 8  # of the noise: bounds of one step, and steps at most
+OUTLIER = 3.0  # standard deviations, at which innovations are clipped: the filter weighs larger ones less
+
+# Kalman filter (kalman.py)
+MOMENTUM_CORRELATION = 5.0  # correlation time of the momentum-rate error, in CORRELATION_S
+STICTION_S = 0.25  # s, over which the torque that stiction carries stays constant
+REST_SPANS = 5  # spans without sliding, after which an arm is at rest
+HUBER = 1.5  # standard deviations of an innovation; benchmarks/payload.py part=events,quiet
+MOST_SURPRISE = 9.0  # squared standard deviations: a larger innovation is a jump, not noise
+
+# test for payload jumps (payload_jump.py, estimator.py)
+ONSETS = 10  # spans at which a jump may have begun: 0.2 s
+THRESHOLD = np.log(36000.0 / T)  # log odds: one false alarm in ten hours (Markov's inequality)
+NEW_PAYLOAD = 0.2  # of the prior: standard deviation of a payload directly after a jump
+SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest, in which the payload is compared with that before
+# squared distance of two estimates: one false alarm in an hour of tests, doubled because model errors persist
+REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
+
+# reported estimate (estimator.py)
+LEAST_KG = 0.02  # kg: no centre is reported for a smaller mass
+FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot follow
+
+# feedforward (feedforward.py)
+BLENDING = -np.expm1(-SIM_DT / T)  # per cycle: a new estimate enters over one span
+ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a loop of this rate tolerates the latency of an arm

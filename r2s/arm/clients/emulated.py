@@ -1,0 +1,54 @@
+"""The Franka clients connected to our emulator of the control box, with a hidden twin behind it."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from functools import partial
+from typing import Any
+
+from r2s.arm.clients.consent import Operator, find_operator
+from r2s.arm.clients.fr3 import FR3
+from r2s.arm.clients.franka import Franka
+from r2s.arm.clients.libfranka import CAUTIOUS, CollisionThresholds
+from r2s.arm.clients.panda import Panda
+from r2s.arm.emulator.process import Emulator
+from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.errors import UserError, choices
+from r2s.physics.robot import Robot
+
+CLIENTS: dict[str, tuple[type[Panda] | type[FR3], int]] = {"panda": (Panda, 5), "fr3": (FR3, 10)}  # with FCI version
+
+
+def emulated_arm(
+    robot: Robot,
+    *,
+    client: str,
+    seed: int = 0,
+    realtime: bool = False,
+    noise: int = 0,
+    payload: Any = 0.0,
+    declared_payload: Any = None,
+    operator: Operator | str | None = "terminal",
+    collision_torque: Sequence[float] = CAUTIOUS.torque,
+    collision_force: Sequence[float] = CAUTIOUS.force,
+) -> AbstractContextManager[Franka]:
+    """Open an emulated Panda or FR3. These are the keys of conf/arm/*_emulated.yaml.
+
+    Args:
+        robot: nominal model. client: 'panda' or 'fr3'.
+        seed: of the rigid twin. noise, payload, declared_payload: see `TwinBase`.
+        realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force: see `Panda`.
+    """
+    if client not in CLIENTS:
+        raise UserError(f"arm.client: {client!r}; allowed: {choices(CLIENTS)}")
+    make, version = CLIENTS[client]
+    CollisionThresholds(collision_torque, collision_force)  # checked before the emulator starts
+    settings: dict[str, Any] = {"collision_torque": collision_torque, "collision_force": collision_force}
+    arm = partial(make, robot, operator=find_operator(operator), **settings)
+    twin = partial(RigidTwin, robot, seed, payload=payload, noise=noise, declared_payload=declared_payload)
+    return _opened(arm, Emulator(twin, version=version, realtime=realtime))
+
+
+@contextmanager
+def _opened(make_arm: Callable[[str], Franka], emulator: Emulator) -> Iterator[Franka]:
+    with emulator as address, closing(make_arm(address)) as arm:
+        yield arm

@@ -1,0 +1,96 @@
+"""The wire format of the Franka Control Interface (FCI), as far as torque control needs it.
+
+A client connects to TCP port 1337 and sends its version and a UDP port. The robot then sends one RobotState per
+millisecond by UDP and, during a motion, expects a RobotCommand for each. Two versions are implemented: 5 (libfranka
+0.9, the Panda, FER) and 10 (libfranka 0.18 and later, the FR3). All structs are packed and little-endian.
+
+Source: the public headers of libfranka-common (service_types.h, rbk_types.h), checked against both client packages.
+"""
+
+import numpy as np
+
+PORT = 1337  # fixed in libfranka: several robots need several addresses
+VERSIONS = (5, 10)
+HEADER = np.dtype([("command", "<u4"), ("id", "<u4"), ("size", "<u4")])  # size includes the header
+CONNECT = np.dtype([("version", "<u2"), ("udp_port", "<u2")])
+MOVE = np.dtype([("controller_mode", "<u4"), ("motion_generator_mode", "<u4")])  # unused deviations follow
+COLLISION = np.dtype(  # both our clients set the thresholds during acceleration to the same values
+    [
+        ("torque_acceleration", "<f8", (2, 7)),
+        ("lower_torque", "<f8", 7),
+        ("upper_torque", "<f8", 7),
+        ("force", "<f8", (4, 6)),
+    ]
+)
+
+
+_SHARED = ("Connect", "Move", "StopMove")
+_SETTERS = (
+    "SetCollisionBehavior", "SetJointImpedance", "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE",
+    "SetLoad",
+)  # fmt: skip
+REQUESTS = {  # a request's number is its index
+    5: (*_SHARED, "GetCartesianLimit", *_SETTERS, "SetFilters", "AutomaticErrorRecovery", "LoadModelLibrary"),
+    10: (*_SHARED, *_SETTERS, "AutomaticErrorRecovery", "GetRobotModel"),
+}
+MOVE_STATUS = {
+    5: {
+        "Success": 0, "MotionStarted": 1, "Preempted": 2, "NotPossible": 3, "InvalidArgument": 5,
+        "ReflexAborted": 6, "EmergencyAborted": 7,
+    },
+    10: {
+        "Success": 0, "MotionStarted": 1, "Preempted": 2, "NotPossible": 5, "InvalidArgument": 7,
+        "ReflexAborted": 8, "EmergencyAborted": 9,
+    },
+}  # fmt: skip
+DONE, NOT_POSSIBLE, EMERGENCY = 0, 1, 5  # status of all other requests; NOT_POSSIBLE also means a wrong version
+
+
+# torque control in a Move request, and in RobotState during the motion; 0.9 has no "none" among motion generators
+EXTERNAL_CONTROLLER = 2
+GENERATOR_REQUESTED = {5: 1, 10: 4}
+GENERATOR_RUNNING = {5: 2, 10: 5}
+OTHER_CONTROLLER, NO_GENERATOR = 3, 0
+
+
+IDLE, MOVE_MODE, GUIDING, REFLEX, USER_STOPPED = 1, 2, 3, 4, 5  # robot_mode
+
+
+# indices in `errors` and `reflex_reason`, of 41
+N_ERRORS = 41
+JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX = 0, 3, 6
+COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34
+
+
+_STATE = (
+    ("O_T_EE", 16), ("O_T_EE_d", 16), ("F_T_EE", 16), ("EE_T_K", 16), ("F_T_NE", 16), ("NE_T_EE", 16),
+    ("m_ee", 1), ("I_ee", 9), ("F_x_Cee", 3), ("m_load", 1), ("I_load", 9), ("F_x_Cload", 3),
+    ("elbow", 2), ("elbow_d", 2), ("tau_J", 7), ("tau_J_d", 7), ("dtau_J", 7), ("q", 7), ("q_d", 7),
+    ("dq", 7), ("dq_d", 7), ("ddq_d", 7), ("joint_contact", 7), ("cartesian_contact", 6),
+    ("joint_collision", 7), ("cartesian_collision", 6), ("tau_ext_hat_filtered", 7), ("O_F_ext_hat_K", 6),
+    ("K_F_ext_hat_K", 6), ("O_dP_EE_d", 6), ("O_ddP_O", 3), ("elbow_c", 2), ("delbow_c", 2), ("ddelbow_c", 2),
+    ("O_T_EE_c", 16), ("O_dP_EE_c", 6), ("O_ddP_EE_c", 6), ("theta", 7), ("dtheta", 7),
+)  # fmt: skip
+_ACCELEROMETERS = (("accelerometer_top", 18), ("accelerometer_bottom", 18))
+
+
+def _state_type(number: str, values: tuple[tuple[str, int], ...]) -> np.dtype:
+    flags = [(name, "u1", (N_ERRORS,)) for name in ("errors", "reflex_reason")]
+    return np.dtype(
+        [("message_id", "<u8")]  # also the robot's time in ms
+        + [(name, number, (n,)) for name, n in values]
+        + [("motion_generator_mode", "u1"), ("controller_mode", "u1"), *flags, ("robot_mode", "u1")]
+        + [("control_command_success_rate", number)]
+    )
+
+
+STATE = {5: _state_type("<f8", _STATE), 10: _state_type("<f4", _STATE + _ACCELEROMETERS)}
+
+
+_MOTION = (
+    ("message_id", "<u8"), ("q_c", "<f8", (7,)), ("dq_c", "<f8", (7,)), ("O_T_EE_c", "<f8", (16,)),
+    ("O_dP_EE_c", "<f8", (6,)), ("elbow_c", "<f8", (2,)), ("valid_elbow", "?"), ("motion_generation_finished", "?"),
+    ("tau_J_d", "<f8", (7,)),
+)  # fmt: skip
+COMMAND = {5: np.dtype(list(_MOTION)), 10: np.dtype([*_MOTION, ("torque_command_finished", "?")])}
+FINISHED = {5: "motion_generation_finished", 10: "torque_command_finished"}

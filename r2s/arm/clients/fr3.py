@@ -1,0 +1,101 @@
+"""The FR3 through pylibfranka, libfranka 0.18 and later: hardware, or the emulator in FCI version 10.
+
+pylibfranka has neither rate limiter nor low-pass in this loop: the arm receives each command unchanged.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.clients import fr3_limits
+from r2s.arm.clients.consent import Operator, find_operator
+from r2s.arm.clients.franka import Franka
+from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds
+from r2s.physics.robot import Robot
+
+STOP_DISTANCE = 0.02  # rad, of a joint that brakes from 0.2 rad/s, the speed that an FR3 allows there
+
+
+def within_fr3(robot: Robot) -> Robot:
+    """Return the robot with limits inside an FR3's as well as its own, slowing down before them as an FR3 does.
+
+    An FR3 allows no speed in the last hundredths of a radian. The limits exclude that range and a stopping distance.
+    """
+    margin = fr3_limits.VELOCITY_OFFSET**2 / (2 * fr3_limits.DECELERATION) + STOP_DISTANCE
+    return replace(
+        robot,
+        q_min=np.maximum(robot.q_min, fr3_limits.Q_MIN + margin),
+        q_max=np.minimum(robot.q_max, fr3_limits.Q_MAX - margin),
+        dq_max=np.minimum(robot.dq_max, fr3_limits.DQ_MAX),
+        velocity_envelope=(fr3_limits.DECELERATION, fr3_limits.VELOCITY_OFFSET),
+    )
+
+
+class FR3(Franka):
+    """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
+
+    Raises:
+        UserError: pylibfranka is missing, or no server of its FCI version answers at the address.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        address: str,
+        *,
+        operator: Operator | str | None = None,
+        realtime: bool = False,
+        collision_torque: Sequence[float] = CAUTIOUS.torque,
+        collision_force: Sequence[float] = CAUTIOUS.force,
+    ):
+        thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
+        super().__init__(within_fr3(robot), _FR3Client(address, realtime), operator, thresholds)
+
+
+class _FR3Client(Client):
+    def __init__(self, address: str, realtime: bool):
+        super().__init__("fr3", "pylibfranka", address, realtime)
+        self._control: Any = None
+        self._last = [0.0] * 7
+
+    def start(self) -> Any:
+        return self._call(self._start)
+
+    def exchange(self, tau: np.ndarray) -> Any:
+        return self._call(lambda: self._exchange(tau))
+
+    def finish(self) -> None:
+        if self._control is not None:
+            self._call(self._finish)
+            self._control = None
+
+    def close(self) -> None:
+        self._control = self._robot = None
+
+    def _start(self) -> Any:
+        self._control, self._last = self._robot.start_torque_control(), [0.0] * 7
+        while True:
+            state, _ = self._control.readOnce()
+            # the arm may ignore commands until its success rate is above 0; the caller's first must not get lost
+            if state.control_command_success_rate > 0:
+                return state
+            self._control.writeOnce(self._package.Torques(self._last))
+
+    def _exchange(self, tau: np.ndarray) -> Any:
+        self._last = tau.tolist()
+        self._control.writeOnce(self._package.Torques(self._last))
+        return self._control.readOnce()[0]
+
+    def _finish(self) -> None:
+        torques = self._package.Torques(self._last)  # a step to zero could trigger a reflex
+        torques.motion_finished = True
+        self._control.writeOnce(torques)
+
+    def _call(self, function: Callable[[], Any]) -> Any:
+        try:
+            return super()._call(function)
+        except Exception:
+            self._control = None
+            raise

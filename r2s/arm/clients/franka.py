@@ -1,0 +1,270 @@
+"""What the Panda and the FR3 have in common: the `Arm` protocol on a libfranka client, hardware or emulated.
+
+libfranka has no point-to-point motion in torque control. `move_to` therefore follows a slow, checked joint path with
+the recorder's tracking controller, in the same 1 kHz torque loop as every other motion. It needs no model from the
+client package, and the emulator tests the code that moves the hardware.
+"""
+
+import weakref
+from typing import Any, Self
+
+import numpy as np
+
+from r2s.arm.clients import fci
+from r2s.arm.clients.consent import Operator
+from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds
+from r2s.arm.command_loop import STILL, CommandLoop
+from r2s.arm.driver import Driver
+from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
+from r2s.arm.tracking_controller import CUTOFF_HZ, TrackingController
+from r2s.errors import UserError
+from r2s.excitation.minimum_jerk import minimum_jerk
+from r2s.excitation.motion import Excitation
+from r2s.excitation.motion_checks import Space, friction_margin
+from r2s.excitation.paths import approach
+from r2s.physics.robot import SIM_DT, Robot
+
+# move_to: slow and weak, so that a person who blocks a link meets a bounded force (docs/explanation/safety.md)
+SPEED = 0.2  # of dq_max
+ACCELERATION = 0.2  # of ddq_max
+TORQUE_SHARE = 0.2  # of tau_max, torque limit of the driver
+MAX_DEVIATION = 0.1  # rad off the path; beyond it `move_to` gives up
+SETTLE_S = 3.0  # longest time at the end of the path
+INTEGRAL_GAIN = 15.0  # of tau_max per rad s; overcomes breakaway at the end of the path
+INTEGRAL_SHARE = 0.15  # of tau_max, limit of that integral
+ARRIVED = 2e-3  # rad from the target: the motion ends
+ACCEPTED = 1e-2  # rad from the target after SETTLE_S: accepted, because a real wrist's friction may hold it there
+MODES = {fci.GUIDING: "guiding", fci.USER_STOPPED: "user stopped"}
+
+
+class Franka:
+    """An `Arm` (r2s/arm/interface.py) on a `Client`, with an operator (`Operated`).
+
+    A motion begins with the caller's first `command`; from then on the arm needs one command per millisecond.
+
+    Attributes:
+        operator, blocked: see `Operated`. Every end of a motion except `stop` blocks the arm: a reflex, a stop button
+            (even if released since), a refused command, a failed `move_to`.
+
+    Args:
+        robot: limits and nominal model.
+        client: the connection.
+        operator: called with the reason before the arm moves again after a stop. None: `move_to` refuses until a new
+            connection begins with an arm that is ready.
+        collision: external torque and force at which the arm stops itself.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        client: Client,
+        operator: Operator | None = None,
+        collision: CollisionThresholds = CAUTIOUS,
+    ):
+        if robot.n != 7:
+            raise UserError(f"expected 7 joints for a Franka arm, got {robot.n} ({robot.name})")
+        self.robot, self.operator = robot, operator
+        self.blocked: str | None = None
+        self._client, self._collision = client, collision
+        self._reflexes = Reflexes(robot)
+        self._moving, self._closed, self._thresholds_set = False, False, False
+        self._space: Space | None = None
+        self._stopped: str | None = "no motion was started; call move_to first"
+        self._read_idle()
+        # a strong reference back to the arm would keep it, and its connection, alive after its last user
+        self._loop = CommandLoop(
+            weakref.proxy(self),
+            Driver(robot, TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot), cutoff_hz=CUTOFF_HZ),
+        )
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Move to q (7,) rad at a fifth of the speed limits, unless the arm is within 2 mrad of it, and hold there.
+
+        The path is the first one of r2s/excitation/paths.py that keeps clear of limits, table and arm.
+
+        Raises:
+            NotCleared: the arm stopped before, and no operator agreed that it may move.
+            ArmStopped: q is outside the limits; the arm is not ready; no path exists (nothing moved); the arm stopped
+                on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
+
+        """
+        q = np.array(q, dtype=float)
+        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
+            raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
+        self._reflexes.state(q, np.zeros(self.robot.n))
+        self.stop()
+        self._prepare()
+        path = self._plan(q)
+        self._stopped = None
+        for posture in path:
+            self._follow(posture)
+        return self._state
+
+    def read(self) -> ArmState:
+        """Return the state of the current cycle; before a motion's first command, of the arm at rest."""
+        return self._state
+
+    def command(self, tau: np.ndarray) -> None:
+        """Send tau (7,) Nm without gravity and wait for the next cycle; the first one starts the motion.
+
+        Raises:
+            ArmStopped: the arm stopped itself (libfranka's message), or it would reject the command. A rejected
+                command is not sent; the arm is brought to rest instead.
+
+        """
+        if self._stopped is not None:
+            raise ArmStopped(f"the arm is stopped: {self._stopped}")
+        tau = np.array(tau, dtype=float)
+        try:
+            self._reflexes.command(tau, self._state.tau_J_d)
+        except ArmStopped as refused:
+            self.stop()
+            self._stopped = self.blocked = str(refused)
+            raise
+        self._send(tau)
+
+    def stop(self) -> None:
+        """Damp the remaining motion for at most 0.5 s, and end it."""
+        for part in (self._damp, self._end):  # `_end` also runs if damping failed
+            try:
+                if self._moving:
+                    part()
+            except ArmStopped as reason:
+                self._stopped = self.blocked = str(reason)
+        self._moving = False
+        if self._stopped is None:
+            self._stopped = "stop was called"
+
+    def close(self) -> None:
+        """Stop and drop the connection."""
+        self.stop()
+        self._client.close()
+        self._closed, self._stopped = True, "the connection was closed"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _send(self, tau: np.ndarray) -> None:
+        try:
+            if not self._moving:
+                self._begun = _ms(self._client.start())
+                self._moving = True
+            self._state = self._sample(self._client.exchange(tau))
+        except ArmStopped as reason:
+            self._moving, self._stopped = False, str(reason)
+            self.blocked = self._stopped
+            raise
+
+    def _sample(self, s: Any) -> ArmState:
+        t = (_ms(s) - self._begun) * SIM_DT
+        return ArmState(t, np.array(s.q), np.array(s.dq), np.array(s.tau_J), np.array(s.tau_J_d))
+
+    def _damp(self) -> None:
+        if self._stopped is None:
+            self._loop.begin()
+            self._loop.rest()
+
+    def _end(self) -> None:
+        self._moving = False
+        self._client.finish()
+        self._read_idle()
+
+    def _read_idle(self) -> None:
+        """Read the arm between motions; tau_J_d is then the torque of the arm's own controller, not a command."""
+        s = self._client.idle()
+        self._begun = _ms(s)
+        sample = self._sample(s)
+        self._state = ArmState(0.0, sample.q, sample.dq, sample.tau_J, np.zeros(self.robot.n))
+
+    def _prepare(self) -> None:
+        """Raise ArmStopped unless the arm can move; after a stop the operator must agree first."""
+        if self._closed:
+            raise ArmStopped("the connection was closed")
+        s = self._client.idle()
+        mode = int(s.robot_mode)
+        if self.blocked is None and mode == fci.REFLEX:
+            self.blocked = str(s.last_motion_errors) or "an earlier reflex"
+        elif self.blocked is None and mode == fci.USER_STOPPED:
+            self.blocked = "it is user stopped"
+        if self.blocked is not None:
+            if self.operator is None or not self.operator(self.blocked):
+                raise NotCleared(f"the arm has stopped and no operator agreed that it may move: {self.blocked}")
+            mode = int(self._client.idle().robot_mode)  # the stop button may have been released during the question
+        if mode == fci.REFLEX:
+            self._client.recover()
+        elif mode != fci.IDLE:
+            raise ArmStopped(f"the arm is not ready to move: it is {MODES.get(mode, f'in mode {mode}')}")
+        self.blocked = None
+        if not self._thresholds_set:
+            self._client.set_collision_thresholds(self._collision)
+            self._thresholds_set = True
+        self._read_idle()
+
+    def _plan(self, q: np.ndarray) -> np.ndarray:
+        """Return the postures (k, 7) rad on the path to q (7,) rad; k is 0 if the arm is at q already."""
+        here = self._state.q
+        if np.abs(here - q).max() <= ARRIVED:
+            return q[:0, None]
+        try:
+            self._space = self._space or Space(self.robot)
+            return approach(self.robot, here, q, what="the path of move_to", space=self._space)[1:]
+        except UserError as no_path:
+            self._stopped = f"{no_path}; guide the arm by hand to a posture that has one"
+            raise ArmStopped(self._stopped) from None
+
+    def _follow(self, q: np.ndarray) -> None:
+        """Follow the straight joint path to q (7,) rad."""
+        path, moving = _slow_path(self.robot, self._state.q, q)
+        controller, loop = TrackingController(self.robot, path, MAX_DEVIATION), self._loop
+        limit = INTEGRAL_SHARE * self.robot.tau_max
+        integral, last_error = np.zeros(7), np.zeros(7)
+        loop.begin()
+        try:
+            for k in range(len(path.t)):
+                s = loop.state
+                error = q - s.q
+                if k >= moving and np.abs(error).max() < ARRIVED and np.abs(s.dq).max() < STILL:
+                    break
+                if (reason := controller.deviation(k, s)) is not None:
+                    loop.halt(reason)
+                if k >= moving:
+                    # Clegg integrator (1958): it resets when the error changes sign. Otherwise the torque that broke
+                    # a joint loose would carry it past its target
+                    integral = np.clip(integral + INTEGRAL_GAIN * SIM_DT * self.robot.tau_max * error, -limit, limit)
+                    integral = np.where(error * last_error < 0, 0, integral)
+                    last_error = error
+                loop(controller(k, s) + integral)
+            self._end()
+        except ArmStopped as reason:
+            self.blocked = str(reason)
+            raise
+        finally:
+            if self._moving:  # interrupted, or given up
+                self.stop()
+        distance = np.abs(self._state.q - q)
+        if distance.max() > ACCEPTED:
+            i = int(distance.argmax())
+            self._stopped = f"joint {i + 1}: expected {q[i]:.4f} rad after move_to, got {self._state.q[i]:.4f} rad"
+            self.blocked = self._stopped
+            raise ArmStopped(self._stopped)
+
+
+def _ms(state: Any) -> int:
+    return round(state.time.to_sec() * 1e3)
+
+
+def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray) -> tuple[Excitation, int]:
+    """Return a minimum-jerk path followed by rest, and how many rows move."""
+    distance = np.abs(end - start)
+    # peaks of minimum jerk: velocity 15/8 distance / T, acceleration 10/sqrt(3) distance / T^2
+    duration = max(
+        0.2,  # s
+        (15 / 8 * distance / (SPEED * robot.dq_max)).max(),
+        np.sqrt(10 / np.sqrt(3) * distance / (ACCELERATION * robot.ddq_max)).max(),
+    )
+    moving = int(np.ceil(duration / SIM_DT))
+    t = SIM_DT * np.arange(moving + round(SETTLE_S / SIM_DT) + 1)
+    return Excitation(t, *minimum_jerk(start, end, duration, t[:, None])), moving

@@ -1,0 +1,147 @@
+"""libfranka through its two Python packages: import, connection, error messages, and what both clients share."""
+
+import importlib
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.clients import fci
+from r2s.arm.interface import ArmStopped
+from r2s.errors import UserError, check_number
+
+DESK_PORT = 443  # https, Franka's web interface "Desk"
+CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in ms; libfranka waits about 60 s
+
+
+@dataclass(frozen=True)
+class CollisionThresholds:
+    """External torque and force at which the arm stops itself (libfranka's setCollisionBehavior).
+
+    The contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
+
+    Attributes:
+        torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
+
+    Raises:
+        UserError: a wrong count, or a value that is not above 0.
+    """
+
+    torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    force: Sequence[float] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+
+    def __post_init__(self):
+        for name, values, count in (("torque", self.torque, 7), ("force", self.force, 6)):
+            if len(values) != count:
+                raise UserError(f"collision_{name}: expected {count} numbers, got {len(values)}")
+            for value in values:
+                check_number(f"collision_{name}", value, "(0, inf)")
+
+
+CAUTIOUS = CollisionThresholds()
+
+
+class Client:
+    """One of libfranka's two Python packages; RobotState has the same attributes in both.
+
+    Every method raises ArmStopped with libfranka's message.
+
+    Args:
+        name: option of the group `arm`, and the extra that installs the package. package: its module.
+        address: host name or IP. realtime: require a real-time kernel and priority.
+    """
+
+    def __init__(self, name: str, package: str, address: str, realtime: bool):
+        self._package = import_package(package, name)
+        config = self._package.RealtimeConfig
+        config = config.kEnforce if realtime else config.kIgnore
+        self._robot = connect(lambda: self._package.Robot(address, config), name, address)
+
+    def start(self) -> Any:
+        """Start a torque motion; return the RobotState that waits for the first command."""
+        raise NotImplementedError
+
+    def exchange(self, tau: np.ndarray) -> Any:
+        """Send tau (7,) Nm for this cycle, wait for the next one and return its RobotState."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """End the running motion."""
+        raise NotImplementedError
+
+    def idle(self) -> Any:
+        """Return a fresh RobotState while no motion runs; the first one read may be old."""
+        return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
+
+    def recover(self) -> None:
+        """Clear a reflex."""
+        self._call(self._robot.automatic_error_recovery)
+
+    def set_collision_thresholds(self, thresholds: CollisionThresholds) -> None:
+        """Set the external torque and force at which the arm stops itself."""
+        torque, force = list(thresholds.torque), list(thresholds.force)
+        self._call(lambda: self._robot.set_collision_behavior(torque, torque, force, force))
+
+    def close(self) -> None:
+        """Drop the connection."""
+        self._robot = None
+
+    def _call(self, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except Exception as error:
+            raise ArmStopped(one_line(error)) from error
+
+
+def import_package(name: str, extra: str) -> ModuleType:
+    """Import a client package.
+
+    Raises:
+        UserError: the package or one of its dependencies is not installed.
+
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        cause = "" if error.name in (name, name.split(".")[0]) else f" ({error})"
+        raise UserError(
+            f"arm={extra} needs the package {name.split('.')[0]}{cause}: pip install 'r2s[{extra}]'"
+        ) from None
+
+
+def connect(make: Callable[[], Any], extra: str, address: str) -> Any:
+    """Return the client's robot.
+
+    Raises:
+        UserError: no connection, with libfranka's reason.
+    """
+    if not is_reachable(address):
+        raise UserError(f"arm={extra}: no connection to {address}: no answer; is the cable plugged in?")
+    try:
+        return make()
+    except Exception as error:
+        raise UserError(f"arm={extra}: no connection to {address}: {one_line(error)}") from None
+
+
+def is_reachable(address: str) -> bool:
+    """Return whether a computer answers at the address; a refused connection counts as an answer.
+
+    The FCI port comes second, because opening it occupies the arm's only client slot.
+    """
+    for port in (DESK_PORT, fci.PORT):
+        try:
+            socket.create_connection((address, port), CONNECT_TIMEOUT_S).close()
+        except TimeoutError:
+            continue
+        except OSError:
+            pass  # refused, or an unknown host name, which libfranka reports
+        return True
+    return False
+
+
+def one_line(error: BaseException) -> str:
+    """Return libfranka's message as one line."""
+    return " ".join(str(error).split()) or type(error).__name__

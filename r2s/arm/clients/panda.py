@@ -1,0 +1,140 @@
+"""The Panda (FER) through panda-python, libfranka 0.9: hardware, or the emulator in FCI version 5.
+
+libfranka calls back once per millisecond, while r2s calls an `Arm`. Therefore libfranka's loop runs in a thread; its
+callback passes the state on and waits for the command. libfranka's rate limiter and low-pass are off: the arm
+receives each command unchanged.
+"""
+
+import threading
+from collections.abc import Sequence
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.clients.consent import Operator, find_operator
+from r2s.arm.clients.franka import Franka
+from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds, one_line
+from r2s.arm.interface import ArmStopped
+from r2s.physics.robot import Robot
+
+NO_FILTER_HZ = 1000.0  # libfranka's kMaxCutoffFrequency: switches the low-pass off
+OWNER_CHECK_S = 0.1  # period of the check that the commanding thread is alive
+
+
+class Panda(Franka):
+    """A Franka Emika Panda.
+
+    Args:
+        robot: limits and nominal model.
+        address: host name or IP of the arm or of an emulator.
+        operator: see `Franka`; 'terminal' asks a person at the terminal.
+        realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
+        collision_torque, collision_force: see `CollisionThresholds`.
+
+    Raises:
+        UserError: panda-python is missing, or no server of FCI version 5 answers at the address.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        address: str,
+        *,
+        operator: Operator | str | None = None,
+        realtime: bool = False,
+        collision_torque: Sequence[float] = CAUTIOUS.torque,
+        collision_force: Sequence[float] = CAUTIOUS.force,
+    ):
+        thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
+        super().__init__(robot, _PandaClient(address, realtime), operator, thresholds)
+
+
+class _PandaClient(Client):
+    def __init__(self, address: str, realtime: bool):
+        self._motion: _Motion | None = None
+        super().__init__("panda", "panda_py.libfranka", address, realtime)
+
+    def __del__(self):
+        if self._motion is not None:  # ends the loop's thread, which waits for a command
+            self._motion.answer(None)
+
+    def start(self) -> Any:
+        self._motion = _Motion(self._robot, self._package)
+        return self._motion.next()
+
+    def exchange(self, tau: np.ndarray) -> Any:
+        assert self._motion is not None
+        self._motion.answer(tau)
+        return self._motion.next()
+
+    def finish(self) -> None:
+        motion, self._motion = self._motion, None
+        if motion is not None:
+            motion.answer(None)
+            motion.join()
+
+    def close(self) -> None:
+        self._motion = self._robot = None
+
+
+class _Motion:
+    """libfranka's control loop in a thread, driven by calls of `next` and `answer`."""
+
+    def __init__(self, robot: Any, libfranka: Any):
+        self._robot, self._libfranka = robot, libfranka
+        self._states: SimpleQueue = SimpleQueue()
+        self._answers: SimpleQueue = SimpleQueue()
+        self._owner = threading.current_thread()
+        self._started, self._last = False, [0.0] * 7
+        self._thread = threading.Thread(target=self._run, name="libfranka control loop")
+        self._thread.start()
+
+    def next(self) -> Any:
+        """Return the RobotState of the next cycle."""
+        state = self._states.get()
+        if isinstance(state, Exception):
+            self._thread.join()
+            raise ArmStopped(one_line(state)) from state
+        return state  # None only follows an answer of None
+
+    def answer(self, tau: np.ndarray | None) -> None:
+        """Answer the state that `next` returned last; None ends the motion."""
+        self._answers.put(tau if tau is None else tau.tolist())
+
+    def join(self) -> None:
+        """Wait for the end of the motion after an answer of None."""
+        self._thread.join()
+        while not self._states.empty():  # an interrupted reader may leave a state in the queue
+            end = self._states.get()
+            if isinstance(end, Exception):
+                raise ArmStopped(one_line(end)) from end
+
+    def _run(self) -> None:
+        end: Exception | None = None
+        try:
+            self._robot.control(self._callback, limit_rate=False, cutoff_frequency=NO_FILTER_HZ)
+        except Exception as error:
+            end = error
+        self._robot = None  # else a stored exception would keep the connection open
+        self._states.put(end)
+
+    def _callback(self, state: Any, _: Any) -> Any:
+        # the arm may ignore commands until its success rate is above 0; the caller's first command must not get lost
+        self._started = self._started or state.control_command_success_rate > 0
+        if not self._started:
+            return self._libfranka.Torques(self._last)
+        self._states.put(state)
+        tau = self._wait()
+        if tau is None:
+            return self._libfranka.motion_finished(self._libfranka.Torques(self._last))
+        self._last = tau
+        return self._libfranka.Torques(tau)
+
+    def _wait(self) -> list[float] | None:
+        while True:
+            try:
+                return self._answers.get(timeout=OWNER_CHECK_S)
+            except Empty:
+                if not self._owner.is_alive():
+                    raise RuntimeError("the thread that commanded the arm has ended") from None

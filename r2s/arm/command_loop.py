@@ -1,0 +1,152 @@
+"""An arm behind its driver: the only module of r2s that commands an arm.
+
+Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives the
+driver's torques, and nothing else; tests/test_command_loop.py checks that no other call exists.
+"""
+
+import time
+from collections import deque
+from contextlib import suppress
+
+import numpy as np
+
+from r2s.adaptation.adapter import Adapter
+from r2s.arm.driver import Driver
+from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
+from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.robot import SIM_DT
+
+# `CommandLoop.rest`, which damps a moving arm; the values are our choice
+REST_S = 0.5  # longest duration
+REST_RATE = 15.0  # 1/s, rate at which damping takes the speed out
+REST_SHARE = 0.2  # of tau_max, limit of the damping torque
+STILL = 0.02  # rad/s, speed below which a joint counts as at rest
+
+
+class CommandLoop:
+    """Runs the motions of one arm, one 1 kHz cycle per call.
+
+    Attributes:
+        arm, driver: the arguments.
+        state: of the current cycle. sent: (n,) Nm, the last torque.
+        clock: s, perf_counter before and after the driver's last computation, and after the adapter's.
+
+    Args:
+        arm: the arm. driver: its settings limit the torques of these motions.
+        log: receives (state, torque) of every cycle before the torque is sent.
+        adapter: called once per cycle; its torque is added from the next cycle on. If it raises, the driver stops the
+            arm as after a missing command, and the exception propagates.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        driver: Driver,
+        log: deque[tuple[ArmState, np.ndarray]] | None = None,
+        adapter: Adapter | None = None,
+    ):
+        self.arm, self.driver = arm, driver
+        self._adapter, self._adapting = adapter, False
+        self._added: np.ndarray | None = None
+        self._log, self._ended = log, False
+        self._inverse = InverseInertia(arm.robot)
+        self.state: ArmState
+        self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
+
+    def place(self, q: np.ndarray) -> ArmState:
+        """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
+        self._reset()
+        try:
+            self.state = self.arm.move_to(q)
+        except ArmStopped:
+            self.state = self.arm.read()
+            raise
+        return self.state
+
+    def begin(self) -> None:
+        """Begin a motion at the arm's current posture."""
+        self._reset()
+        self.state = self.arm.read()
+
+    def __call__(self, command: np.ndarray | None) -> ArmState:
+        """Run one cycle with a command (c,) of the driver's controller, None for no new one; return the next state.
+
+        Raises:
+            ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has then ended.
+        """
+        if self._ended:
+            raise ArmStopped("the motion is over")
+        began = time.perf_counter()
+        self.sent = self.driver(self.state, command, self._added)
+        driven = time.perf_counter()
+        if self._adapter is not None and self._adapting:
+            self._adapt(self._adapter)
+        self.clock = began, driven, time.perf_counter()
+        if self._log is not None:
+            self._log.append((self.state, self.sent))
+        try:
+            self.arm.command(self.sent)
+        except ArmStopped:
+            self._ended = True
+            raise
+        self.state = self.arm.read()
+        if self.driver.done:
+            self._raise(str(self.driver.stopping))
+        return self.state
+
+    def rest(self) -> None:
+        """Damp the arm's motion and reduce its command, for at most 0.5 s."""
+        damping = REST_RATE / np.diag(self._inverse(self.state.q[None])[0])
+        limit, step = REST_SHARE * self.arm.robot.tau_max, self.arm.robot.dtau_max * SIM_DT
+        for _ in range(round(REST_S / SIM_DT)):
+            s = self.state
+            if np.abs(s.dq).max() < STILL and (np.abs(s.tau_J_d) <= step).all():
+                return
+            self(np.clip(-damping * s.dq, -limit, limit))
+
+    def halt(self, reason: str) -> None:
+        """Bring the arm to rest, then raise ArmStopped with `reason`."""
+        self.rest()
+        self._raise(reason)
+
+    def end(self) -> str | None:
+        """Stop the arm; return the reason if the driver was bringing it to rest, else None."""
+        reason = None if self._ended else self.driver.stopping
+        if reason is not None:
+            self._block(reason)
+        self._ended = True
+        self.arm.stop()
+        return reason
+
+    def _reset(self) -> None:
+        self.driver.reset()
+        self._ended = False
+        if self._adapter is not None:
+            self._adapter.begin()
+            self._adapting, self._added = True, np.zeros(self.arm.robot.n)
+
+    def _adapt(self, adapter: Adapter) -> None:
+        """Update the adapter's torque; if it raises, run without commands until the driver has stopped the arm."""
+        try:
+            self._added = np.asarray(adapter(self.state.q, self.state.dq, self.sent), dtype=float)
+            if self._added.shape != self.sent.shape:
+                raise ValueError(
+                    f"expected a torque of shape {self.sent.shape} from the adapter, got {self._added.shape}"
+                )
+        except Exception:
+            self._adapting, self._added = False, None
+            with suppress(ArmStopped):
+                self.arm.command(self.sent)
+                self.state = self.arm.read()
+                while True:
+                    self(None)
+            raise
+
+    def _raise(self, reason: str) -> None:
+        self._ended = True
+        self._block(reason)
+        raise ArmStopped(reason)
+
+    def _block(self, reason: str) -> None:
+        if isinstance(self.arm, Operated):
+            self.arm.blocked = reason

@@ -1,0 +1,91 @@
+"""Episodes on a twin, distributed over cores: chunks of goals, each on a new twin from the same seed.
+
+The chunks, and therefore the results, do not depend on the number of cores. Each chunk has its own stream of sensor
+noise. A twin whose friction warms up begins each chunk cold.
+"""
+
+import multiprocessing
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.policy_runner import PolicyRunner, Stop, Timing
+from r2s.tasks.rollout import PolicyLike, rollout
+from r2s.tasks.task import Episodes, Task
+
+CHUNK = 25  # goals
+
+
+def run_parallel_episodes(
+    open_twin: Callable[[int], AbstractContextManager[PolicyRunner]],
+    policy: PolicyLike,
+    task: Task,
+    starts: np.ndarray,
+    goals: np.ndarray,
+    workers: int,
+    progress: Callable[[int, int], None],
+) -> tuple[Episodes, list[Stop], Timing]:
+    """Return the episodes, their early stops, and measured durations.
+
+    On Linux the processes are forked, so call this before any thread starts; elsewhere it uses one process.
+
+    Args:
+        open_twin: opens the twin of a chunk, by the chunk's number.
+        policy, task: see `rollout`.
+        starts, goals: (E, n) rad, (E, ...).
+        workers: largest number of processes.
+        progress: called with (goals done, total).
+    """
+    chunks = range(-(-len(goals) // CHUNK))
+    done: dict[int, tuple[Episodes, list[Stop], Timing]] = {}
+    job = open_twin, policy, task, starts, goals
+
+    def collect(chunk: int, result: tuple[Episodes, list[Stop], Timing]) -> None:
+        done[chunk] = result
+        progress(sum(len(episodes.goal) for episodes, _, _ in done.values()), len(goals))
+
+    if min(workers, len(chunks)) < 2 or not sys.platform.startswith("linux"):
+        for chunk in chunks:
+            collect(chunk, _run_chunk(job, chunk))
+    else:
+        with multiprocessing.get_context("fork").Pool(min(workers, len(chunks)), _initialize, (job,)) as pool:
+            for chunk, result in pool.imap_unordered(_work, chunks):
+                collect(chunk, result)
+    parts = [done[chunk] for chunk in chunks]
+    each = [episodes for episodes, _, _ in parts]
+    names = [f.name for f in fields(Episodes) if f.name != "t"]
+    together = {name: np.concatenate([getattr(episodes, name) for episodes in each]) for name in names}
+    timing = Timing()
+    for _, _, durations in parts:
+        for field in fields(Timing):
+            getattr(timing, field.name).extend(getattr(durations, field.name))
+    return replace(each[0], **together), [stop for _, stops, _ in parts for stop in stops], timing
+
+
+_job: Any = None  # of a forked process
+
+
+def _initialize(job: Any) -> None:
+    import torch
+
+    global _job
+    _job = job
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent process
+
+
+def _work(chunk: int) -> tuple[int, tuple[Episodes, list[Stop], Timing]]:
+    return chunk, _run_chunk(_job, chunk)
+
+
+def _run_chunk(job: Any, chunk: int) -> tuple[Episodes, list[Stop], Timing]:
+    open_twin, policy, task, starts, goals = job
+    first, now = chunk * CHUNK, slice(chunk * CHUNK, (chunk + 1) * CHUNK)
+    with open_twin(chunk) as runner:
+        episodes = rollout(policy, runner, task, starts[now], goals[now])
+        return episodes, [replace(stop, episode=first + stop.episode) for stop in runner.stops], runner.timing

@@ -1,0 +1,236 @@
+"""A policy on an arm that waits for its commands: observe, query the policy at its rate, command the arm at 1 kHz.
+
+The arm's time stands still while the policy computes. This suits twins and the emulator in lock-step, and repeats bit
+for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a process of its own.
+"""
+
+import time
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import chain, repeat
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from r2s.adaptation.adapter import Adapter
+from r2s.arm.command_loop import CommandLoop
+from r2s.arm.driver import Driver
+from r2s.arm.interface import Arm, ArmState, ArmStopped, NotCleared, Operated
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.tasks.task import State, Task
+
+LOGGED_S = 1.0  # before a stop, at 1 kHz
+SMOOTHING_CYCLES = 20  # on each side; an encoder's noise then leaves 2e-4 rad/s of speed
+ATTEMPTS = 3  # to bring an arm to its start, each with the operator's consent
+
+
+@dataclass
+class Timing:
+    """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
+
+    Attributes:
+        policy: from a state to the policy's command, once per control step. driver: computation of one command.
+        adapter: one update of the adapter, if there is one. period: from one command to the next.
+    """
+
+    policy: list[float] = field(default_factory=list)
+    driver: list[float] = field(default_factory=list)
+    adapter: list[float] = field(default_factory=list)
+    period: list[float] = field(default_factory=list)
+
+    def table(self) -> list[dict[str, float | str]]:
+        """Return one row per duration: count, median, 99 % quantile and maximum, ms."""
+        rows: list[dict[str, float | str]] = []
+        names = ["policy", "driver", *(["adapter"] if self.adapter else []), "period"]
+        for name in names:
+            x = 1e3 * np.array(getattr(self, name) or [np.nan])
+            row = {"median_ms": np.median(x), "p99_ms": np.percentile(x, 99), "max_ms": x.max()}
+            rows.append({"what": name, "count": len(x), **{k: float(v) for k, v in row.items()}})
+        return rows
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Why an episode ended early.
+
+    Attributes:
+        episode: its number, from 0. when: time in the episode. reason: message of the arm or of the driver.
+        log: (k, 1 + 4 n), the last second at 1 kHz: t s, q rad, dq rad/s, tau_J_d Nm, command Nm.
+    """
+
+    episode: int
+    when: str
+    reason: str
+    log: np.ndarray
+
+    def __str__(self) -> str:
+        return f"episode {self.episode + 1}, {self.when}: {self.reason}"
+
+
+def episode_driver(
+    robot: Robot, task: Task, soft_start_s: float, friction: np.ndarray, rotors: np.ndarray | None = None
+) -> Driver:
+    """Return the driver of an episode of `task`; friction (n,) Nm and rotors as in `DriverBatch`."""
+    period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
+    own = {"soft_start_s": soft_start_s, "rotors": rotors, "control": task.control(robot)}
+    return Driver(robot, task.torque_limit(robot), friction, **period, **own)
+
+
+class PolicyRunner:
+    """An arm behind the driver, one control period per step; implements `Arms` of `r2s.tasks.rollout`.
+
+    Attributes:
+        stops: why episodes ended early. timing: see `Timing`.
+        done: number of episodes for which the arm moved, or tried to move, to the start.
+        speeds: (1, T, n) rad/s after each control step of the last episode, smoothed over 1 kHz cycles.
+        halted: reason for which no further episode runs: the operator did not agree after a stop. None: not halted.
+
+    Args:
+        arm: an arm that waits for its commands.
+        task: rates and torque limits.
+        friction: (n,) Nm, friction that holds each joint: `Dynamics.level` of the dynamics the policy was trained on.
+        soft_start_s: s, fade-in of an episode's torque; recommended on hardware, 0 for twins.
+        rotors: (n,) kg m^2, `Dynamics.armature` of the same dynamics; None: the robot's.
+        adapter: adds torque to the policy's; None: no adaptation.
+    """
+
+    width = 1
+
+    def __init__(
+        self,
+        arm: Arm,
+        task: Task,
+        friction: np.ndarray,
+        *,
+        soft_start_s: float = 0.0,
+        rotors: np.ndarray | None = None,
+        adapter: Adapter | None = None,
+    ):
+        self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
+        self._kinematics = Kinematics(arm.robot)
+        self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
+        self._adapts = adapter is not None
+        driver = episode_driver(arm.robot, task, soft_start_s, friction, rotors)
+        self._loop = CommandLoop(arm, driver, self._log, adapter)
+        self.stops: list[Stop] = []
+        self.timing = Timing()
+        self.done = 0
+        self.speeds = np.zeros((1, task.steps, arm.robot.n))
+        self.halted: str | None = None
+
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Move to starts (1, n) rad and begin episode `first` there.
+
+        A stop during that move ends the episode. The operator of an `Operated` arm is then asked for another attempt;
+        without consent neither this nor any later episode begins.
+        """
+        self._log.clear()
+        self._angles: list[np.ndarray] = []
+        self._episode, self._stopped, self._sent_at, self._limited = first, False, 0.0, 0
+        if self.halted is None:
+            self._approach(starts[0])
+        self._stopped = self._stopped or self.halted is not None
+        self.done += self.halted is None
+        return self._observe()
+
+    def step(self, command: np.ndarray) -> State:
+        """Run one control period with the command (1, c) of the controller, or until the arm stops."""
+        self.timing.policy.append(time.perf_counter() - self._observed_at)
+        self.run(chain([command[0]], repeat(None, self._substeps - 1)))
+        return self._observe()
+
+    def run(self, commands: Iterable[np.ndarray | None]) -> None:
+        """Run one 1 kHz cycle per command (c,), None for no new one, until they end or the arm stops."""
+        for command in commands:
+            self._cycle(command)
+            if self._stopped:
+                return
+
+    def end(self) -> np.ndarray:
+        """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
+        reason = self._loop.end()
+        if not self._stopped and reason is not None:  # the episode ended before the driver brought the arm to rest
+            self._record_stop(f"{self._loop.state.t:.2f} s", reason)
+        speeds = smooth_speeds(self._angles, self._substeps)[: self.speeds.shape[1]]
+        self.speeds[:] = 0.0  # a stopped arm is at rest
+        self.speeds[0, : len(speeds)] = speeds
+        return np.array([self._stopped])
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles of the episode so far."""
+        return len(self._angles)
+
+    def read(self) -> tuple[ArmState, np.ndarray, bool, int]:
+        """Return the arm's state, the low-pass filtered target (n,) Nm, whether the episode was stopped, and the
+        number of its cycles in which the safety filter changed the torque.
+        """
+        driver = self._loop.driver
+        return self._loop.state, driver.effort, self._stopped, driver.limited
+
+    def _cycle(self, command: np.ndarray | None) -> None:
+        try:
+            self._loop(command)
+        except ArmStopped as reason:
+            self._record_stop(f"{self._loop.state.t:.2f} s", reason)
+        self._angles.append(self._loop.state.q)
+        began, driven, adapted = self._loop.clock
+        self.timing.driver.append(driven - began)
+        if self._adapts:
+            self.timing.adapter.append(adapted - driven)
+        if self._sent_at:
+            self.timing.period.append(driven - self._sent_at)
+        self._sent_at = driven
+
+    def _approach(self, start: np.ndarray) -> None:
+        operated = isinstance(self._arm, Operated)
+        for left in reversed(range(ATTEMPTS if operated else 1)):
+            try:
+                self._loop.place(start)
+                return
+            except NotCleared as reason:
+                self.halted = str(reason)
+                return
+            except ArmStopped as reason:
+                if left:
+                    continue
+                if operated:
+                    self.halted = str(reason)
+                    return
+                self._record_stop("on the way to its start", reason)
+
+    def _record_stop(self, when: str, reason: object) -> None:
+        rows = [np.concatenate([[s.t], s.q, s.dq, s.tau_J_d, command]) for s, command in self._log]
+        log = np.array(rows).reshape(-1, 1 + 4 * self.robot.n)
+        self.stops.append(Stop(self._episode, when, str(reason), log))
+        self._stopped = True
+
+    def _observe(self) -> State:
+        s, effort, stopped, limited = self.read()
+        share = (limited - self._limited) / self._substeps
+        state, self._limited = as_state(self._kinematics, s, effort, stopped, share), limited
+        self._observed_at = time.perf_counter()
+        return state
+
+
+def smooth_speeds(angles: Sequence[np.ndarray], every: int) -> np.ndarray:
+    """Return speeds (., n) rad/s at each `every`-th cycle of the angles (n,) rad.
+
+    A parabola through SMOOTHING_CYCLES on each side (Savitzky and Golay, Analytical Chemistry 36(8), 1964).
+    """
+    window = min(2 * SMOOTHING_CYCLES + 1, len(angles) - 1 + len(angles) % 2)
+    if window < 3:
+        return np.zeros((0, 1))
+    speeds = savgol_filter(np.array(angles), window, 2, deriv=1, delta=SIM_DT, axis=0)
+    return speeds[every - 1 :: every]
+
+
+def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: bool, limited: float) -> State:
+    """Return one arm's `State`; effort (n,) Nm, stopped and limited as in `State`."""
+    ee, jacobian = kinematics(s.q)
+    return State(
+        t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
+        tau=s.tau_J_d[None], effort=effort[None], stopped=np.array([stopped]), limited=np.array([limited]),
+    )  # fmt: skip

@@ -1,0 +1,277 @@
+"""A policy on an arm whose clock does not wait: the 1 kHz cycle runs in its own process.
+
+The arm's process continues whatever happens to the policy's process: without a new command for the driver's deadline
+it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock blocks
+every thread (benchmarks/watchdog.py). The processes share memory without a lock, which a killed process would keep.
+"""
+
+import gc
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import RawArray
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
+from r2s.arm.policy_runner import PolicyRunner, Stop, Timing, as_state
+from r2s.physics.rigid_body import Kinematics
+from r2s.physics.robot import Robot
+from r2s.tasks.task import State, Task
+
+START_S = 240.0  # longest time for the process to import, compile and connect to its arm
+POLL_S = 2e-4  # between two looks at shared memory, a fifth of a cycle
+EXIT_S = 5.0  # longest time for the arm to come to rest at the end; twice as long ends the process by force
+READ_ATTEMPTS = 10  # of a slot that is being written; then its content counts as old
+
+
+class Slot:
+    """Numbers in shared memory with one writer; a write counter makes reads consistent (seqlock)."""
+
+    def __init__(self, width: int):
+        self._raw = RawArray("d", 1 + width)
+
+    def write(self, values: np.ndarray) -> None:
+        """Write values (width,)."""
+        a = np.frombuffer(self._raw)
+        a[0] += 1  # odd during a write
+        a[1:] = values
+        a[0] += 1
+
+    def read(self) -> tuple[int, np.ndarray] | None:
+        """Return the number of writes and the values (width,); None during a write, also an interrupted one."""
+        a = np.frombuffer(self._raw)
+        for _ in range(READ_ATTEMPTS):
+            before = a[0]
+            values = a[1:].copy()
+            if before == a[0] and before % 2 == 0:
+                return int(before) // 2, values
+        return None
+
+
+class Channel(NamedTuple):
+    """What the two processes share.
+
+    Attributes:
+        command: (c,) of the controller, from the policy. state: from the arm, see `_publish`.
+        end: above 0 when the policy's process has ended the episode.
+    """
+
+    command: Slot
+    state: Slot
+    end: Slot
+
+    @property
+    def ended(self) -> bool:
+        """Whether the policy's process has ended the episode."""
+        end = self.end.read()
+        return end is not None and end[1][0] > 0
+
+
+class RealtimeRunner:
+    """An arm behind the driver in its own process; implements `Arms` of `r2s.tasks.rollout`.
+
+    `with RealtimeRunner(...) as arms`: the process opens the arm, and always stops and closes it at the end.
+
+    Attributes:
+        robot: the arm's. stops, timing, done, speeds, halted: see `PolicyRunner`.
+
+    Args:
+        open_arm: returns the arm or a context manager of it; runs in the arm's process, so it must be picklable.
+        robot: has as many joints as the arm. task: see `PolicyRunner`.
+        settings: further arguments of `PolicyRunner`; its adapter runs in the arm's process.
+
+    Raises:
+        UserError, ArmStopped: the arm cannot be opened.
+    """
+
+    width = 1
+
+    def __init__(self, open_arm: Callable[[], Any], robot: Robot, task: Task, friction: np.ndarray, **settings: Any):
+        self.robot, self._task, self._n = robot, task, robot.n
+        self.stops: list[Stop] = []
+        self.timing = Timing()
+        self.done = 0
+        self.speeds = np.zeros((1, task.steps, robot.n))
+        self.halted: str | None = None
+        self._kinematics = Kinematics(robot)
+        self._operator: Callable[[str], bool] | None = None
+        self._channel = Channel(Slot(task.control(robot).command_size), Slot(5 * robot.n + 4), Slot(1))
+        self._arguments = open_arm, task, {"friction": friction, **settings}, self._channel
+
+    def __enter__(self) -> "RealtimeRunner":
+        context = multiprocessing.get_context("spawn")  # fork would copy locks that other threads hold
+        self._line, remote = context.Pipe()
+        # not a daemon: that would be killed while its arm moves, and could not start an emulator
+        self._process = context.Process(target=_serve, args=(remote, *self._arguments), name="arm")
+        self._process.start()
+        remote.close()
+        try:
+            self.robot, self._operator = self._receive("ready", START_S)
+        except BaseException:
+            self.__exit__()
+            raise
+        self._kinematics = Kinematics(self.robot)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._channel.end.write(np.ones(1))
+        self._line.close()  # the process ends at the end of file
+        self._process.join(2 * EXIT_S)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()
+
+    @property
+    def cycle(self) -> int:
+        """Number of the arm's cycles since the episode began."""
+        return self._latest()[0]
+
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Begin episode `first` at starts (1, n) rad, as `PolicyRunner.place`; this process asks the operator."""
+        self._channel.end.write(np.zeros(1))
+        self._line.send(("place", starts, first))
+        self.done, self.halted = self._receive("placed")
+        self._due, self._last = 0, (0, 0)
+        return self._observe()
+
+    def step(self, command: np.ndarray) -> State:
+        """Write the command (1, c) of the controller, and return the state at the next control period.
+
+        A command that took longer than its period applies at once; the next query is at the following period.
+        """
+        self.timing.policy.append(time.perf_counter() - self._observed_at)
+        self._channel.command.write(command[0])
+        substeps = self._task.substeps
+        self._due = max(self._due + substeps, (self.cycle // substeps + 1) * substeps)
+        polls = 0
+        while True:
+            cycle, _, _, stopped, _ = self._latest()
+            if stopped or cycle >= self._due:
+                return self._observe()
+            polls += 1
+            if polls % 100 == 0 and not self._process.is_alive():
+                self._receive("ended")  # raises the process's last message, or that it has ended
+            time.sleep(POLL_S)
+
+    def end(self) -> np.ndarray:
+        """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
+        self._channel.end.write(np.ones(1))
+        self.stops, stopped, timing, self.speeds = self._receive("ended")
+        self.timing.driver, self.timing.adapter, self.timing.period = timing.driver, timing.adapter, timing.period
+        return np.array([stopped])
+
+    def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
+        """Return cycle, state, filtered target (n,) Nm, stopped, and cycles changed by the safety filter."""
+        while (latest := self._channel.state.read()) is None:
+            if not self._process.is_alive():
+                raise ArmStopped("the process that drove the arm has ended")
+        t, cycle, stopped, limited = latest[1][:4]
+        q, dq, tau_J, tau_J_d, effort = latest[1][4:].reshape(5, self._n)
+        return int(cycle), ArmState(t, q, dq, tau_J, tau_J_d), effort, bool(stopped), int(limited)
+
+    def _observe(self) -> State:
+        cycle, s, effort, stopped, limited = self._latest()
+        share = (limited - self._last[1]) / max(cycle - self._last[0], 1)
+        state, self._last = as_state(self._kinematics, s, effort, stopped, share), (cycle, limited)
+        self._observed_at = time.perf_counter()
+        return state
+
+    def _receive(self, kind: str, timeout_s: float | None = None) -> Any:
+        """Wait for the process's message of this kind and return its content; pass its questions to the operator."""
+        try:
+            while True:
+                if timeout_s is not None and not self._line.poll(timeout_s):
+                    raise ArmStopped(f"the process that drives the arm sent no message for {timeout_s:g} s")
+                received, content = self._line.recv()
+                if received == kind:
+                    return content
+                if received == "failed":
+                    raise content
+                self._line.send(self._operator is not None and self._operator(content))
+        except (EOFError, ConnectionError):
+            raise ArmStopped("the process that drove the arm has ended") from None
+
+
+def _serve(
+    line: Connection, open_arm: Callable[[], Any], task: Task, settings: dict[str, Any], channel: Channel
+) -> None:
+    """Open the arm, run the requested episodes, and end when the other process closes the line."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the other process, which stops the arm first
+
+    def forward(reason: str) -> bool:
+        line.send(("operator", reason))
+        return line.recv()
+
+    try:
+        with ExitStack() as stack:
+            opened = open_arm()
+            arm: Arm = stack.enter_context(opened) if hasattr(opened, "__enter__") else opened
+            stack.callback(arm.stop)
+            operator = None
+            if isinstance(arm, Operated):
+                operator, arm.operator = arm.operator, forward  # the other process has the terminal
+            runner = PolicyRunner(arm, task, **settings)
+            line.send(("ready", (arm.robot, operator)))
+            while True:
+                _, starts, first = line.recv()
+                _run_episode(runner, starts, first, line, channel)
+    except (EOFError, ConnectionError):
+        return  # the other process has ended
+    except Exception as error:
+        line.send(("failed", error))
+
+
+def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Connection, channel: Channel) -> None:
+    commands = _newest_commands(runner, channel, last=(channel.command.read() or (0,))[0])
+    runner.place(starts, first)
+    _publish(runner, channel)
+    line.send(("placed", (runner.done, runner.halted)))
+    gc.collect()
+    gc.disable()  # a collection could delay a cycle
+    try:
+        if runner.halted is None:
+            runner.run(commands)
+            _publish(runner, channel)
+        while not channel.ended and _policy_is_alive():
+            time.sleep(POLL_S)
+    finally:
+        gc.enable()
+        stopped = bool(runner.end()[0])
+    line.send(("ended", (runner.stops, stopped, runner.timing, runner.speeds)))
+
+
+def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
+    """Give each cycle's command, None without a new one, from the first new one until the episode ends.
+
+    Args:
+        last: number of commands written in earlier episodes.
+    """
+    while not channel.ended:
+        latest = channel.command.read()
+        if latest is not None and latest[0] > last:
+            last = latest[0]
+            yield latest[1]
+        elif runner.cycles:
+            yield None
+        elif _policy_is_alive():
+            time.sleep(POLL_S)
+            continue
+        else:
+            return
+        _publish(runner, channel)
+
+
+def _policy_is_alive() -> bool:
+    parent = multiprocessing.parent_process()
+    return parent is not None and parent.is_alive()
+
+
+def _publish(runner: PolicyRunner, channel: Channel) -> None:
+    s, effort, stopped, limited = runner.read()
+    head = [s.t, runner.cycles, stopped, limited]
+    channel.state.write(np.concatenate([head, s.q, s.dq, s.tau_J, s.tau_J_d, effort]))

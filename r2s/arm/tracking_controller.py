@@ -1,0 +1,104 @@
+"""PD tracking of a planned motion about the nominal model, with an adaptive friction and offset estimate."""
+
+import mujoco
+import numpy as np
+
+from r2s.arm.interface import ArmState
+from r2s.excitation.motion import Excitation
+from r2s.excitation.motion_checks import friction_margin
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import MOST_KG, Payload, sphere_inertia, with_payload
+from r2s.physics.rigid_body import mass_matrix, mujoco_inverse_dynamics
+from r2s.physics.robot import SIM_DT, Robot
+
+CUTOFF_HZ = 100.0  # low-pass of the driver during tracking, libfranka's default
+# Gains: chosen for stability margins under a few ms of delay
+BANDWIDTH = 20.0  # rad/s, of the critically damped tracking loop
+ADAPTATION_RATE = 0.8  # 1/s, of the proportional gain; leaves half of the loop's stability margin
+FRICTION_DQ = 0.03  # rad/s, width of the sign change of the friction estimate
+MASS_EVERY = 10  # cycles between two mass matrices
+# Limits
+OFFSET_SHARE = 0.1  # of tau_max, offset estimate: 1 kg at a Panda's full reach unknown to gravity compensation
+CORRECTION_SHARE = 0.3  # of tau_max, all torque in addition to the plan's
+MAX_DEVIATION = 0.2  # rad off the plan: an obstacle, or another arm than the planned one
+# For an arm with an undeclared payload
+LOADED_FACTOR = 2.0  # times OFFSET_SHARE and CORRECTION_SHARE
+LOADED_DEVIATION = 0.5  # rad
+
+
+class TrackingController:
+    """PD control about the nominal model's torque plus an adaptive estimate of the missing torque.
+
+    The estimate is theta . (1, tanh(dq_ref / 0.03), dq_ref / dq_max) per joint: offset, Coulomb and viscous friction,
+    adapted during the motion as in Slotine and Li (IJRR 6(3), 1987), within plausible limits. Without it, friction as
+    large as the whole PD torque would hold a light wrist, whose gains must be small.
+    Gains are the nominal mass matrix times a bandwidth. They fit any arm, including joints with nearly parallel axes,
+    which independent joint gains destabilize.
+
+    Args:
+        robot: the nominal model. excitation: the plan.
+        max_deviation: rad, largest allowed deviation of a joint from the plan.
+    """
+
+    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: float = MAX_DEVIATION):
+        self._plan, self._max_deviation = excitation, max_deviation
+        self._feedforward, self._mass = _inverse_dynamics(robot, excitation)
+        dq = excitation.dq
+        basis = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
+        self._regressor = basis.transpose(1, 0, 2)  # (T, 3, n)
+        self._theta = np.zeros((3, robot.n))
+        friction = friction_margin(robot)
+        self._theta_max = np.array([OFFSET_SHARE * robot.tau_max, friction, friction])
+        # inertia of each joint with the others free; a light posture has to adapt slowly
+        inertia = 1 / np.diagonal(np.linalg.inv(self._mass), axis1=1, axis2=2)
+        self._gain = ADAPTATION_RATE * SIM_DT * BANDWIDTH**2 * inertia  # Nm per (rad/s + BANDWIDTH rad) of error
+        self._correction = CORRECTION_SHARE * robot.tau_max
+
+    def __call__(self, k: int, state: ArmState) -> np.ndarray:
+        """Return the target (n,) Nm of cycle k, from the state read in it."""
+        e = self._plan
+        error, rate = e.q[k] - state.q, e.dq[k] - state.dq
+        self._theta += self._gain[k // MASS_EVERY] * (rate + 0.5 * BANDWIDTH * error) * self._regressor[k]
+        self._theta = np.minimum(np.maximum(self._theta, -self._theta_max), self._theta_max)
+        pd = self._mass[k // MASS_EVERY] @ (BANDWIDTH**2 * error + 2 * BANDWIDTH * rate)
+        added = pd + (self._theta * self._regressor[k]).sum(0)
+        return self._feedforward[k] + np.minimum(np.maximum(added, -self._correction), self._correction)
+
+    def deviation(self, k: int, state: ArmState) -> str | None:
+        """Return the message for a joint that deviates too far from the plan in cycle k, or None."""
+        deviation = np.abs(self._plan.q[k] - state.q)
+        if (deviation <= self._max_deviation).all():
+            return None
+        i = int(deviation.argmax())
+        return (
+            f"joint {i + 1} is {deviation[i]:.3f} rad off its path, allowed {self._max_deviation:g} rad: an obstacle "
+            "blocks it, or it cannot follow"
+        )
+
+
+class LoadedTrackingController(TrackingController):
+    """Tracking for an arm that may carry an undeclared payload of up to 1.5 kg.
+
+    Its gains assume half of that, because the sag of a strong joint would otherwise swing the wrist. It allows a
+    larger deviation and a larger correction.
+    """
+
+    def __init__(self, robot: Robot, excitation: Excitation):
+        super().__init__(robot, excitation, LOADED_DEVIATION)
+        half = np.array(0.5 * MOST_KG)
+        payload = Payload(half, np.zeros(3), sphere_inertia(half))
+        links = with_payload(robot, payload, (robot.mass, robot.com, robot.inertia))
+        mass, bias, work = np.empty((robot.n, robot.n)), np.empty(robot.n), np.empty((robot.n, WORK))
+        arm = links_of(robot, *links)
+        for k, q in enumerate(excitation.q[::MASS_EVERY]):
+            equations(arm, robot.gravity, q, np.zeros(robot.n), mass, bias, work)
+            self._mass[k] = mass + np.diag(robot.armature)
+        self._theta_max[0] *= LOADED_FACTOR
+        self._correction = LOADED_FACTOR * self._correction
+
+
+def _inverse_dynamics(robot: Robot, e: Excitation) -> tuple[np.ndarray, np.ndarray]:
+    """Return torque without gravity (T, n) Nm and every MASS_EVERY-th mass matrix (., n, n) kg m^2."""
+    model = robot.model(gravity=False)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # excludes the soft spring of joint limits
+    return mujoco_inverse_dynamics(model, e.q, e.dq, e.ddq), mass_matrix(robot, e.q[::MASS_EVERY])

@@ -1,0 +1,205 @@
+"""Joints with elastic gears and dry friction that warms up, compiled: one 1 ms cycle of the elastic twin.
+
+Per joint, theta and w = dtheta/dt of the motor (at the joint's side of the gear), q and v of the link:
+    rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v
+    s = K (theta - q) + D (w - v)
+    f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
+L (w - v) is the damping of the gear by the drive's torque loop. A motor at rest stays exactly at rest while the net
+torque on it is within f at w = 0; friction then balances that torque.
+warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus a sine of theta each per revolution of the joint, of the
+motor, and of half a revolution of the motor (the two lobes of a strain wave gear).
+
+Integration is Verlet's: half a step of positions, a whole step of velocities with the forces there, half a step of
+positions. Velocity-dependent forces are taken at the middle of the step, with one correction. A motor that comes to
+rest within a step rests or reverses from that moment on (as in r2s/physics/stick_slip.py; motors act on each other
+only through their gears, so that each is solved by itself).
+"""
+
+import numpy as np
+
+from r2s.arm.twins.draws import ENCODER, drag
+from r2s.compiled import njit
+from r2s.physics.linear_algebra import factor, solve
+from r2s.physics.newton_euler import WORK, equations
+from r2s.physics.robot import SIM_DT
+
+# Rows of the parameters (ROWS, n) ...
+C_NEG, C_POS, BREAK, MU, V_STRIBECK, SHAPE, VISCOUS, POWER, RATIO = range(9)
+RIPPLE, PHASE = 9, 12  # three rows each: joint, motor and half motor revolution
+FALL, POWER_0, COOLING = range(15, 18)  # POWER_0: W of friction at which heat settles at 1
+HELP, HELP_VISCOUS, HELP_WIDTH = range(18, 21)  # the arm's own friction compensation: Nm, Nm s/rad, rad/s
+ROTOR, STIFF, GEAR, LOOP, DAMPING, DELAY, LAG = range(21, 28)
+OFFSET, DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ROWS = range(28, 37)
+# ... of the state (STATES, n); *_AT: at the time of the sensors; ADDED: Nm, added to the command by the arm's control
+LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, THETA_AT, W_AT, S_AT, ADDED, STATES = (
+    range(14)
+)
+# ... and of the forces within a step (FORCES, n); the velocities are those at its middle
+F_DRIVE, F_FACTOR, F_SPRING, F_LINK_V, F_W, F_POWER, FORCES = range(7)
+HALF_WARM = 0.6  # heat scale of warming; heat is 1 at a quarter of the speed limit
+
+
+@njit(cache=True)
+def warmth(p, heat, i):
+    """Return the factor of all friction, from 1 when cold to 1 - FALL."""
+    return 1.0 - p[FALL, i] * (1.0 - np.exp(-heat / HALF_WARM))
+
+
+@njit(cache=True)
+def ripple(p, theta, i):
+    """Return the position-dependent factor of all friction."""
+    joint = p[RIPPLE, i] * np.sin(theta + p[PHASE, i])
+    motor = p[RIPPLE + 1, i] * np.sin(p[RATIO, i] * theta + p[PHASE + 1, i])
+    return 1.0 + joint + motor + p[RIPPLE + 2, i] * np.sin(2 * p[RATIO, i] * theta + p[PHASE + 2, i])
+
+
+@njit(cache=True)
+def level(p, w, load, side, i):
+    """Return the friction, Nm, cold and without ripple, against motion to `side` at w rad/s; at 0: breakaway."""
+    coulomb = p[C_POS, i] if side > 0 else p[C_NEG, i]
+    speed = abs(w)
+    rise = (p[BREAK, i] - 1.0) / (1.0 + (speed / p[V_STRIBECK, i]) ** p[SHAPE, i])
+    return coulomb * (1.0 + rise) + p[MU, i] * abs(load) + p[VISCOUS, i] * speed ** p[POWER, i]
+
+
+@njit(cache=True)
+def _next_velocity(p, w, middle, push, load, factor, h, i):
+    """Return the motor's velocity after h seconds under a net torque `push` without friction.
+
+    Args:
+        p, i: parameters and joint. w: velocity now, rad/s. middle: velocity for the friction of a motor that keeps
+            its direction. load: Nm, of the gear. factor: of friction.
+    """
+    side = np.sign(w)
+    if w != 0.0:
+        f = factor * level(p, middle if middle * side > 0 else w, load, side, i)
+        after = w + h / p[ROTOR, i] * (push - side * f)
+        if after * side >= 0.0:
+            return after
+        h *= 1.0 - w / (w - after)  # the time that is left after it has come to rest
+    side = np.sign(push)
+    edge = factor * level(p, 0.0, load, side, i)
+    if abs(push) <= edge:
+        return 0.0
+    f = factor * level(p, middle, load, side, i) if middle * side > 0 else edge
+    return h / p[ROTOR, i] * (push - side * f)
+
+
+@njit(cache=True)
+def _active(line, cycle, t, delay):
+    """Return the row of the line that a joint executes at t cycles, the last whose delay is over; -1 for none yet."""
+    slots, arrival = len(line), line.shape[1] - 1
+    for k in range(cycle, max(cycle - slots, -1), -1):
+        if line[k % slots, arrival] + delay <= t:
+            return k % slots
+    return -1
+
+
+@njit(cache=True)
+def _commanded(line, cycle, begin, end, delay, i):
+    """Return the mean command, Nm, that a joint executes between two times, cycles."""
+    older, newer = _active(line, cycle, begin, delay), _active(line, cycle, end, delay)
+    after = line[newer, i] if newer >= 0 else 0.0
+    if older == newer:
+        return after
+    before = line[older, i] if older >= 0 else 0.0
+    return after + (before - after) * (line[newer, line.shape[1] - 1] + delay - begin) / (end - begin)
+
+
+@njit(cache=True)
+def compensate(p, s, gravity):
+    """Write the torque that the arm's own control adds: gravity (n,) Nm and partial friction compensation."""
+    for i in range(s.shape[1]):
+        dq = s[DQ_MEASURED, i]
+        s[ADDED, i] = gravity[i] + p[HELP, i] * np.tanh(dq / p[HELP_WIDTH, i]) + p[HELP_VISCOUS, i] * dq
+
+
+@njit(cache=True)
+def advance(p, s, links, gravity, line, cycle, steps, age):
+    """Advance the arm by one cycle in `steps` steps; keep its motion at `age` cycles before the end for the sensors.
+
+    Args:
+        p, s: parameters, and the state, which changes. links, gravity: of the true arm.
+        line: (slots, n + 1), the last commands, Nm, and when each arrived, cycles. cycle: its number.
+    """
+    n, h = s.shape[1], SIM_DT / steps
+    mass, root, bias, work = np.empty((n, n)), np.empty((n, n)), np.empty(n), np.empty((n, WORK))
+    f, before = np.empty((FORCES, n)), np.empty((3, n))
+    f[F_POWER] = 0.0
+    for step in range(steps):
+        for i in range(n):
+            before[0, i], before[1, i] = s[THETA, i], s[W, i]
+            before[2, i] = _gear_torque(p, s, i)
+        _move(s, 0.5 * h)
+        _external_forces(p, s, f, line, cycle, cycle + step / steps, cycle + (step + 1) / steps, h)
+        for correction in range(2):
+            equations(links, gravity, s[LINK_Q], f[F_LINK_V], mass, bias, work)
+            if correction == 0:
+                factor(mass, root)
+            _accelerate(p, s, f, bias, root, h, correction == 1)
+        _move(s, 0.5 * h)
+        share = steps * (1.0 - age) - step  # of this step, at which the sensors read
+        if 0.0 <= share <= 1.0:
+            for i in range(n):
+                s[THETA_AT, i] = (1.0 - share) * before[0, i] + share * s[THETA, i]
+                s[W_AT, i] = (1.0 - share) * before[1, i] + share * s[W, i]
+                s[S_AT, i] = (1.0 - share) * before[2, i] + share * _gear_torque(p, s, i)
+    for i in range(n):
+        s[HEAT, i] += SIM_DT / p[COOLING, i] * (f[F_POWER, i] / steps / p[POWER_0, i] - s[HEAT, i])
+
+
+@njit(cache=True)
+def _gear_torque(p, s, i):
+    return p[STIFF, i] * (s[THETA, i] - s[LINK_Q, i]) + p[GEAR, i] * (s[W, i] - s[LINK_V, i])
+
+
+@njit(cache=True)
+def _move(s, h):
+    for i in range(s.shape[1]):
+        s[LINK_Q, i] += h * s[LINK_V, i]
+        s[THETA, i] += h * s[W, i]
+
+
+@njit(cache=True)
+def _external_forces(p, s, f, line, cycle, begin, end, h):
+    """Write the motors' torque, friction factors and spring torques of a step from `begin` to `end`, cycles."""
+    for i in range(s.shape[1]):
+        target = s[ADDED, i] + _commanded(line, cycle, begin, end, p[DELAY, i], i)
+        change = (target - s[MOTOR, i]) * -np.expm1(-h / p[LAG, i])
+        f[F_DRIVE, i] = s[MOTOR, i] + 0.5 * change + p[OFFSET, i]
+        s[MOTOR, i] += change
+        f[F_FACTOR, i] = warmth(p, s[HEAT, i], i) * ripple(p, s[THETA, i], i)
+        f[F_SPRING, i] = p[STIFF, i] * (s[THETA, i] - s[LINK_Q, i])
+        f[F_LINK_V, i], f[F_W, i] = s[LINK_V, i], s[W, i]
+
+
+@njit(cache=True)
+def _accelerate(p, s, f, bias, root, h, last):
+    """Predict the velocities at the middle of the step, or take the step with them if `last`."""
+    n, q = s.shape[1], s[LINK_Q]
+    for i in range(n):
+        gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])
+        pull = drag(p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i], q[i], q[(i + 1) % n])
+        bias[i] = gear + pull - p[DAMPING, i] * f[F_LINK_V, i] - bias[i]
+        push = f[F_DRIVE, i] - gear - p[LOOP, i] * (f[F_W, i] - f[F_LINK_V, i])
+        after = _next_velocity(p, s[W, i], f[F_W, i], push, gear, f[F_FACTOR, i], h, i)
+        if last:
+            f[F_POWER, i] += (push - p[ROTOR, i] * (after - s[W, i]) / h) * 0.5 * (s[W, i] + after)
+            s[W, i] = after
+        else:
+            f[F_W, i] = 0.5 * (s[W, i] + after)
+    solve(root, bias)
+    for i in range(n):
+        if last:
+            s[LINK_V, i] += h * bias[i]
+        else:
+            f[F_LINK_V, i] = s[LINK_V, i] + 0.5 * h * bias[i]
+
+
+@njit(cache=True)
+def sense(p, s, noise, dq_filter):
+    """Read the sensors at the kept motion; noise (3, n) is standard normal."""
+    for i in range(s.shape[1]):
+        s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
+        s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])
+        s[TAU_MEASURED, i] = s[S_AT, i] + p[NOISE_TAU, i] * noise[2, i]

@@ -1,0 +1,183 @@
+"""The elastic variant of hidden twin: none of its difficulties is in the identification's model.
+
+Elastic gears that oscillate; friction with exact rest, a Stribeck curve of its own shape, warming, and ripple with
+the gears (elastic_joints.py); a control box that compensates a part of the friction from the measured speed; a clock
+that jitters and occasionally loses a packet; another delay and lag for each joint. Wrong masses, centres and tensors,
+offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot, whose parameters only
+this file reads. Seeds 0-9 are for development; seeds of 200 and above are for judging.
+
+One cycle of 1 ms: the control box adds its compensations to the command; elastic_joints.py integrates rotors and
+links in steps of at most 0.05 ms; the sensors read the motors up to half a millisecond before the end.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.twins import elastic_joints as ej
+from r2s.arm.twins.draws import drag, draw_links, draw_surroundings, magnitudes
+from r2s.arm.twins.twin_base import NOISE_BLOCK, TwinBase
+from r2s.errors import UserError
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.payload import Payload, with_payload
+from r2s.physics.robot import SIM_DT, Robot
+
+MIN_STEPS = 20  # per cycle: 1 s of open loop is then within 1e-5 rad of the result with finer steps
+MAX_STEPS = 200
+PHASE_STEP = 0.1  # rad per step of the fastest oscillation at home, at most
+SLOTS = 8  # cycles of stored commands
+WARM_SPEED = 0.25  # of dq_max, at which heat settles at 1
+STATIC_ROUNDS = 50  # fixed-point iterations of the posture in which gears balance gravity
+
+
+class ElasticTwin(TwinBase):
+    """The elastic variant; arguments as in `TwinBase`.
+
+    Time, noise and oscillation restart at every `move_to`. Heat remains, because the arm is the same: the k-th motion
+    of a twin depends on those before it. A new twin is cold, and `move_to` takes no time.
+
+    Args:
+        stiffness: None: drawn with the robot.
+
+    Raises:
+        UserError: gears so stiff, or rotors and links so light, that their oscillation needs more than MAX_STEPS.
+    """
+
+    def __init__(self, robot: Robot, seed: int, **settings: Any):
+        super().__init__(robot, seed, **settings)
+        rng = np.random.default_rng([self._seed, 2])
+        self._nominal = links_of(robot, robot.mass, robot.com, robot.inertia)
+        self._unloaded = links = draw_links(robot, rng)
+        self._links = links_of(robot, *links)
+        self._mass, self._bias = np.empty((robot.n, robot.n)), np.empty(robot.n)
+        self._work = np.empty((robot.n, WORK))
+        at_home = self._gravity(self._nominal, robot.q_home)
+        unbalanced = at_home - self._gravity(self._links, robot.q_home)
+        inertia = self._mass.copy()
+        self._hidden = p = _draw_joints(robot, rng, inertia, unbalanced)
+        p[[ej.C_NEG, ej.C_POS, ej.VISCOUS]] *= self._friction_scale
+        if self._stiffness is not None:
+            p[ej.STIFF] = robot.tau_max * self._stiffness / robot.tau_max.max()
+        critical = _critical_damping(p, inertia)
+        p[ej.GEAR] = critical * rng.uniform(0.02, 0.06, robot.n)
+        p[ej.LOOP] = critical * rng.uniform(0.45, 0.7, robot.n)
+        self._steps = _steps(p, inertia)
+        if self._declared_payload is not None:
+            declared = with_payload(robot, self._declared_payload, (robot.mass, robot.com, robot.inertia))
+            self._nominal = links_of(robot, *declared)
+        self._update_payload()
+        self._dq_filter = -np.expm1(-2 * np.pi * rng.uniform(60.0, 120.0) * SIM_DT)
+        self._jitter = rng.uniform(0.2, 0.5)  # cycles, of sensors and of commands
+        self._loss = rng.uniform(5e-4, 3e-3)  # share of the commands that miss their cycle
+        self._line = np.zeros((SLOTS, robot.n + 1))
+        self._state = np.zeros((ej.STATES, robot.n))
+        self._start(robot.q_home)
+
+    def _attach(self, payload: Payload | None) -> None:
+        self._links = links_of(self.robot, *with_payload(self.robot, payload, self._unloaded))
+
+    def _gravity(self, links: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm that holds these links at q (n,) rad."""
+        equations(links, self.robot.gravity, q, np.zeros(self.robot.n), self._mass, self._bias, self._work)
+        return self._bias.copy()
+
+    def _start(self, q: np.ndarray) -> None:
+        p, s = self._hidden, self._state
+        self._rng = np.random.default_rng([self._seed, 3, self._episode, self._stream])
+        self._cycle, self._tau_J_d = 0, np.zeros(self.robot.n)
+        heat = s[ej.HEAT].copy()
+        s[:] = 0
+        s[ej.HEAT], s[ej.LINK_Q], s[ej.THETA], s[ej.MOTOR] = heat, q, q, self._gravity(self._nominal, q)
+        cable = p[ej.DRAG_OWN], p[ej.DRAG_NEXT], p[ej.DRAG_WAVES], p[ej.DRAG_PHASE]
+        for _ in range(STATIC_ROUNDS):
+            pull = drag(*cable, s[ej.LINK_Q], np.roll(s[ej.LINK_Q], -1))
+            s[ej.LINK_Q] = q - (self._gravity(self._links, s[ej.LINK_Q]) - pull) / p[ej.STIFF]
+        s[ej.THETA_AT], s[ej.S_AT] = q, p[ej.STIFF] * (q - s[ej.LINK_Q])
+        self._line[:] = 0
+        self._q, self._dq = s[ej.THETA], s[ej.W]  # views: the reflexes check the motors
+        self._sense()
+
+    def _advance(self, tau: np.ndarray) -> None:
+        s, robot = self._state, self.robot
+        age, late, luck = self._clock[self._cycle % NOISE_BLOCK]
+        if luck >= self._loss:  # otherwise the arm repeats the previous command
+            self._tau_J_d = tau
+        slot = self._cycle % SLOTS
+        self._line[slot, :-1], self._line[slot, -1] = self._tau_J_d, self._cycle + self._jitter * late
+        ej.compensate(self._hidden, s, self._gravity(self._nominal, s[ej.Q_MEASURED]))
+        ej.advance(
+            self._hidden, s, self._links, robot.gravity, self._line, self._cycle, self._steps, self._jitter * age
+        )
+        self._cycle += 1
+        self._sense()
+
+    def _sense(self) -> None:
+        row = self._cycle % NOISE_BLOCK
+        if row == 0:
+            self._noise = self._rng.standard_normal((NOISE_BLOCK, 3, self.robot.n))
+            self._clock = self._rng.uniform(size=(NOISE_BLOCK, 3))
+        ej.sense(self._hidden, self._state, self._noise[row], self._dq_filter)
+
+    def _sensors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = self._state
+        return s[ej.Q_MEASURED], s[ej.DQ_MEASURED], s[ej.TAU_MEASURED]
+
+
+def _draw_joints(robot: Robot, rng: np.random.Generator, inertia: np.ndarray, unbalanced: np.ndarray) -> np.ndarray:
+    """Return the parameters (ROWS, n) but the gears' damping.
+
+    Args:
+        robot, rng: the arm, and the random stream.
+        inertia: (n, n) kg m^2, of the true links at home.
+        unbalanced: (n,) Nm, what gravity compensation leaves at home.
+
+    """
+    n, model = robot.n, robot.model(gravity=False)
+    own_inertia = 1 / np.diag(np.linalg.inv(inertia))  # kg m^2, with the other joints free
+    p = np.zeros((ej.ROWS, n))
+    size = magnitudes(robot)[0] * rng.uniform(0.7, 1.3, n)
+    coulomb = 0.75 * size  # the control box compensates a quarter of it; the rest of the size comes with speed
+    asymmetry = coulomb * rng.uniform(0.05, 0.25, n) * rng.choice([-1, 1], n)
+    p[ej.C_NEG] = coulomb - asymmetry + model.dof_frictionloss
+    p[ej.C_POS] = coulomb + asymmetry + model.dof_frictionloss
+    p[ej.BREAK] = rng.uniform(1.1, 1.35, n)  # of the Coulomb level
+    p[ej.MU] = rng.uniform(0.01, 0.02, n)  # Nm per Nm of gear torque
+    p[ej.V_STRIBECK], p[ej.SHAPE] = rng.uniform(0.02, 0.08, n), rng.uniform(1.0, 1.6, n)
+    p[ej.VISCOUS], p[ej.POWER] = 0.5 * size * rng.uniform(0.7, 1.3, n), rng.uniform(0.6, 0.9, n)
+    p[ej.RATIO] = rng.choice([50.0, 80.0, 100.0, 120.0, 160.0], n)
+    p[ej.RIPPLE : ej.RIPPLE + 3] = rng.uniform(0.01, 0.05, (3, n))
+    p[ej.PHASE : ej.PHASE + 3] = rng.uniform(-np.pi, np.pi, (3, n))
+    p[ej.FALL], p[ej.COOLING] = rng.uniform(0.13, 0.3, n), rng.uniform(60.0, 180.0, n)
+    share = rng.uniform(0.15, 0.3, n)
+    p[ej.HELP], p[ej.HELP_VISCOUS] = share * coulomb * rng.uniform(0.9, 1.1, n), share * p[ej.VISCOUS]
+    p[ej.HELP_WIDTH] = rng.uniform(0.02, 0.05, n)  # rad/s
+    p[ej.ROTOR] = own_inertia * rng.uniform(0.15, 0.3, n) + model.dof_armature
+    p[ej.STIFF] = robot.tau_max * rng.uniform(125.0, 210.0, n)  # 1.5e4 Nm/rad for the strong joints of a Panda
+    p[ej.DAMPING] = model.dof_damping
+    p[ej.DELAY] = rng.uniform(1.75, 3.75) * rng.uniform(0.75, 1.25, n) * 1e-3 / SIM_DT  # cycles
+    p[ej.LAG] = rng.uniform(5e-4, 2e-3, n)  # s
+    p[ej.OFFSET : ej.NOISE_TAU + 1] = draw_surroundings(robot, rng, 0.7 * coulomb, unbalanced)
+    speed = WARM_SPEED * robot.dq_max
+    p[ej.POWER_0] = [speed[i] * ej.level(p, speed[i], 0.0, 1.0, i) for i in range(n)]
+    return p
+
+
+def _critical_damping(p: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """Return (n,) Nm s/rad of each gear's critical damping, with the other joints free."""
+    reduced = 1 / (1 / p[ej.ROTOR] + np.diag(np.linalg.inv(inertia)))
+    return 2 * np.sqrt(p[ej.STIFF] * reduced)
+
+
+def _steps(p: np.ndarray, inertia: np.ndarray) -> int:
+    """Return the number of steps per cycle that resolves the gears' fastest oscillation."""
+    mobility = np.linalg.inv(inertia) + np.diag(1 / p[ej.ROTOR])  # of the gears' deflections
+    root = np.sqrt(p[ej.STIFF])
+    fastest = np.sqrt(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
+    steps = int(np.ceil(fastest * SIM_DT / PHASE_STEP))
+    if steps > MAX_STEPS:
+        limit = MAX_STEPS * PHASE_STEP / SIM_DT / 2 / np.pi
+        raise UserError(
+            f"arm.stiffness: gears of {p[ej.STIFF].max():.3g} Nm/rad oscillate at {fastest / 2 / np.pi:.3g} Hz on "
+            f"this arm; arm.variant=elastic allows up to {limit:.3g} Hz; arm.variant=rigid has rigid gears"
+        )
+    return max(MIN_STEPS, steps)

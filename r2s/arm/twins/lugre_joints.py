@@ -1,0 +1,147 @@
+"""LuGre friction of the rigid twin, compiled: implicit friction for the engine's step, and the sensors.
+
+Per joint (Canudas de Wit et al., IEEE TAC 40(3), 1995), with bristle deflection z rad and velocity v:
+    dz/dt = v - s0 |v| z / g(v),   f = s0 z + s1(v) dz/dt + s2 v,   s1(v) = s1 exp(-(v / vd)^2)
+    g(v) = c (1 + (b - 1) exp(-(v / vs)^2)) + mu |load|,   c one value per direction
+"""
+
+import numpy as np
+
+from r2s.arm.twins.draws import ENCODER, drag
+from r2s.compiled import njit
+from r2s.physics.robot import SIM_DT
+
+# Rows of the parameters (ROWS, n) ...
+C_NEG, C_POS, BREAK, MU, V_STRIBECK, S0, S1, S2, OFFSET = range(9)
+DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMATURE, COMPLIANCE = range(9, 18)
+DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; gains per cycle of torque lag and speed filter
+# ... and of the state (STATES, n)
+Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
+Q, V, V_BEFORE, STATES = range(12, 16)
+
+DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, otherwise each reversal would cause a torque pulse
+SWEEPS, CONVERGED = 50, 1e-9  # most Gauss-Seidel sweeps, and the change, rad/s, at which they end
+
+
+@njit(cache=True)
+def _stribeck(p, z, v, load, i):
+    """Return the friction level g(v), Nm; z gives the direction."""
+    coulomb = p[C_POS, i] if z >= 0 else p[C_NEG, i]
+    fade = np.exp(-((v / p[V_STRIBECK, i]) ** 2))
+    return coulomb * (1 + (p[BREAK, i] - 1) * fade) + p[MU, i] * abs(load)
+
+
+@njit(cache=True)
+def cable_drag(p, q, i):
+    """Return the cable's torque on joint i at q (n,) rad, Nm."""
+    own, along, waves, phase = p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i]
+    return drag(own, along, waves, phase, q[i], q[(i + 1) % len(q)])
+
+
+@njit(cache=True)
+def rest(p, s, q, compensation, gravity):
+    """Set the state at rest at q (n,) rad: bristles hold the difference of gravity compensation and gravity, Nm."""
+    s[:] = 0
+    for i in range(len(q)):
+        s[Q, i] = q[i]
+        left = compensation[i] + p[OFFSET, i] + cable_drag(p, q, i)
+        level = 0.95 * _stribeck(p, left - gravity[i], 0.0, compensation[i], i)
+        s[FRICTION, i] = min(max(left - gravity[i], -level), level)
+        s[Z, i] = s[FRICTION, i] / p[S0, i]
+        s[DRIVE, i] = left
+        s[LEVEL, i] = np.inf
+        s[BIAS, i] = gravity[i]
+        s[BENT, i] = p[COMPLIANCE, i] * (s[DRIVE, i] - s[FRICTION, i])
+
+
+@njit(cache=True)
+def drive(p, s, line, cycle, tau, compensation, mass):
+    """Apply a command; return passive torque and implicit damping (n,) for the engine's step.
+
+    The coupled implicit equation of the step, mass (w - v) / h + bias + f(w) = drive, is solved for the next velocity
+    w joint by joint (Gauss-Seidel), each exactly: with the bristle's backward Euler step
+    z' = (z + h w) / (1 + k |w|), k = h s0 / g, it is a quadratic with one root of the right sign.
+
+    Args:
+        p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: its number.
+        tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
+    """
+    n, slots, h = len(tau), len(line), SIM_DT
+    q, v, w = s[Q], s[V], s[V_GUESS]
+    passive, damping = np.empty(n), np.empty(n)
+    for i in range(n):
+        line[cycle % slots, i] = tau[i]
+    for i in range(n):
+        whole = int(p[DELAY, i])
+        part = p[DELAY, i] - whole
+        newer, older = (cycle - whole) % slots, (cycle - whole - 1) % slots
+        delayed = (1 - part) * line[newer, i] + part * line[older, i]
+        s[MOTOR, i] += p[LAG, i] * (delayed - s[MOTOR, i])
+        passive[i] = compensation[i] + p[OFFSET, i] + cable_drag(p, q, i)
+        s[DRIVE, i] = s[MOTOR, i] + passive[i]
+        s[LEVEL, i] = _stribeck(p, s[Z, i], v[i], compensation[i], i)
+        limit = s[LEVEL, i] / p[S0, i]
+        s[Z, i] = min(max(s[Z, i], -limit), limit)
+        damping[i] = p[S1, i] * np.exp(-((v[i] / DQ_BRISTLE) ** 2)) / h  # s1 / h until the end of this function
+    for _ in range(SWEEPS):
+        if _sweep(p, s, damping, mass) < CONVERGED:
+            break
+    for i in range(n):
+        stiff, z, k = p[S0, i] + damping[i], s[Z, i], h * p[S0, i] / s[LEVEL, i]
+        grow = 1 + k * abs(w[i])
+        sign = 1.0 if w[i] >= 0 else -1.0
+        friction = stiff * (z + h * w[i]) / grow - damping[i] * z + p[S2, i] * w[i]
+        slope = stiff * (h - z * k * sign) / (grow * grow) + p[S2, i]
+        s[FRICTION, i], s[SLOPE, i] = friction, slope
+        damping[i] = slope
+        passive[i] -= friction - slope * w[i]
+    return passive, damping
+
+
+@njit(cache=True)
+def _sweep(p, s, damping, mass):
+    """Solve each joint's equation once for its next velocity; return the largest change, rad/s."""
+    n, h, v, w, change = len(damping), SIM_DT, s[V], s[V_GUESS], 0.0
+    for i in range(n):
+        free = s[DRIVE, i] - s[BIAS, i] + mass[i, i] / h * v[i]
+        for j in range(n):
+            if j != i:
+                free -= mass[i, j] / h * (w[j] - v[j])
+        stiff, z, k = p[S0, i] + damping[i], s[Z, i], h * p[S0, i] / s[LEVEL, i]
+        a = mass[i, i] / h + p[S2, i]
+        left = free + damping[i] * z - stiff * z  # the torque at w = 0 determines the direction
+        sign = 1.0 if left >= 0 else -1.0
+        b = a + stiff * h - sign * (free + damping[i] * z) * k
+        root = np.sqrt(b * b + 4 * a * k * abs(left))
+        speed = 2 * abs(left) / (b + root) if b > 0 else (root - b) / (2 * a * k)
+        change = max(change, abs(sign * speed - w[i]))
+        w[i] = sign * speed
+    return change
+
+
+@njit(cache=True)
+def sense(p, s, mass, noise):
+    """Finish the step: bristles, link torque, remaining bias, sensors.
+
+    Args:
+        p, s: parameters, and the state with Q, V after the step and V_BEFORE.
+        mass: (n, n) kg m^2. noise: (3, n), standard normal, of q, dq and tau_J.
+    """
+    n, h, v, before = s.shape[1], SIM_DT, s[V], s[V_BEFORE]
+    for i in range(n):
+        s[FRICTION, i] += s[SLOPE, i] * (v[i] - s[V_GUESS, i])
+        s[Z, i] = (s[Z, i] + h * v[i]) / (1 + h * p[S0, i] / s[LEVEL, i] * abs(v[i]))
+        link = s[DRIVE, i] - s[FRICTION, i]
+        inertial = 0.0
+        for j in range(n):
+            inertial += mass[i, j] * (v[j] - before[j]) / h
+        s[BIAS, i] = link - inertial
+        rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of gear and sensor
+        bent = p[COMPLIANCE, i] * (link - rotor)
+        motor_q, motor_v = s[Q, i] + bent, v[i] + (bent - s[BENT, i]) / h
+        s[BENT, i] = bent
+        s[Q_MEASURED, i] = ENCODER * np.round((motor_q + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
+        s[DQ_MEASURED, i] += p[DQ_FILTER, i] * (motor_v + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])
+        s[TAU_MEASURED, i] = link - rotor + p[NOISE_TAU, i] * noise[2, i]
+    for i in range(n):
+        s[V_GUESS, i] = v[i]

@@ -1,0 +1,47 @@
+"""The hidden twins by their variant: `arm=twin arm.variant=rigid|elastic`."""
+
+from typing import Any
+
+from r2s.arm.twins.elastic_twin import ElasticTwin
+from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.arm.twins.twin_base import TwinBase
+from r2s.errors import UserError, choices, nearest
+from r2s.physics.robot import Robot
+
+VARIANTS: dict[str, type[TwinBase]] = {"rigid": RigidTwin, "elastic": ElasticTwin}
+
+
+def make_twin(
+    robot: Robot,
+    *,
+    variant: str = "rigid",
+    seed: int = 0,
+    payload: Any = 0.0,
+    declared_payload: Any = None,
+    stiffness: float | None = None,
+    noise: int = 0,
+    friction_scale: float = 1.0,
+    extra_delay_s: float = 0.0,
+) -> TwinBase:
+    """Return a hidden twin. These are the keys of conf/arm/twin.yaml; see `TwinBase`.
+
+    Args:
+        variant: 'rigid': rigid or quasi-statically bending gears, LuGre friction, in DART. 'elastic': effects that no
+            model of r2s contains, see r2s/arm/twins/elastic_twin.py.
+
+    Raises:
+        UserError: an unknown variant, or an argument out of its range.
+    """
+    if not isinstance(variant, str) or variant not in VARIANTS:
+        near = nearest(str(variant), VARIANTS)
+        raise UserError(f"arm.variant: {variant!r}; allowed: {choices(VARIANTS)}{near}")
+    return VARIANTS[variant](
+        robot,
+        seed,
+        payload=payload,
+        declared_payload=declared_payload,
+        stiffness=stiffness,
+        noise=noise,
+        friction_scale=friction_scale,
+        extra_delay_s=extra_delay_s,
+    )

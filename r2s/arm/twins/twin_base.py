@@ -1,0 +1,162 @@
+"""What both variants of hidden twin have in common: settings, reflexes, payload, extra delay, episodes.
+
+A variant (rigid_twin.py, elastic_twin.py) draws a robot around the nominal one from its seed, and has drives and
+friction of its own. Only the variant's own code reads the drawn parameters.
+"""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.errors import UserError, check_number
+from r2s.physics.payload import Payload, payload_of
+from r2s.physics.robot import SIM_DT, Robot
+
+NOISE_BLOCK = 1000  # cycles of noise drawn at once
+MAX_EXTRA_DELAY_S = 0.02
+
+
+class TwinBase:
+    """An `Arm` (r2s/arm/interface.py) whose parameters are hidden: only its seed is known.
+
+    Equal seed, noise stream and calls give bit-identical states. `move_to` begins an episode with a noise stream of
+    its own: the k-th episode of a twin has the same noise whatever its earlier episodes did.
+
+    A variant implements `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command,
+    `_attach(payload)`, which changes the payload now, and `_sensors()`, which returns q, dq and tau_J. It sets `_q`
+    and `_dq`, which the reflexes check, `_cycle` and `_tau_J_d`, and multiplies its friction by `_friction_scale`.
+
+    Args:
+        robot: the nominal arm. seed: of the robot drawn around it.
+        payload: the carried body, see `r2s.physics.payload.payload_of`: kg of a point mass, or a mapping.
+        declared_payload: what the arm's gravity compensation assumes of it (libfranka's setLoad), in the same form;
+            None: nothing.
+        stiffness: Nm/rad of the strongest joints' gears; the other joints' in proportion to their torque limit.
+        noise: number of the sensor noise stream; two recordings of one robot need different ones.
+        friction_scale: factor of the drawn friction, except of its load-dependent part; below 1 for a warm arm.
+        extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
+
+    Raises:
+        UserError: an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        *,
+        payload: Any = 0.0,
+        declared_payload: Any = None,
+        stiffness: float | None = None,
+        noise: int = 0,
+        friction_scale: float = 1.0,
+        extra_delay_s: float = 0.0,
+    ):
+        check_number("arm.seed", seed, "[0, inf)", whole=True)
+        self._payload = payload_of(payload)
+        self._declared_payload = payload_of(declared_payload, "arm.declared_payload")
+        self._carries = False
+        if stiffness is not None:
+            check_number("arm.stiffness", stiffness, "(0, inf)")
+        check_number("arm.noise", noise, "[0, inf)", whole=True)
+        check_number("arm.friction_scale", friction_scale, "[0.1, 3]")
+        self._stiffness, self._friction_scale = stiffness, float(friction_scale)
+        self._extra_delay = _delay_cycles(extra_delay_s)
+        self.robot = robot
+        self._seed, self._stream = int(seed), int(noise)
+        self._reflexes = Reflexes(robot)
+        self._episode = 0
+        self._stopped: str | None = "no motion was started; call move_to first"
+        self._cycle, self._tau_J_d = 0, np.zeros(robot.n)
+        self._q, self._dq = robot.q_home, np.zeros(robot.n)
+        self._pending: deque[np.ndarray] = deque()  # commands within the extra delay
+        self._sent = np.zeros(robot.n)
+
+    def move_to(self, q: np.ndarray) -> ArmState:
+        """Place the arm at rest at q (n,) rad; friction holds what gravity compensation leaves."""
+        q = np.array(q, dtype=float)
+        if q.shape != (self.robot.n,) or not np.isfinite(q).all():
+            raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
+        self._reflexes.state(q, np.zeros(self.robot.n))
+        self._cycle = 0
+        self._update_payload()
+        self._start(q)
+        self._pending, self._sent = deque(np.zeros((self._extra_delay, self.robot.n))), np.zeros(self.robot.n)
+        self._episode += 1
+        self._stopped = None
+        return self.read()
+
+    def read(self) -> ArmState:
+        """Return the sensors' values of the current cycle."""
+        q, dq, tau_J = self._sensors()
+        return ArmState(self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._last_command.copy())
+
+    def command(self, tau: np.ndarray) -> None:
+        """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""
+        if self._stopped is not None:
+            raise ArmStopped(f"the arm is stopped: {self._stopped}")
+        tau = np.array(tau, dtype=float)
+        try:
+            self._reflexes.command(tau, self._last_command)
+            self._update_payload()
+            self._advance(self._delayed(tau) if self._extra_delay else tau)
+            self._reflexes.state(self._q, self._dq)
+        except ArmStopped as reason:
+            self._stopped = str(reason)
+            raise
+
+    def stop(self) -> None:
+        """End the motion; `command` is refused until the next `move_to`."""
+        if self._stopped is None:
+            self._stopped = "stop was called"
+
+    def carry(self, payload: Payload | None) -> None:
+        """Change the payload, now and in all later motions."""
+        self._payload = payload
+        self._attach(payload if payload is not None and payload.attached(self._cycle * SIM_DT) else None)
+        self._carries = payload is not None and bool(payload.attached(self._cycle * SIM_DT))
+
+    @property
+    def _last_command(self) -> np.ndarray:
+        """(n,) Nm: with an extra delay the last one sent, otherwise the one that the arm executes."""
+        return self._sent if self._extra_delay else self._tau_J_d
+
+    def _delayed(self, tau: np.ndarray) -> np.ndarray:
+        """Queue a command (n,) Nm and return the one to execute now."""
+        self._pending.append(tau)
+        self._sent = tau
+        # rate-limited, because a variant may have lost the command before it
+        executed, step = self._tau_J_d, self.robot.dtau_max * SIM_DT
+        return executed + np.clip(self._pending.popleft() - executed, -step, step)
+
+    def _update_payload(self) -> None:
+        """Attach or detach the payload at its time."""
+        payload = self._payload
+        if payload is not None and self._carries != (now := bool(payload.attached(self._cycle * SIM_DT))):
+            self._attach(payload if now else None)
+            self._carries = now
+
+    def _attach(self, payload: Payload | None) -> None:
+        raise NotImplementedError
+
+    def _start(self, q: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _advance(self, tau: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _sensors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        raise NotImplementedError
+
+
+def _delay_cycles(extra_delay_s: float) -> int:
+    """Return the delay in cycles; raises UserError unless it is a whole number of them within the limit."""
+    check_number("arm.extra_delay_s", extra_delay_s, f"[0, {MAX_EXTRA_DELAY_S}]")
+    cycles = round(extra_delay_s / SIM_DT)
+    if abs(extra_delay_s / SIM_DT - cycles) > 1e-6:
+        raise UserError(
+            f"arm.extra_delay_s: {extra_delay_s!r}; allowed: whole milliseconds from 0 to {MAX_EXTRA_DELAY_S} s"
+        )
+    return cycles

@@ -1,0 +1,1 @@
+"""Controllers: what runs once a millisecond between a policy's action and the safety filter."""

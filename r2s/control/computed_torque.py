@@ -1,0 +1,104 @@
+"""`control=computed_torque`: follow a task's trajectory with the model's inverse dynamics; an action adds torque.
+
+    tau = action + ID(q_r, dq_r, ddq_r) + M(q_r) (w^2 (q_d - q) + 2 w (dq_d - dq))
+
+ID is the inverse dynamics of the identified arm without gravity, friction included. q_d is the reference now, and q_r
+the reference at the time when the torque acts, so that latency does not delay the feedforward (Spong, Hutchinson and
+Vidyasagar, Robot Modeling and Control, ch. 8).
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from r2s.control.controller import ControlledTask, Controller
+from r2s.errors import UserError, check_number
+from r2s.physics.control_laws import computed_torque_law
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.inverse_dynamics import InverseDynamics
+from r2s.physics.robot import SIM_DT, Robot
+
+LATENCY = (
+    0.007  # s, of torque and measurement assumed for the feedback: delay, lag and a filter (docs/explanation/arms.md)
+)
+# rad: bandwidth times latency of the loop. It leaves a phase margin of 56 deg; pi / 2 oscillates without end.
+BANDWIDTH_LATENCY = 0.6
+
+
+@dataclass(frozen=True)
+class ComputedTorque(Controller):
+    """Computed torque about a task's trajectory; see `Controller`.
+
+    Attributes:
+        model: the identified arm, None only before it is set. ahead_s: s, how far ahead the feedforward looks: half a
+            control period, the low-pass, and the identified delay and lag.
+    """
+
+    model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
+    ahead_s: float = 0.0
+
+    @property
+    def setpoint_size(self) -> int:
+        """Feedforward, q_d, dq_d (n each) and M (n n)."""
+        n = self.action_dim
+        return n * (3 + n)
+
+    @property
+    def observes_torque(self) -> bool:
+        """The policy observes the torque that its action is added to."""
+        return True
+
+    def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, s): feedforward Nm, q_d rad, dq_d rad/s, and M kg m^2 row by row."""
+        q_d, dq_d, _ = task.trajectory(t, goals, 0.0)
+        q, dq, ddq = task.trajectory(t, goals, self.ahead_s)
+        mass = self.model.mass(q).reshape(len(q), -1)
+        return np.concatenate([self.model(q, dq, ddq, dq), q_d, dq_d, mass], axis=1)
+
+
+def computed_torque(
+    robot: Robot,
+    task: ControlledTask,
+    dynamics: Dynamics,
+    *,
+    residual: float = 0.1,
+    bandwidth: float | None = None,
+    feedback_hz: float | None = None,
+) -> ComputedTorque:
+    """Return the controller of a task that has a trajectory.
+
+    Args:
+        robot, task: the arm, and what it does. dynamics: of the identified arm.
+        residual: share of the task's torque limit that an action of 1 adds.
+        bandwidth: rad/s of the critically damped feedback; None: BANDWIDTH_LATENCY over twice the loop's latency. The
+            loop is late by a control period, the low-pass and LATENCY, and the damping 2 w is its rate.
+        feedback_hz: rate at which the feedback is updated, at most 1000; None: the policy's.
+
+    Raises:
+        UserError: the task has no trajectory, or a setting is out of its range.
+    """
+    if not hasattr(task, "trajectory"):
+        raise UserError(
+            f"control: computed_torque needs a task with a reference trajectory; {type(task).__name__} has none, "
+            "task=track has one"
+        )
+    check_number("residual", residual, "(0, 1]")
+    low_pass = 1 / (2 * np.pi * task.cutoff_hz)
+    if bandwidth is None:
+        bandwidth = 0.5 * BANDWIDTH_LATENCY / (1.0 / task.ctrl_hz + low_pass + LATENCY)
+    else:
+        check_number("bandwidth", bandwidth, "(0, inf)")
+    if feedback_hz is not None:
+        check_number("feedback_hz", feedback_hz, f"[{task.ctrl_hz}, {1 / SIM_DT:g}]")
+    hold = round(1.0 / ((feedback_hz or task.ctrl_hz) * SIM_DT))
+    return ComputedTorque(
+        "computed_torque",
+        computed_torque_law,
+        residual * task.torque_limit(robot),
+        np.zeros(robot.n),
+        parameters=np.array([bandwidth, hold], dtype=float),
+        memory_size=1 + robot.n,
+        model=InverseDynamics(robot, dynamics),
+        ahead_s=0.5 / task.ctrl_hz + low_pass + float(dynamics.delay) + float(dynamics.lag),
+    )

@@ -1,0 +1,104 @@
+"""The controller protocol: an action space, and the compiled law that turns a command into torque at 1 kHz."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from r2s.physics.control_laws import run_law
+from r2s.physics.robot import Robot
+
+
+class ControlledTask(Protocol):
+    """What a controller may ask of a task.
+
+    Attributes:
+        ctrl_hz: policy rate. cutoff_hz: low-pass on the torque.
+    """
+
+    @property
+    def ctrl_hz(self) -> int: ...  # noqa: D102 (see the class)
+    @property
+    def cutoff_hz(self) -> float: ...  # noqa: D102
+
+    def torque_limit(self, robot: Robot) -> np.ndarray:
+        """Return (n,) Nm, the largest target torque."""
+        ...
+
+
+class Trajectory(Protocol):
+    """A task whose goals are reference motions of the joints."""
+
+    def trajectory(
+        self, t: np.ndarray, goals: np.ndarray, ahead_s: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, dq, ddq (m, n) of the references `goals` at t (m,) s plus ahead_s."""
+        ...
+
+
+@dataclass(frozen=True)
+class Controller:
+    """One action space and one control law, for all arms of a robot; `control=` names what makes one.
+
+    A policy's action lies in [-1, 1]. In SI units it is action_offset + action_scale action. A command is the action
+    in SI units, then the setpoint that the controller derives from the task.
+
+    Attributes:
+        name: of the controller.
+        law: compiled; see r2s/physics/control_laws.py.
+        action_scale, action_offset: (a,) in `unit`. action: what the policy commands, for tables and contracts.
+        parameters: (p,) of the law. memory_size: numbers that the law keeps from cycle to cycle.
+        cpp: body of the same law in C++17, for contract.hpp; "": a bundle has no header.
+    """
+
+    name: str
+    law: Callable
+    action_scale: np.ndarray
+    action_offset: np.ndarray
+    action: str = "torque"
+    unit: str = "Nm"
+    parameters: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    memory_size: int = 0
+    cpp: str = ""
+
+    @property
+    def action_dim(self) -> int:
+        """Number of values in an action."""
+        return len(self.action_scale)
+
+    @property
+    def setpoint_size(self) -> int:
+        """Number of values in a setpoint."""
+        return 0
+
+    @property
+    def command_size(self) -> int:
+        """Number of values in a command."""
+        return self.action_dim + self.setpoint_size
+
+    @property
+    def observes_torque(self) -> bool:
+        """Whether the policy observes the torque that the law gives for an action of zero."""
+        return False
+
+    def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the setpoints (m, s) at t (m,) s of episodes with these goals."""
+        return np.empty((len(t), 0))
+
+    def command(self, action: np.ndarray, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the commands (m, c) of the control period that begins at t (m,) s.
+
+        Args:
+            action: (m, a) in [-1, 1]. task, goals: what the episodes ask for.
+        """
+        scaled = action * self.action_scale
+        if self.action_offset.any():
+            scaled = self.action_offset + scaled
+        if not self.setpoint_size:
+            return scaled
+        return np.concatenate([scaled, self.setpoint(task, t, goals)], axis=1)
+
+    def torque(self, q: np.ndarray, dq: np.ndarray, command: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n) Nm in the first cycle of a command: q, dq (m, n) rad, rad/s, command (m, c)."""
+        return run_law(self.law, q, dq, command, self.parameters, self.memory_size)

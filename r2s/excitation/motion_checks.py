@@ -1,0 +1,284 @@
+"""Safety checks of a motion before an arm runs it: consistency, limits, torque, and clearance to table and links.
+
+Joint limits are checked at every sample, torque and geometry at `GEOMETRY_HZ`. The links are the MJCF's geoms.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.physics.collision import TABLE_M, collision_pairs, link_name
+from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.robot import SIM_DT, Robot
+
+TOOL_M = 0.1  # m, default minimum height of the end effector, because the MJCF contains no tool
+CLEARANCE_M = 0.03  # m, between a link and the table or another link: a tracking error of 30 mrad at 1 m
+FAR_M = 0.1  # m, at larger distances the bounding spheres are accurate enough
+GEOMETRY_HZ = 100
+TORQUE_SHARE = 0.8  # share of tau_max for |gravity| + |dynamics| + friction
+FRICTION_SHARE = 0.15  # share of tau_max for friction; a Panda's joint 5 has 0.14
+FRICTION_ROOT = 0.5  # sqrt(Nm), friction of strong joints is at most this times sqrt(tau_max)
+
+
+class Motion(Protocol):
+    """A motion to check: t (T,) s; q, dq, ddq (T, n) rad, rad/s, rad/s^2."""
+
+    @property
+    def t(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def q(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def dq(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def ddq(self) -> np.ndarray: ...  # noqa: D102
+
+
+def check_motion(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
+    """Raise UserError with joint or link, value and time of the first violation, in the order of the checks below.
+
+    Args:
+        robot: limits and links.
+        motion: sampled at 1 kHz.
+        table: m, height of the table in the base frame; -inf: no table.
+        z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
+    """
+    check_shape(robot, motion)
+    check_limits(robot, motion)
+    check_derivatives(robot, motion)
+    check_torque(robot, motion)
+    check_space(robot, motion, table=table, z_min=z_min)
+
+
+def check_shape(robot: Robot, motion: Motion) -> None:
+    """Raise UserError unless the motion is finite, has the robot's joints and a step of 1 ms."""
+    t = motion.t
+    for name in ("q", "dq", "ddq"):
+        x = getattr(motion, name)
+        if x.shape != (len(t), robot.n):
+            raise UserError(f"excitation: expected {name} of shape {(len(t), robot.n)}, got {x.shape}")
+        bad = np.argwhere(~np.isfinite(x))
+        if len(bad):
+            row, i = bad[0]
+            raise UserError(f"excitation: {name} of joint {i + 1} is {x[row, i]} at {t[row]:.3f} s, not finite")
+    if len(t) < 3:
+        raise UserError(f"excitation: expected at least 3 samples, got {len(t)}")
+    wrong = ~(np.abs(np.diff(t) - SIM_DT) <= 1e-6 * SIM_DT + 1e-11 * abs(t[-1]))
+    if wrong.any():
+        row = int(wrong.argmax())
+        step = t[row + 1] - t[row]
+        raise UserError(f"excitation: expected a time step of {SIM_DT:g} s, got {step:g} s at {t[row]:.3f} s")
+
+
+def check_limits(robot: Robot, motion: Motion) -> None:
+    """Raise UserError if position, velocity or acceleration of a joint exceeds its limits."""
+    e, r = motion, robot
+    for name, x, low, high, unit in (
+        ("position", e.q, r.q_min, r.q_max, "rad"),
+        ("velocity", e.dq, -r.dq_max, r.dq_max, "rad/s"),
+        ("acceleration", e.ddq, -r.ddq_max, r.ddq_max, "rad/s^2"),
+    ):
+        bad = np.argwhere(~((x >= low) & (x <= high)))
+        if len(bad):
+            row, i = bad[0]
+            raise UserError(
+                f"excitation: {name} of joint {i + 1} is {x[row, i]:.4g} {unit} at {e.t[row]:.3f} s, "
+                f"allowed {low[i]:g} to {high[i]:g}"
+            )
+
+
+def check_derivatives(robot: Robot, motion: Motion) -> None:
+    """Raise UserError unless dq and ddq are the derivatives of q, and the motion starts and ends at rest.
+
+    The tracking controller feeds all three forward, so a step in q would jerk the arm within all limits.
+    """
+    e = motion
+    for name, x, slope, most, unit in (
+        ("dq", e.q, e.dq, robot.dq_max, "rad/s"),
+        ("ddq", e.dq, e.ddq, robot.ddq_max, "rad/s^2"),
+    ):
+        off = np.abs((x[2:] - x[:-2]) / (2 * SIM_DT) - slope[1:-1])
+        bad = np.argwhere(~(off <= 0.02 * most))
+        if len(bad):
+            row, i = bad[0]
+            raise UserError(
+                f"excitation: {name} of joint {i + 1} is {off[row, i]:.3g} {unit} off the slope of {name[1:]} at "
+                f"{e.t[row + 1]:.3f} s, allowed {0.02 * most[i]:g}"
+            )
+        moving = np.argwhere(~(np.abs(slope[[0, -1]]) <= 1e-3 * most))
+        if len(moving):
+            end, i = moving[0]
+            raise UserError(
+                f"excitation: {name} of joint {i + 1} is {slope[-end, i]:.3g} {unit} at {e.t[-end]:.3f} s; "
+                "expected 0 at both ends"
+            )
+
+
+def check_torque(robot: Robot, motion: Motion) -> None:
+    """Raise UserError if the nominal model and friction need more than 80 % of a torque limit."""
+    rows = _every(motion)
+    share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
+    bad = np.argwhere(~(share <= TORQUE_SHARE))
+    if len(bad):
+        row, i = bad[0]
+        limit = robot.tau_max[i]
+        raise UserError(
+            f"excitation: torque of joint {i + 1} is {share[row, i] * limit:.4g} Nm at {motion.t[rows[row]]:.3f} s "
+            f"(|gravity| + |dynamics| + {friction_margin(robot)[i]:.3g} Nm for friction), "
+            f"allowed {TORQUE_SHARE * limit:.4g} Nm, {100 * TORQUE_SHARE:g} % of tau_max"
+        )
+
+
+def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
+    """Raise UserError if a link comes too near to the table or to another link; `paths` checks the approach."""
+    space = Space(robot, table=table, z_min=z_min)
+    rows = _every(motion)
+    space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
+
+
+def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Return (T, n): |gravity| + |dynamics| of the nominal model plus `friction_margin`, over tau_max.
+
+    The sum of magnitudes is conservative: the arm differs from the nominal model, and the torque limit of some arms
+    applies before gravity compensation, of others after it.
+    """
+    gravity = gravity_torque(robot, q)
+    dynamics = _inverse(robot, q, dq, ddq) - gravity
+    return (np.abs(gravity) + np.abs(dynamics) + friction_margin(robot)) / robot.tau_max
+
+
+def gravity_torque(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return the torque (T, n) Nm that holds the nominal arm at rest at q (T, n) rad."""
+    return _inverse(robot, q, np.zeros_like(q), np.zeros_like(q))
+
+
+def _inverse(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Return the nominal model's torque (T, n) Nm, gravity included."""
+    model = robot.model(gravity=True)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # without the springs of joint limits
+    return mujoco_inverse_dynamics(model, q, dq, ddq)
+
+
+def friction_margin(robot: Robot) -> np.ndarray:
+    """Return the torque (n,) Nm reserved for friction before identification."""
+    return np.minimum(FRICTION_SHARE * robot.tau_max, FRICTION_ROOT * np.sqrt(robot.tau_max))
+
+
+class Space:
+    """Distances of an arm's links from the table and from each other; see `collision` for the geoms that count.
+
+    Attributes:
+        clearance: (K,) m, minimum of each distance: height of the end effector above z_min (a margin of the search
+            only, `gaps` does not subtract it), of the links above the table, and between the pairs.
+        reach: m, upper bound of the distance between a point of the arm and a joint.
+    """
+
+    def __init__(self, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M):
+        self.model = robot.model(gravity=False)
+        self.data = mujoco.MjData(self.model)
+        self.site = self.model.site(robot.ee_site).id
+        moving = self.model.jnt_bodyid
+        parts = np.isin(self.model.geom_bodyid, np.arange(moving[0], self.model.nbody))
+        farthest = (np.linalg.norm(self.model.geom_pos, axis=1) + self.model.geom_rbound)[parts].max(initial=0.0)
+        links = np.linalg.norm(self.model.body_pos[moving[0] + 1 :], axis=1).sum()
+        self.reach = float(links + farthest)
+        found = collision_pairs(robot, self.model, table=bool(np.isfinite(table)))
+        self.table, self.floor = table, z_min
+        self.above, self.pairs = found.above, found.pairs
+        self._pose(robot.q_home)
+        at_home = self._heights(self.data.geom_xpos[None], self.data.geom_xmat[None])[0] - table
+        if (at_home <= 0).any():
+            worst = int(at_home.argmin())
+            name = link_name(self.model, self.above[worst])
+            raise UserError(
+                f"excitation: {name} reaches {-at_home[worst]:.3f} m below the table at {table:g} m already at "
+                "robot.q_home; set another height of the table, -inf for none"
+            )
+        need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm with a low home posture must be able to return to it
+        self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
+
+    def gaps(self, q: np.ndarray) -> np.ndarray:
+        """Return distances minus clearances (T, K) m at postures q (T, n) rad; negative: too near."""
+        tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
+        places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
+        for k, posture in enumerate(q):
+            self._pose(posture)
+            tip[k] = self.data.site_xpos[self.site, 2]
+            places[k], frames[k] = self.data.geom_xpos, self.data.geom_xmat
+            apart[k] = self._apart()
+        distances = np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart])
+        distances[:, 1:] -= self.clearance[1:]
+        return distances
+
+    def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
+        """Raise UserError at the first posture of q (T, n) that is too near; `when(k)` describes row k."""
+        gaps = self.gaps(q)
+        bad = np.argwhere(~(gaps >= 0))
+        if len(bad):
+            row, which = bad[0]
+            raise UserError(f"excitation: {self.explain(int(which), gaps[row, which], when(row))}")
+
+    def explain(self, which: int, gap: float, when: str) -> str:
+        """Return the sentence for column `which` of `gaps` with value `gap` m."""
+        if which == 0:
+            seen = gap + self.floor
+            return f"the end effector is {seen:.3f} m above the base plane {when}, allowed {self.floor:g} m or more"
+        allowed = self.clearance[which]
+        if which <= len(self.above):
+            name, other = link_name(self.model, self.above[which - 1]), "above the table"
+        else:
+            a, b = self.pairs[which - 1 - len(self.above)]
+            name, other = link_name(self.model, a), f"from {link_name(self.model, b)}"
+        return f"{name} is {gap + allowed:.3f} m {other} {when}, allowed {allowed:.3g} m or more"
+
+    def _pose(self, q: np.ndarray) -> None:
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _distance(self, a: int, b: int) -> float:
+        return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
+
+    def _apart(self) -> np.ndarray:
+        """Return the distance of each pair (K,) m; beyond FAR_M that of their bounding spheres."""
+        a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
+        radius, place = self.model.geom_rbound, self.data.geom_xpos
+        out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]
+        for k in np.flatnonzero(out < FAR_M):
+            out[k] = self._distance(*self.pairs[k])
+        return out
+
+    def _heights(self, places: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Return the heights (T, G) m of the lowest points of `above`, from geom_xpos and geom_xmat (T, ngeom, .)."""
+        lowest = [places[:, g, 2] - self._reach(g, frames[:, g, 6:]) for g in self.above]
+        return np.array(lowest).T.reshape(len(places), len(self.above))
+
+    def _reach(self, g: int, up: np.ndarray) -> np.ndarray:
+        """Return (T,) m from a geom's centre to its lowest point; `up` (T, 3) is the vertical in the geom's frame.
+
+        A signed distance field counts as its bounding sphere.
+        """
+        m, kind, size = self.model, mujoco.mjtGeom, self.model.geom_size[g]
+        across, along = np.hypot(up[:, 0], up[:, 1]), np.abs(up[:, 2])
+        match m.geom_type[g]:
+            case kind.mjGEOM_CAPSULE:
+                return size[0] + size[1] * along
+            case kind.mjGEOM_CYLINDER:
+                return size[0] * across + size[1] * along
+            case kind.mjGEOM_BOX:
+                return np.abs(up) @ size
+            case kind.mjGEOM_ELLIPSOID:
+                return np.linalg.norm(up * size, axis=1)
+            case kind.mjGEOM_MESH:
+                mesh = m.geom_dataid[g]
+                first = m.mesh_vertadr[mesh]
+                return -(up @ m.mesh_vert[first : first + m.mesh_vertnum[mesh]].T).min(1)
+            case _:
+                return np.full(len(up), m.geom_rbound[g])
+
+
+def _every(motion: Motion) -> np.ndarray:
+    """Return row indices at GEOMETRY_HZ, with the last row."""
+    rows = np.arange(0, len(motion.t), max(1, round(1 / (GEOMETRY_HZ * SIM_DT))))
+    return np.union1d(rows, [len(motion.t) - 1])

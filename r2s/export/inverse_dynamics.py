@@ -1,0 +1,116 @@
+"""Inverse dynamics of the identified arm in NumPy: a second implementation of r2s/physics/inverse_dynamics.py.
+
+It computes the setpoints of control=computed_torque. It needs nothing of r2s; `r2s export` puts it into the one file
+of a bundle.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from r2s.export.law import LINK, BundleError, Model, is_number
+
+MODEL_JOINT = ("rotors", "offset_Nm", "load", "drag_sin_Nm", "drag_cos_Nm")
+MODEL_NUMBER = ("ahead_s", "sign_rad_per_s", "load_sign_rad_per_s")
+_STRIBECK = ("coulomb", "asymmetry", "viscous", "rise", "stribeck_velocity", "rise_asymmetry", "viscous_asymmetry")
+FRICTION = {
+    "sigmoid": ("phi1", "phi2", "phi3", "viscous"),
+    "coulomb": ("coulomb", "asymmetry", "viscous", "viscous_asymmetry"),
+    "stribeck": _STRIBECK,
+    "bristle": _STRIBECK,  # feedforward without presliding
+}
+
+
+def check_model(model: dict[str, Any], n: int) -> None:
+    """Raise BundleError if `control.model` of a contract is incomplete."""
+    friction = model["friction"]
+    if friction["family"] not in FRICTION:
+        raise BundleError(
+            f"contract.json: control.model.friction is '{friction['family']}'; this runtime has {', '.join(FRICTION)}"
+        )
+    if missing := [k for link in model["links"] for k in LINK if k not in link]:
+        raise BundleError(f"contract.json: control.model.links has a link without {missing[0]}")
+    lists = {f"control.model.{k}": model[k] for k in ("links", *MODEL_JOINT)}
+    own = FRICTION[friction["family"]]
+    lists |= {f"control.model.friction.parameters.{k}": friction["parameters"][k] for k in own}
+    for name, values in lists.items():
+        if len(values) != n:
+            raise BundleError(f"contract.json: expected {n} joints, got {len(values)} ({name})")
+        if name != "control.model.links" and not all(map(is_number, values)):
+            raise BundleError(f"contract.json: {name} is {values}; expected finite numbers")
+    if len(model["gravity_m_per_s2"]) != 3:
+        raise BundleError(
+            f"contract.json: expected 3 numbers, got {len(model['gravity_m_per_s2'])} "
+            "(control.model.gravity_m_per_s2)"
+        )
+    for name in MODEL_NUMBER:
+        value = model["number"].get(name)
+        if not is_number(value) or value < 0 or (value == 0 and name != "ahead_s"):
+            raise BundleError(f"contract.json: control.model.number.{name} is {value}; expected a number above 0")
+
+
+class InverseDynamics:
+    """Inverse dynamics of the identified arm, and the setpoints that a plan gives.
+
+    Args:
+        contract: `control.model` is the identified arm, `model` the one that the arm's own compensation uses.
+    """
+
+    def __init__(self, contract: dict[str, Any]):
+        own = contract["control"]["model"]
+        no_hand = {"hand_m": [0.0, 0.0, 0.0]}
+        self._own = Model({"links": own["links"], "rotors": own["rotors"]} | no_hand)
+        self._nominal = Model(contract["model"])
+        self._gravity = np.array(own["gravity_m_per_s2"], dtype=float)
+        joint = {name: np.array(own[name], dtype=float) for name in MODEL_JOINT}
+        self._offset, self._load = joint["offset_Nm"], joint["load"]
+        self._drag = joint["drag_sin_Nm"], joint["drag_cos_Nm"]
+        self._family, parameters = own["friction"]["family"], own["friction"]["parameters"]
+        self._friction = [np.array(parameters[k], dtype=float) for k in FRICTION[self._family]]
+        number = own["number"]
+        self._ahead = number["ahead_s"]
+        self._sign, self._slides = number["sign_rad_per_s"], number["load_sign_rad_per_s"]
+
+    def setpoints(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, hz: float, rows: int) -> np.ndarray:
+        """Return the setpoints (rows, 3 n + n n) of the first rows of a plan's joints (T, n) at hz.
+
+        Feedforward Nm, q_d, dq_d and the mass matrix row by row. A cycle of 1 ms has no time for it.
+        """
+        n = q.shape[1]
+        out = np.empty((rows, 3 * n + n * n))
+        whole, last = int(self._ahead * hz), len(q) - 1
+        h = self._ahead - whole / hz
+        for row in range(rows):  # the plan when the torque acts; its acceleration is linear between rows
+            a, b = min(row + whole, last), min(row + whole + 1, last)
+            jerk = (ddq[b] - ddq[a]) * hz
+            to = q[a] + h * (dq[a] + h * (ddq[a] / 2 + h * jerk / 6))
+            dto = dq[a] + h * (ddq[a] + h * jerk / 2)
+            mass, torque = self.equations(to, dto, ddq[a] + h * jerk)
+            out[row] = np.concatenate([torque, q[row], dq[row], mass.ravel()])
+        return out
+
+    def equations(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mass matrix (n, n) kg m^2, and a motion's torque (n,) Nm beyond the arm's own compensation."""
+        self._own.place(q)
+        self._nominal.place(q)
+        mass, bias = self._own.equations(dq)
+        held = self._nominal.weight(self._gravity)
+        out = mass @ ddq + bias + self._own.weight(self._gravity) - held
+        out += self.friction(dq) - self._offset - self._drag[0] * np.sin(q) - self._drag[1] * np.cos(q)
+        return mass, out + self._load * np.abs(held) * np.tanh(dq / self._slides)
+
+    def friction(self, v: np.ndarray) -> np.ndarray:
+        """Return friction (n,) Nm at v (n,) rad/s, as r2s/physics/friction.py does."""
+        p, sign = self._friction, np.tanh(v / self._sign)
+        if self._family == "sigmoid":
+            return p[0] * (_logistic(p[1] * (v + p[2])) - _logistic(p[1] * p[2])) + p[3] * v
+        level, side = p[0] * (1 + np.sign(sign) * p[1]) * sign, np.sign(v)
+        if self._family == "coulomb":
+            return level + p[2] * (1 + side * p[3]) * v
+        rise = p[3] * (1 + np.sign(sign) * p[5]) * np.exp(-((v / p[4]) ** 2))
+        return level * (1 + rise) + p[2] * (1 + side * p[6]) * v
+
+
+def _logistic(x: np.ndarray) -> np.ndarray:
+    e = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, e) / (1.0 + e)

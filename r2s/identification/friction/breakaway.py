@@ -1,0 +1,287 @@
+"""Breakaway torque of each joint from recorded ramps: the paper's Table II.
+
+A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has been
+accelerating for 10 to 150 ms while the command rose on, and before release a real joint creeps: its bristles bend,
+ever faster, by millirads. Neither a threshold nor a parabola through the first motion separates creep from release.
+So the motion of a joint that does both is fitted to the positions, with the release command U as a parameter:
+
+    d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
+
+u is the command at the joint in the ramp's direction and kappa the inverse inertia. Stiction balances u up to U while
+it is stretched over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). Friction
+after release is less than U (Stribeck; eq. 6 of the paper drops it altogether and has z = 0): `jump` is the
+difference as an acceleration. This needs no model of the arm.
+
+If friction falls over a range of velocities (Stribeck), motion begins so slowly that the sudden `jump` detects
+release late: by 4 to 22 mNm on an arm of known truth. With the sliding motion of an identified arm (`Slide`), which
+has jump (1 - exp(-(v / fall)^2)) instead, only U is fitted: within 0.2 mNm on that arm. That fit counts if it
+explains the motion as well as the free fit.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from r2s.compiled import njit
+from r2s.errors import check_number
+from r2s.recordings.ramps import Ramps
+
+MOVED = 5e-3  # rad; real joints and the twin creep by 1 to 3 mrad before release
+MIN_ROWS = 10  # up to there
+ENCODER = 2e-5  # rad, scale of position residuals: encoder noise of a Panda
+RELEASE_S = 2e-3  # s, accuracy of the moment of release
+STEP = 1e-3  # s, longest integration step
+# bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
+LOW = np.log(1e-2), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
+HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
+RIGID = 1e-8  # rad, creep length of a joint that does not creep
+DRIFT = 3e-4  # rad/s, prior sigma of a drift: a resting joint may still settle
+SIDES = "negative", "positive"
+KAPPA_SIGMA = 0.1  # prior sigma of log kappa, if an identified arm gives it
+WORSE = 1.01  # misfit over that of a free fit, above which the identified slide does not describe this joint
+BACK = 0.0, 0.03, 0.1  # starts of U below the last command, as shares of the ramp
+DAMPING = np.log(10.0), 1.5  # log lambda and its prior sigma, for motion too short to determine it
+STARTS = ((1e-5, 0.3), (4e-4, 0.3), (4e-4, 1.0))  # creep length, rad; time since release, relative to its guess
+
+
+@dataclass(frozen=True, eq=False)
+class Breakaway:
+    """Commands at which n joints broke away in K ramps; as commanded, without gravity.
+
+    Attributes:
+        command: (n, 2) Nm, negative and positive direction, mean over ramps; NaN without a release. Command plus
+            offset is the breakaway torque: ramps alone determine the width of the dead zone, not its centre.
+        spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two.
+        count: (n, 2) ramps with a release. ramped: (n, 2) ramps in all.
+        held: (n, 2) Nm, without a release the largest command that the joint held against; 0 without a ramp.
+        resolution: (n, 2) Nm, accuracy of the fit of one ramp: `RELEASE_S` times its rate.
+        value: (K,) Nm, of each ramp; NaN without a release.
+        misfit: (K,) rad RMS between positions and fit. Well above the encoder noise (or 5e-5 for real stick-slip) the
+            motion was of another kind.
+        joint, sign, pose: (K,), see `Ramps`.
+    """
+
+    command: np.ndarray
+    spread: np.ndarray
+    count: np.ndarray
+    ramped: np.ndarray
+    held: np.ndarray
+    resolution: np.ndarray
+    value: np.ndarray
+    misfit: np.ndarray
+    joint: np.ndarray
+    sign: np.ndarray
+    pose: np.ndarray
+
+    @property
+    def unknown(self) -> dict[str, str]:
+        """Reasons for unknown directions: {"joint 3, positive": "not reached: held against 2.4 Nm"}."""
+        reasons = {}
+        for j, side in np.argwhere(self.count == 0):
+            held = abs(self.held[j, side])
+            why = f"held against {held:.3g} Nm" if held else "no usable ramp"
+            reasons[f"joint {j + 1}, {SIDES[side]}"] = f"not reached: {why}" if self.ramped[j, side] else "not ramped"
+        return reasons
+
+
+@dataclass(frozen=True, eq=False)
+class Slide:
+    """Sliding motion of the joints of K ramps after release, in each ramp's direction, by an identified model.
+
+    Attributes:
+        kappa: (K,) rad/s^2 per Nm, inverse inertia with the other joints at rest.
+        level: (K,) Nm, command that balances slow sliding above `fall`: the Coulomb level without other torques.
+        viscous: (K,) Nm s/rad.
+        fall: (K,) rad/s, over which friction falls from breakaway to `level` as exp(-(v / fall)^2).
+        misfit: (K,) rad RMS of the free fit.
+    """
+
+    kappa: np.ndarray
+    level: np.ndarray
+    viscous: np.ndarray
+    fall: np.ndarray
+    misfit: np.ndarray
+
+
+def estimate_breakaway(
+    ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED, slide: Slide | None = None
+) -> Breakaway:
+    """Estimate the command at which each ramped joint broke away, from t, q and tau alone.
+
+    A ramp that does not reach `moved` in its own direction, or whose joint moved before the command rose, gives NaN.
+
+    Args:
+        ramps: commands that rise (fall for sign -1) from rest, at any rate. Expect an error of the rate times 0.5 to
+            3 ms for an encoder of 2e-5 rad, the most for the largest inertia.
+        delay, lag: s, of the command; both shift the result.
+        moved: rad from the first position, well beyond creep; later rows do not matter.
+        slide: sliding motion by an identified model.
+
+    Raises:
+        UserError: delay, lag or distance out of range.
+    """
+    check_number("breakaway: delay", delay, "[0, 0.1)")
+    check_number("breakaway: lag", lag, "[0, 0.1)")
+    check_number("breakaway: moved", moved, f"[{10 * ENCODER:g}, 0.1)")
+    count = len(ramps.recording.stretches)
+    value, misfit = (np.full(count, np.nan) for _ in range(2))
+    held, blur = np.zeros(count), np.zeros(count)
+    for k, (t, x, u) in enumerate(_in_direction(ramps)):
+        end = int(np.argmax(np.abs(x) >= moved)) + 1
+        if np.abs(x).max() < moved:
+            held[k] = max(_delayed(t, u, delay, lag).max(), 0.0)
+        if x[end - 1] < moved or end < MIN_ROWS:
+            continue
+        seen = t[:end], x[:end], _delayed(t, u, delay, lag)[:end]
+        if slide is not None and not np.isnan(slide.kappa[k]):
+            known = slide.kappa[k], slide.level[k], slide.viscous[k], slide.fall[k]
+            value[k], misfit[k] = _fit_slide(*seen, *known)
+        if np.isnan(value[k]) or (slide is not None and misfit[k] > WORSE * slide.misfit[k]):
+            value[k], misfit[k] = _fit_release(*seen)
+        value[k] *= ramps.sign[k]
+        blur[k] = RELEASE_S * (u[end - 1] - u[end // 2]) / (t[end - 1] - t[end // 2])
+    return _summarize(ramps, value, misfit, held, blur)
+
+
+def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, in its direction, time and angle from the first row."""
+    r = ramps.recording
+    for rows, j, sign in zip(r.stretches, ramps.joint, ramps.sign, strict=True):
+        yield r.t[rows] - r.t[rows.start], sign * (r.q[rows, j] - r.q[rows.start, j]), sign * r.tau[rows, j]
+
+
+def _summarize(
+    ramps: Ramps, value: np.ndarray, misfit: np.ndarray, held_by: np.ndarray, blur: np.ndarray
+) -> Breakaway:
+    """Return `Breakaway` by joint and direction from the fits of K ramps."""
+    n = ramps.recording.n_joints
+    command, spread, held, resolution = (np.full((n, 2), x) for x in (np.nan, np.nan, 0.0, 0.0))
+    count, ramped = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
+    for j in range(n):
+        for side, sign in enumerate((-1, 1)):
+            own = (ramps.joint == j) & (ramps.sign == sign)
+            released = own & ~np.isnan(value)
+            values = value[released]
+            count[j, side], ramped[j, side] = len(values), own.sum()
+            if len(values):
+                resolution[j, side] = np.sqrt((blur[released] ** 2).mean())
+            elif own.any():
+                held[j, side] = sign * held_by[own].max()
+            command[j, side] = values.mean() if len(values) else np.nan
+            spread[j, side] = values.std(ddof=1) if len(values) > 1 else np.nan
+    cells = command, spread, count, ramped, held, resolution
+    return Breakaway(*cells, value, misfit, ramps.joint, ramps.sign, ramps.pose)
+
+
+def _delayed(t: np.ndarray, u: np.ndarray, delay: float, lag: float) -> np.ndarray:
+    """Return the command u (T,) Nm as it acts on the joint at t (T,) s, after rest under its first value."""
+    late = np.interp(t - delay, t, u)
+    if lag == 0:
+        return late
+    factor = -np.expm1(-np.diff(t) / lag)
+    out = late.copy()
+    for k in range(len(factor)):
+        # first-order response to a linear segment: behind a lag a ramp is the ramp `lag` later
+        slope = (late[k + 1] - late[k]) / (t[k + 1] - t[k])
+        out[k + 1] = out[k] + factor[k] * (late[k] - out[k] - lag * slope) + (late[k + 1] - late[k])
+    return out
+
+
+def _fit_release(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[float, float]:
+    """Fit the motion to x (T,) rad under u (T,) Nm; return U, Nm (NaN: below any command), and misfit, rad."""
+    far, span = x[-1], u[-1] - u[0]
+    if span <= 0:
+        return np.nan, np.nan
+    near, used = _parts(x)
+    guess = 1.5 * (t[-1] - t[near])  # time since release if x grew quadratically
+    low, high = np.array([u[0] + 1e-3 * span, *LOW]), np.array([u[-1], *HIGH])
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        motion = p[5] + p[6] * t + _slide(t, u, p[0], np.exp(p[1]), np.exp(p[2]), np.exp(p[3]), p[4], 0.0)
+        priors = (p[3] - DAMPING[0]) / DAMPING[1], p[6] / DRIFT
+        return np.concatenate([(motion - x)[used] / ENCODER, priors])
+
+    fits = []
+    for creep, share in STARTS:
+        since = share * guess
+        U = max(np.interp(t[-1] - since, t, u), u[0] + 0.02 * span)
+        kappa = 3 * far / (max(u[-1] - U, 1e-3 * span) * since**2)
+        jump, rest = far / since**2, np.median(x[near // 4 : near + 1])
+        first = np.array([U, np.log(kappa), np.log(creep), DAMPING[0], jump, rest, 0.0])
+        first = np.clip(first, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+        scale = np.array([0.02 * span, 0.3, 0.3, 0.5, 0.2 * jump, ENCODER, DRIFT])
+        step = [1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-3, 1e-3]
+        fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
+    best = min(fits, key=lambda fit: fit.cost)
+    misfit = ENCODER * float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
+    return (float(best.x[0]) if best.x[0] > u[0] + 5e-3 * span else np.nan), misfit
+
+
+def _fit_slide(
+    t: np.ndarray, x: np.ndarray, u: np.ndarray, kappa: float, level: float, viscous: float, fall: float
+) -> tuple[float, float]:
+    """Fit U of a `Slide` to x (T,) rad under u (T,) Nm; return U, Nm, and misfit, rad."""
+    span = u[-1] - u[0]
+    if span <= 0:
+        return np.nan, np.nan
+    near, used = _parts(x)
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        k = kappa * np.exp(p[1])
+        motion = p[2] + p[3] * t + _slide(t, u, p[0], k, RIGID, k * viscous, k * max(p[0] - level, 0.0), fall)
+        return np.concatenate([(motion - x)[used] / ENCODER, [p[1] / KAPPA_SIGMA, p[3] / DRIFT]])
+
+    fits = []
+    low, high = [u[0], -1.0, *LOW[-2:]], [u[-1], 1.0, *HIGH[-2:]]
+    for back in BACK:
+        first = np.array([u[-1] - (back + 1e-3) * span, 0.0, np.median(x[near // 4 : near + 1]), 0.0])
+        scale, step = [0.02 * span, 0.5 * KAPPA_SIGMA, ENCODER, DRIFT], [1e-5, 1e-4, 1e-3, 1e-3]
+        fits.append(least_squares(residuals, first, bounds=(low, high), x_scale=scale, diff_step=step, max_nfev=40))
+    best = min(fits, key=lambda fit: fit.cost)
+    return float(best.x[0]), ENCODER * float(np.sqrt(np.mean(best.fun[:-2] ** 2)))
+
+
+def _parts(x: np.ndarray) -> tuple[int, slice]:
+    """Return the last row before x (T,) clearly moves, and the rows to fit."""
+    near = int(np.flatnonzero(x < x[-1] / 9)[-1])
+    return near, slice(near // 4, None)  # the first rows may still settle from the motion before
+
+
+@njit(cache=True)
+def _slide(t, u, U, kappa, z, damping, jump, fall):
+    """Return x (T,) of the motion in this module's docstring; u is linear between samples, fall = 0 a sudden jump.
+
+    Steps are implicit in velocity, so that creep lengths far below the encoder noise stay stable.
+    """
+    x = np.zeros(len(t))
+    v = 0.0
+    for k in range(len(t) - 1):
+        parts = int(np.ceil((t[k + 1] - t[k]) / STEP - 1e-6))
+        h, rise = (t[k + 1] - t[k]) / parts, (u[k + 1] - u[k]) / parts
+        at = x[k]
+        for i in range(parts):
+            before = u[k] + i * rise
+            after = before + rise
+            beyond = min(max((max(before, after) - U) / max(abs(rise), 1e-12), 0.0), 1.0)  # share of the step
+            push = v + h * kappa * (0.5 * (before + after) - U)
+            drop = h * jump * beyond
+            hold = h * kappa * (U - u[0])
+            w = v
+            for _ in range(60):
+                e = hold * np.exp(-max(at + 0.5 * h * (v + w), 0.0) / z)
+                left, steeper = 0.0, 0.0  # share of the friction that has not fallen yet, and its slope
+                if fall > 0.0:
+                    ratio = 0.5 * (v + w) / fall
+                    left = np.exp(-ratio * ratio)
+                    steeper = min(drop * left * ratio / fall, 0.5)
+                off = w * (1.0 + h * damping) - push - e - drop * (1.0 - left)
+                change = off / (1.0 + h * damping + e * 0.5 * h / z - steeper)
+                w -= change
+                if abs(change) < 1e-10:
+                    break
+            at += 0.5 * h * (v + w)
+            v = w
+        x[k + 1] = at
+    return x

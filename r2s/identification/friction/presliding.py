@@ -1,0 +1,67 @@
+"""Presliding distance, over which friction with memory reverses: the softness of its bristles.
+
+Torque rows wait until bristles are bent, so they do not see them bend. Replays of short windows see it at every
+reversal. With all other parameters from the torque fit, replays determine this one.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from r2s.identification.parameters import ParameterSpace, parameter_space
+from r2s.identification.posterior import posterior
+from r2s.identification.problem import Problem, Report
+from r2s.identification.residuals.replay_residual import ReplayResidual
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.residuals.windows import cut_windows
+from r2s.identification.search.least_squares import LeastSquares
+from r2s.physics.dynamics import Dynamics
+from r2s.recordings.recording import Recording
+
+NAME = "presliding"  # the parameter
+WINDOW_S, STRIDE = 0.2, 5  # s, ms of the replays: a joint reverses within some 50 ms
+ROUNDS, STEPS, FTOL = 2, 4, 1e-3  # reweighted fits, with steps and relative gain of each
+MIN_SIGMA = 1e-3  # of the logarithm
+
+
+def estimate_presliding(
+    dynamics: Dynamics,
+    recording: Recording,
+    torque_data: TorqueResidual,
+    bounds: Mapping[str, Sequence[ArrayLike]],
+    prior: Mapping[str, ArrayLike],
+    *,
+    report: Report,
+    seed: int,
+    nthread: int,
+) -> dict[str, np.ndarray]:
+    """Return {"presliding": (n,) rad, "sigma": (n,) standard deviation of its logarithm} from replays.
+
+    Args:
+        dynamics: values of all other parameters. torque_data: their torque residual.
+        bounds, prior: of all parameters.
+        seed: of the posterior's draws.
+    """
+    robot = torque_data.space.robot
+    space = parameter_space(robot, dynamics, {NAME: bounds[NAME]})
+    windows = cut_windows(recording, WINDOW_S)
+    data = ReplayResidual(space, recording, windows, stride=STRIDE, batch=robot.n + 1, nthread=nthread)
+    problem = Problem.of(data, torque_data.on(space), prior)
+    u, search = problem.start, LeastSquares(max_evaluations=STEPS, ftol=FTOL)
+    for _ in range(ROUNDS):
+        u = search(problem, u, report)
+        problem = problem.reweighted(u, fitted=True)
+    steps = posterior(problem, u, seed).steps
+    return {NAME: space.from_unit(u), "sigma": steps.std(0) * space.width}
+
+
+class Presliding:
+    """The estimate of `estimate_presliding` as rows of a fit: its logarithm in standard deviations."""
+
+    def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
+        self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)
+
+    def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
+        """Return (C, n) for x (C, P)."""
+        return (np.log(space.block(x, NAME)) - self._value) / self._sigma

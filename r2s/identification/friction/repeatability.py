@@ -1,0 +1,44 @@
+"""Standard error of breakaway commands from repeated ramps.
+
+Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction give next to no
+variance estimate (Student's t with one degree of freedom: 12.7 deviations). So the variance is moderated
+by that of joints of the same size, which counts as `PRIOR_REPEATS` (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004).
+That number is small because the scatter of like joints differs: on twins by factors of 3 and more. Without any repeat
+the scatter is `REPEATS`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.identification.friction.breakaway import Breakaway
+
+PRIOR_REPEATS = 2.0  # weight of the scatter of like joints, in repeats
+REPEATS = 1e-3  # of tau_max, standard deviation from ramp to ramp: 0.8e-3 to 1e-3 on twins
+
+
+class Certainty(NamedTuple):
+    """Standard error sigma (n, 2) Nm of mean commands, NaN without a release; degrees of freedom (n, 2) of its t."""
+
+    sigma: np.ndarray
+    freedom: np.ndarray
+
+
+def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
+    """Return the certainty of the mean commands; joints with the same torque limit, tau_max (n,) Nm, are alike.
+
+    If no like joint has a repeat, the scatter of all others counts, in proportion to tau_max.
+    """
+    more = np.maximum(found.count - 1, 0)
+    square = np.nan_to_num(found.spread, nan=0.0) ** 2 / tau_max[:, None] ** 2
+    share = REPEATS**2 if not more.any() else (more * square).sum() / more.sum()
+    like = np.full(found.count.shape, share)
+    for limit in np.unique(tau_max):
+        same = tau_max == limit
+        if more[same].any():
+            like[same] = (more[same] * square[same]).sum() / more[same].sum()
+    freedom = PRIOR_REPEATS + more
+    variance = tau_max[:, None] ** 2 * (PRIOR_REPEATS * like + more * square) / freedom
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = np.sqrt((variance + found.resolution**2) / found.count)
+    return Certainty(np.where(found.count > 0, sigma, np.nan), freedom)

@@ -1,0 +1,71 @@
+"""Friction at the onset of sliding, from breakaway ramps: extra residual rows of a fit."""
+
+import numpy as np
+
+from r2s.identification.friction.breakaway import Breakaway, Slide
+from r2s.identification.parameters import ParameterSpace
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.rigid_body import LinkInertia, regressor
+from r2s.physics.robot import Robot
+from r2s.recordings.ramps import Ramps
+
+# of its level: standard deviation between breakaway command and friction at standstill, from creep and onset
+SIGMA = 0.03
+MIN_COMMAND = 0.05  # Nm, level below which the deviation no longer shrinks
+
+
+class StaticFriction:
+    """K ramps with a release: the command, the posture, and the other torques on the joint at release.
+
+    Stribeck friction rises towards standstill, where recordings of motion have little information.
+    """
+
+    def __init__(self, robot: Robot, ramps: Ramps, edges: Breakaway):
+        kept = np.flatnonzero(~np.isnan(edges.value))
+        q = np.stack([ramps.recording.q[s.start] for s in ramps.recording.stretches])[kept]
+        self._kept, self._misfit = kept, edges.misfit
+        self.joint, self.side = edges.joint[kept], (edges.sign[kept] > 0).astype(int)
+        self.command, own = edges.value[kept], np.arange(len(kept))
+        still = np.zeros_like(q)
+        gravity = regressor(robot, q, still, still, robot.gravity)[own, self.joint].reshape(len(kept), -1)
+        self._gravity, self._nominal = gravity, LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
+        self._load = np.abs(gravity @ self._nominal)
+        self._q = q[own, self.joint]
+        unit = np.eye(robot.n)[self.joint]
+        self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
+
+    def net_torque(self, d: Dynamics) -> np.ndarray:
+        """Return (..., K) Nm: the torque on the joint at release, without friction."""
+        standard = LinkInertia(d.mass, d.com, d.inertia).standard()
+        left = (standard.reshape(*standard.shape[:-2], -1) - self._nominal) @ self._gravity.T
+        drag = d.drag[..., self.joint, :]
+        pull = d.offset[..., self.joint] + drag[..., 0] * np.sin(self._q) + drag[..., 1] * np.cos(self._q)
+        return self.command + pull - left
+
+    def slide(self, d: Dynamics) -> Slide:
+        """Return the sliding motion in all ramps, for a family with a Stribeck rise; NaN without a release."""
+        phi = dict(zip(d.family.names, d.phi[self.joint].T, strict=False))
+        sign = np.where(self.side, 1.0, -1.0)
+        level = phi["coulomb"] * (1 + sign * phi["asymmetry"]) + d.load[self.joint] * self._load
+        viscous = phi["viscous"] * (1 + sign * phi.get("viscous_asymmetry", 0.0))
+        inertia = self._inertia @ LinkInertia(d.mass, d.com, d.inertia).standard().ravel() + d.armature[self.joint]
+        out = np.full((4, len(self._misfit)), np.nan)
+        pull = sign * (self.net_torque(d) - self.command)
+        out[:, self._kept] = 1 / inertia, level - pull, viscous, phi["stribeck_velocity"]
+        kappa, level, viscous, fall = out
+        return Slide(kappa, level, viscous, fall, self._misfit)
+
+    def breakaway(self, d: Dynamics) -> np.ndarray:
+        """Return (n, 2) Nm: net torques at release, the mean over ramps; those of d without a ramp."""
+        net, out = self.net_torque(d), d.breakaway.copy()
+        for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
+            out[j, side] = net[(self.joint == j) & (self.side == side)].mean()
+        return np.stack([np.minimum(out[:, 0], 0.0), np.maximum(out[:, 1], 0.0)], -1)
+
+    def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
+        """Return (C, K), net torque minus friction at the onset, in standard deviations, for x (C, P)."""
+        d = space.dynamics(x)
+        sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
+        sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)
+        friction = sides[..., self.joint, self.side] + sign * d.load[..., self.joint] * self._load
+        return (self.net_torque(d) - friction) / (SIGMA * np.maximum(np.abs(self.command), MIN_COMMAND))

@@ -1,0 +1,89 @@
+"""Posterior of an identification: a normal approximation about the fit, drawn inside the bounds."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.identification.problem import Problem
+
+DRAWS = 512  # of the joint distribution
+LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
+
+
+class Posterior(NamedTuple):
+    """u (P,) the fit on the unit cube, draws about it as steps (S, P), and the data's information (P, P)."""
+
+    u: np.ndarray
+    steps: np.ndarray
+    information: np.ndarray
+
+
+def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
+    """Return draws of the joint distribution about the fit u (P,), normal with a cluster-robust covariance.
+
+    Errors within a block are correlated, so what scatters is the score of a block, its part of the gradient: the
+    covariance is H^-1 (sum of s s^T + prior) H^-1 (White, Econometrica 48(4), 1980; clusters: Liang and Zeger,
+    Biometrika 73(1), 1986). A fit follows each of few blocks, so the residual of a block is smaller than its error,
+    by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). The mean of all
+    scores is removed: at a bound it is not 0. Few blocks underestimate the covariance where single ones decide, so in
+    no direction does it fall below that of the residual's variance. A bootstrap over blocks would draw some H with
+    hardly any information on a value that few blocks determine, and those tails are no estimate of an arm.
+    """
+    rng = np.random.default_rng(seed)
+    residual, jacobian = problem.linearize(u)
+    rows, p = len(problem.clusters), len(u)
+    j, r = jacobian[:rows], residual[:rows]
+    count = int(problem.clusters.max()) + 1
+    order = np.argsort(problem.clusters, kind="stable")
+    edges = np.searchsorted(problem.clusters[order], np.arange(count + 1))
+    j, r = j[order], r[order]
+    gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
+    score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
+    rest = jacobian[rows:]
+    prior = rest.T @ rest
+    counts = j.any(1)  # padding rows have neither a residual nor a slope
+    factor = max(1.0, float(np.sqrt(np.mean(r[counts] ** 2)))) if counts.any() else 1.0
+    information = gram.sum(0)
+    covariance = np.linalg.inv(information + prior)
+    root = np.linalg.cholesky(covariance)
+    share, axes = np.linalg.eigh(root.T @ gram @ root)  # a block's share of the information, by direction
+    left = np.maximum(1.0 - share, LEAST_LEFT)[..., None]
+    within = axes @ ((axes.swapaxes(1, 2) @ (root.T @ score[..., None])) / np.sqrt(left))
+    score = np.linalg.solve(root.T, within[..., 0].T).T
+    score -= score.mean(0)
+    least, robust = (covariance @ np.linalg.cholesky(m + prior) for m in (factor**2 * information, score.T @ score))
+    steps = rng.standard_normal((DRAWS, p)) @ _at_least(least, robust).T
+    return Posterior(u, _inside(u, steps, information + prior), information)
+
+
+def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return root (P, P) of the covariance root root^T, raised where it is less than least least^T.
+
+    By direction instead of parameter: the sum of two that trade is known far better than either.
+    """
+    axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
+    return least @ (axes * np.maximum(seen, 1.0))
+
+
+def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return steps (S, P) that end in the cube: values that would leave it stop there and the others compensate.
+
+    h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry at its bound,
+    stopping one of them alone would change their sum. Values stop one at a time, the farthest first: of two that
+    trade and are both outside, the other one returns by itself.
+    """
+    steps = steps.copy()
+    for step in steps:
+        stopped = np.zeros(len(u), dtype=bool)
+        for _ in range(len(u)):
+            out = np.abs(u + step - 0.5) - 0.5
+            k = int(out.argmax())
+            if out[k] < 1e-12:
+                break
+            stopped[k] = True
+            free = ~stopped
+            change = np.clip(u[k] + step[k], 0.0, 1.0) - u[k] - step[k]
+            step[k] += change
+            step[free] -= np.linalg.solve(h[np.ix_(free, free)], h[free, k] * change)
+    return np.clip(u + steps, 0.0, 1.0) - u

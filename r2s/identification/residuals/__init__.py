@@ -1,0 +1,1 @@
+"""Residuals between a model and a recording: of torque (equation error) and of replayed motion (output error)."""

@@ -1,0 +1,201 @@
+"""A recording as weighted means over short windows in which a joint slides in one direction.
+
+Friction at standstill and at a reversal is not a function of velocity, and a low-pass spreads such moments over a
+tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or turns
+(modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command have the same weights.
+Between two reversals the windows are shorter and the rows noisier; the encoder noise tells by how much.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.sparse import csr_array
+
+from r2s.identification.residuals.zero_phase import EDGE_S, too_short
+from r2s.physics.friction import PRESLIDING, presliding
+from r2s.physics.robot import SIM_DT
+from r2s.recordings.recording import Recording
+
+RATE_HZ = 250  # rate at which torques are evaluated before averaging
+CUTOFF_HZ = 40.0  # of angles before differentiation: with a curved friction law velocity noise becomes a bias
+NORMAL = 0.6745  # median magnitude of a normal variable, in standard deviations
+SHORTEST, LONGEST = 0.024, 0.1  # s, half a window
+GUARD = 8e-3  # s, over which the low-pass spreads a stop
+STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a friction law with memory
+STEADY_ROWS = 101  # rows of the polynomial that judges it; over five rows noise passes for acceleration
+MAX_LATENCY = 0.04  # s, of a command
+HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of the step for which a command is held
+LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a first-order lag, over exp(-x)
+
+
+@dataclass(frozen=True)
+class SlidingMotion:
+    """A recording at F instants, and windows about T moments.
+
+    Attributes:
+        t: (T,) s. q, dq, ddq: (F, n) rad, rad/s, rad/s^2. bristle: (F, n), the presliding state.
+        means: n sparse matrices (T, F), the weights of a joint's windows; rows without a window are empty.
+        seen: (T, n) bool, moments with a window in which the joint slides in one direction.
+        noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
+        encoder: (n,) rad, standard deviation of the encoder noise.
+        delayed: (T, L, n) Nm, mean of the command 1 ms after the moment, at it, and each ms before.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    bristle: np.ndarray
+    means: tuple[csr_array, ...]
+    seen: np.ndarray
+    noise: np.ndarray
+    encoder: np.ndarray
+    delayed: np.ndarray
+
+    @staticmethod
+    def of(
+        recording: Recording,
+        rate_hz: float,
+        slowest: float,
+        slid: float = 0.0,
+        presliding_rad: np.ndarray | float = PRESLIDING,
+    ) -> "SlidingMotion":
+        """Find windows about moments at `rate_hz` in which a joint is faster than `slowest` rad/s.
+
+        With `slid`, rad, for a friction law with memory, a window starts once the joint has slid that far since its
+        reversal, because bristles bend first, over `presliding_rad`, one distance or (n,). Rows then also need a
+        velocity that is steady over PRESLIDING, because bristles remember the friction of the velocity before.
+
+        Raises:
+            UserError: no trajectory is long enough.
+        """
+        grid = recording.resample(SIM_DT)
+        smooth = grid.smooth(CUTOFF_HZ)
+        # central differences would lose half a percent of an acceleration at such rates
+        dq, ddq = (_derivative(smooth, order) for order in (1, 2))
+        above = 1.0 - 2.0 * CUTOFF_HZ * SIM_DT  # share of white noise above the cutoff
+        encoder = np.median(np.abs(grid.q - smooth.q), axis=0) / NORMAL / np.sqrt(above)
+        slides = np.abs(dq) >= slowest
+        if slid:
+            change = np.abs(_derivative(smooth, 2, STEADY_ROWS)) * PRESLIDING
+            slides &= change <= STEADY * dq**2
+        every, step, edge = round(1 / (RATE_HZ * SIM_DT)), round(RATE_HZ / rate_hz), round(EDGE_S * RATE_HZ)
+        instants, moments, places, bristle, base = [], [], [], [], 0
+        for s in smooth.stretches:
+            own = np.arange(s.start, s.stop, every)
+            some = np.arange(edge, len(own) - edge, step)
+            instants.append(own)
+            moments.append(own[some])
+            places.append(base + some)
+            bristle.append(presliding(dq[s], SIM_DT, presliding_rad)[::every])
+            base += len(own)
+        own, kept, at = (np.concatenate(parts) for parts in (instants, moments, places))
+        if not len(kept):
+            raise too_short(recording)
+        inside = np.zeros(len(own), dtype=bool)
+        for begin, part in zip(np.cumsum([0, *map(len, instants)]), instants, strict=False):
+            inside[begin + edge : begin + len(part) - edge] = True
+        q, way = smooth.q[own], np.where(slides[own] & inside[:, None], np.sign(dq[own]), 0.0)
+        found = [_windows(q[:, j], way[:, j], at, slid) for j in range(q.shape[1])]
+        means, half = tuple(m for m, _ in found), np.stack([w for _, w in found], 1)
+        gain = np.array([0.0, *(_noise(w) for w in range(1, round(LONGEST * RATE_HZ) + 1))])
+        began, ended = (np.concatenate([np.full(len(p), p[end]) for p in instants]) for end in (0, -1))
+        ago = [np.clip(own - k, began, ended) for k in range(-1, round(MAX_LATENCY / SIM_DT))]
+        delayed = np.stack([_averaged(means, smooth.tau[rows]) for rows in ago], 1)
+        return SlidingMotion(
+            smooth.t[kept], q, dq[own], ddq[own], np.concatenate(bristle),
+            means, half > 0, gain[half], encoder, delayed,
+        )  # fmt: skip
+
+    @property
+    def friction_dq(self) -> np.ndarray:
+        """(F, n) rad/s, velocity in the friction law."""
+        return self.dq
+
+    @property
+    def tau(self) -> np.ndarray:
+        """(T, n) Nm, mean of the command."""
+        return self.delayed[:, 1]
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return (T, n, ...): the means of x (F, n, ...) over the windows of each joint."""
+        return _averaged(self.means, x)
+
+    rows = filtered  # functions of q, dq, ddq are averaged, too
+
+    def command(self, delay: float, lag: float) -> np.ndarray:
+        """Return (T, n) Nm: the mean command at the joints, held for a step, `delay` s late, behind a lag.
+
+        It is u(t - delay - hold - x), averaged over hold, uniform within a step, and x, exponential with mean lag.
+        """
+        late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
+        late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
+        at = late.astype(int)
+        weights = np.zeros(self.delayed.shape[1])
+        for k, weight in enumerate(_cubic(late - at), start=-1):
+            np.add.at(weights, at + k, weight * LAG_WEIGHTS / len(HOLD_STEPS))
+        return np.einsum("tkn,k->tn", self.delayed, weights)
+
+
+def _cubic(x: np.ndarray) -> list[np.ndarray]:
+    """Return the weights of samples at -1, 0, 1 and 2 in their Lagrange interpolation at x in [0, 1]."""
+    return [
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    ]
+
+
+def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
+    """Return (T, n), a derivative of the angles, by polynomials of at most fourth order through `most` rows."""
+    out = np.zeros_like(recording.q)
+    for s in recording.stretches:
+        rows = min(most, s.stop - s.start - (s.stop - s.start + 1) % 2)
+        if rows > 2:
+            out[s] = savgol_filter(recording.q[s], rows, min(rows - 1, 4), deriv=order, delta=SIM_DT, axis=0)
+    return out
+
+
+def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
+    return np.stack([(m @ x[:, j].reshape(len(x), -1)).reshape(-1, *x.shape[2:]) for j, m in enumerate(means)], 1)
+
+
+def _weights(half: int) -> np.ndarray:
+    """Return the weights (2 half + 1,) of a window; they and two derivatives vanish at its ends."""
+    weights = (1.0 - (np.arange(-half, half + 1) / (half + 1)) ** 2) ** 3
+    return weights / weights.sum()
+
+
+def _noise(half: int) -> float:
+    """Return the standard deviation of the mean acceleration, 1/s^2, for white angle noise of 1 rad.
+
+    Integration by parts moves both derivatives to the window. An instant stands for 1 / (RATE_HZ SIM_DT) rows.
+    """
+    second = np.diff(np.pad(_weights(half), 2), 2) * RATE_HZ**2
+    return float(np.linalg.norm(second) * np.sqrt(SIM_DT * RATE_HZ))
+
+
+def _windows(q: np.ndarray, way: np.ndarray, at: np.ndarray, slid: float) -> tuple[csr_array, np.ndarray]:
+    """Return the weights (T, F) of one joint's windows about the instants `at` (T,), and half their widths (T,).
+
+    way (F,) is the sliding direction, 0 where the joint may stick. A width of 0 marks a moment without a window.
+    """
+    first, last = np.zeros(len(q), dtype=int), np.full(len(q), -1)
+    changes = np.flatnonzero(np.diff(way, prepend=np.nan) != 0)
+    for a, b in pairwise([*changes.tolist(), len(q)]):
+        if way[a] != 0.0:
+            far = np.flatnonzero(np.abs(q[a:b] - q[a]) >= slid)
+            first[a:b], last[a:b] = (a + far[0] if len(far) else b), b - 1
+    guard, least, most = (round(seconds * RATE_HZ) for seconds in (GUARD, SHORTEST, LONGEST))
+    half = np.minimum(np.minimum(at - first[at], last[at] - at) - guard, most)
+    half = np.where(half >= least, half, 0)
+    windows = {w: _weights(w) for w in range(least, most + 1)}
+    some = np.flatnonzero(half)
+    values = [windows[half[k]] for k in some]
+    columns = [np.arange(at[k] - half[k], at[k] + half[k] + 1) for k in some]
+    ends = np.concatenate([[0], np.cumsum(np.where(half > 0, 2 * half + 1, 0))])
+    entries = np.concatenate([np.zeros(0), *values]), np.concatenate([np.zeros(0, dtype=int), *columns]), ends
+    return csr_array(entries, shape=(len(at), len(q))), half

@@ -1,0 +1,185 @@
+"""Replay residual (output error) of commanded motion: simulated minus recorded joint angles, eq. (8) of the paper.
+
+Every candidate starts each window at the measured state and receives the recorded commands; all candidates and
+windows run in one batch. Rows are in units of their own standard deviation, see `reweighted`.
+"""
+
+from copy import copy
+
+import numpy as np
+
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.residuals.windows import StartState, Windows
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import SIM_DT
+from r2s.physics.simulator import Simulator
+from r2s.recordings.recording import Recording
+
+USUAL = 0.9  # share of the windows, without the worst, that noise is estimated from
+HUBER = 1.5  # RMS of a window's residual over the median from which it is down-weighted
+Q_STEP, DQ_STEP, TAU_STEP = 1e-4, 1e-3, 1e-2  # rad, rad/s, Nm: finite differences of start state and torque
+TORQUE_SIGMA, MIN_TORQUE_SIGMA = 0.05, 1e-4  # Nm, start value and lower limit of the unexplained torque of a window
+BAYES_ROUNDS = 30  # fixed-point iterations of `_random_effects`
+
+
+class ReplayResidual:
+    """Residual of a commanded recording, averaged over `stride` ms and whitened. Immutable: see `reweighted`.
+
+    A window's error has three sources, which generalized least squares weights together:
+        error = Z b + e,   b ~ N(0, diag(d)): start angle, start velocity and an unexplained torque, constant over the
+        window, per joint;   e ~ N(0, s^2): encoder noise.
+    Z is computed by finite differences about a candidate; d and s come from the recording, later from the residual.
+
+    `clusters` (R,) is the window of each row.
+
+    Args:
+        space, recording, windows: see `cut_windows`.
+        stride: ms. batch: candidates simulated at once. nthread: 0 uses all cores.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        recording: Recording,
+        windows: Windows,
+        *,
+        stride: int = 5,
+        batch: int = 36,
+        nthread: int = 0,
+    ):
+        self.space, self.windows, self._batch = space, windows, batch
+        n = space.n
+        self.count = len(windows.q0)
+        self._stride = stride
+        self._target = self._means(windows.q)
+        last = stride * (1 + np.arange(self._target.shape[1]))
+        self._seen = np.repeat((last <= windows.length[:, None])[..., None], n, axis=2)
+        self.clusters = np.repeat(np.arange(self.count), self._target[0].size)
+        self._sim = Simulator(space.robot, space.nominal, batch * self.count, nthread)
+        state = StartState.of(recording.resample(SIM_DT))
+        self._noise, start = state.noise / np.sqrt(stride), state.sigma.ravel()
+        self._min_sigma = np.concatenate([start, np.full(n, MIN_TORQUE_SIGMA)])
+        self._sigma = np.concatenate([start, np.full(n, TORQUE_SIGMA)])
+        self._reweigh(space.start, fitted=False)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals (C, R), in standard deviations, for candidates x (C, P)."""
+        return (self._white(self.errors(x)) * self._trust[:, None]).reshape(len(x), -1)
+
+    def errors(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, W, S' n) rad: simulated minus recorded angles, 0 in padding rows."""
+        return np.concatenate([self._chunk(x[i : i + self._batch]) for i in range(0, len(x), self._batch)])
+
+    def _chunk(self, x: np.ndarray) -> np.ndarray:
+        w, d = self.windows, self.space.dynamics(x)
+        timing = np.stack(np.broadcast_arrays(d.delay, d.lag, np.zeros(len(x)))[:2], -1)
+        kinds, kind = np.unique(timing, axis=0, return_inverse=True)
+        delayed = np.stack([w.delayed(*pair) for pair in kinds])
+        return self._simulate(d, delayed[kind.ravel()], w.q0, w.dq0)
+
+    def _simulate(self, d: Dynamics, tau: np.ndarray, q0: np.ndarray, dq0: np.ndarray) -> np.ndarray:
+        """Return `errors` of C candidates for joint torques tau (C, W, S, n) and starts (C, W, n) or (W, n)."""
+        count = len(tau)
+        ids = np.arange(count * self.count)
+        shape = (count, *self.windows.q0.shape)
+        self._sim.set_dynamics(d, ids, repeat=self.count)
+        n = q0.shape[-1]
+        q0, dq0, bristle = (np.broadcast_to(a, shape).reshape(-1, n) for a in (q0, dq0, self.windows.bristle))
+        self._sim.reset(q0, dq0, ids, bristle)
+        q = self._sim.rollout(tau.reshape(-1, *tau.shape[2:]), ids=ids)["qpos"]
+        error = (self._means(q).reshape(count, *self._target.shape) - self._target) * self._seen
+        return np.nan_to_num(error.reshape(count, self.count, -1), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def _means(self, q: np.ndarray) -> np.ndarray:
+        """Return (..., S', n): means of `stride` rows of q (..., S, n); their noise is independent."""
+        whole = q.shape[-2] // self._stride
+        parts = q[..., : whole * self._stride, :].reshape(*q.shape[:-2], whole, self._stride, q.shape[-1])
+        return parts.mean(-2)
+
+    def reweighted(self, x: np.ndarray, fitted: bool) -> "ReplayResidual":
+        """Return this residual whitened about x (P,); with `fitted`, d and s are estimated from the residual at x."""
+        other = copy(self)
+        other._reweigh(x, fitted)
+        return other
+
+    def _reweigh(self, x: np.ndarray, fitted: bool) -> None:
+        w, n = self.windows, self.space.n
+        d = self.space.dynamics(x)
+        delayed, eye = w.delayed(d.delay, d.lag), np.eye(n)[:, None]
+        zero = np.zeros((n, 1, n))
+        q0 = np.concatenate([w.q0[None], w.q0 + Q_STEP * eye, w.q0 + zero, w.q0 + zero])
+        dq0 = np.concatenate([w.dq0[None], w.dq0 + zero, w.dq0 + DQ_STEP * eye, w.dq0 + zero])
+        push = np.concatenate([np.zeros((1 + 2 * n, 1, 1, n)), TAU_STEP * eye[:, None]])
+        parts = []
+        for i in range(0, len(q0), self._batch):
+            at = slice(i, i + self._batch)
+            parts.append(self._simulate(d, delayed + push[at], q0[at], dq0[at]))
+        at_x = np.concatenate(parts)
+        steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
+        z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
+        self._trust = np.ones(self.count)
+        moves = self._seen.any((1, 2))  # the other windows are all padding
+        if fitted and moves.any():
+            usual = moves
+            for _ in range(2):  # an outlier window must not set the noise of the others
+                self._sigma, self._noise = _random_effects(
+                    z[usual], at_x[0, usual], self._seen[usual], self._sigma, self._noise, self._min_sigma
+                )
+                self._whiten(z)
+                size = self._window_rms(at_x[0])
+                usual = moves & (size <= np.quantile(size[moves], USUAL))
+            self._trust = np.minimum(1.0, HUBER * np.median(size[moves]) / np.maximum(size, 1e-9))
+        self._whiten(z)
+
+    def _window_rms(self, error: np.ndarray) -> np.ndarray:
+        """Return (W,) the RMS of a window's white residual over rows that count."""
+        r = self._white(error[None])[0]
+        return np.sqrt((r**2).sum(1) / np.maximum(self._seen.reshape(self.count, -1).sum(1), 1))
+
+    def _white(self, error: np.ndarray) -> np.ndarray:
+        """Return (C, W, R') in standard deviations."""
+        r = error / np.tile(self._noise, self._target.shape[1])
+        part = (r[..., None, :] @ self._axes) * self._shrink[:, None] @ self._axes.transpose(0, 2, 1)
+        return r - part[..., 0, :]
+
+    def _whiten(self, z: np.ndarray) -> None:
+        """Set axes and factors of (I + E E^T)^(-1/2) = I - A (1 - 1 / sqrt(1 + l^2)) A^T, E = z d / s."""
+        effect = z * self._sigma / np.tile(self._noise, self._target.shape[1])[:, None]
+        self._axes, size, _ = np.linalg.svd(effect, full_matrices=False)
+        self._shrink = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+
+    def joint_error(self, x: np.ndarray) -> np.ndarray:
+        """Return (C, n) mrad^2: the mean square error of each joint."""
+        return 1e6 * (self.errors(x).reshape(len(x), -1, self.space.n) ** 2).mean(1)
+
+
+def _random_effects(
+    z: np.ndarray, error: np.ndarray, seen: np.ndarray, sigma: np.ndarray, noise: np.ndarray, min_sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
+
+    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b), from
+    `sigma` and `noise` on. The mean of b over all windows is a wrong parameter, an offset above all, rather than
+    noise: as noise it would keep the next fit from correcting it. No d falls below `min_sigma` (K,), for start angle
+    and velocity the encoder's.
+    """
+    _, rows, k = z.shape
+    n = len(noise)
+    joint = np.tile(np.arange(n), rows // n)
+    counted = np.array([seen[..., j].sum() for j in range(n)])
+    for _ in range(BAYES_ROUNDS):
+        weighed = z / (noise[joint] ** 2)[:, None]
+        gram = weighed.transpose(0, 2, 1) @ z
+        scaled = sigma[:, None] * gram * sigma + np.eye(k)
+        inverse = np.linalg.inv(scaled)
+        mean = sigma * np.einsum("wij,wj->wi", inverse, sigma * np.einsum("wri,wr->wi", weighed, error))
+        covariance = sigma[:, None] * inverse * sigma
+        left = error - np.einsum("wri,wi->wr", z, mean)
+        uncertain = np.einsum("wri,wij,wrj->wr", z, covariance, z, optimize=True)
+        total = (left**2 + uncertain).sum(0)
+        new = np.array([total[joint == j].sum() for j in range(n)]) / np.maximum(counted, 1)
+        noise = np.maximum(np.where(counted > 0, np.sqrt(new), noise), 1e-6)
+        determined = 1.0 - np.einsum("wii->wi", covariance) / sigma**2
+        about = mean - mean.mean(0)
+        sigma = np.maximum(np.sqrt((about**2).sum(0) / np.maximum(determined.sum(0), 1e-3)), min_sigma)
+    return sigma, noise

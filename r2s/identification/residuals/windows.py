@@ -1,0 +1,191 @@
+"""A commanded recording cut into short windows that candidates replay from measured states: eq. (8) of the paper.
+
+Short windows keep the problem well-posed: an arm without feedback drifts, and after seconds the error shows the drift
+rather than the parameters.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.signal import savgol_filter
+
+from r2s.errors import UserError
+from r2s.physics.actuation import Motors
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import PRESLIDING, presliding
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.simulator import Simulator
+from r2s.recordings.recording import Recording
+
+STATE_SAMPLES = 31  # ms, of the local fit that gives a window's start state
+HALF = STATE_SAMPLES // 2
+SHORTEST = 0.25  # of the window length: a shorter window costs more than it tells
+MOVED = 0.02  # rad, range of a joint that moves
+SCATTER = 0.1  # Nm, scatter of breakaway commands between postures
+MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
+HISTORY = 40  # ms of commands before a window, the memory of delay and lag
+
+
+@dataclass(frozen=True)
+class Windows:
+    """W stretches of a recording: start states, commands and the joint angles that followed.
+
+    Attributes:
+        t: (W,) s, start. q0, dq0: (W, n) rad, rad/s. tau: (W, S, n) Nm, one row per 1 ms step.
+        before: (W, HISTORY, n) Nm, the commands before the start. bristle: (W, n), presliding state at the start.
+        q: (W, S, n) rad, after each step.
+        length: (W,) steps that count; later rows are padding.
+    """
+
+    t: np.ndarray
+    q0: np.ndarray
+    dq0: np.ndarray
+    tau: np.ndarray
+    before: np.ndarray
+    q: np.ndarray
+    bristle: np.ndarray
+    length: np.ndarray
+
+    def delayed(self, delay: np.ndarray | float, lag: np.ndarray | float) -> np.ndarray:
+        """Return (W, S, n) Nm, the torques at the joints after `delay` and `lag`, s."""
+        motors = Motors(len(self.t), self.tau.shape[-1], delay, lag)
+        motors.reset(tau=self.before[:, 0])
+        return motors(np.concatenate([self.before, self.tau], 1))[:, HISTORY:]
+
+
+def cut_windows(
+    recording: Recording,
+    seconds: float,
+    limit: int | None = None,
+    slowest: float = 0.0,
+    edges: np.ndarray | None = None,
+) -> Windows:
+    """Cut a commanded recording into consecutive windows of at most `seconds`, none across two trajectories.
+
+    Args:
+        limit: keep that many windows, evenly spread.
+        slowest: rad/s. A window ends where a joint gets slower, and the next starts when all are faster again. At
+            rest the smallest change of a parameter shifts the release of a joint by a step, which disturbs every
+            other one. Joints that never move are ignored.
+        edges: (n, 2) Nm, commands at which resting joints break away. A slow joint counts only while its command lies
+            between them.
+
+    Raises:
+        UserError: no trajectory is as long as a window, or all joints hardly ever move at once.
+    """
+    grid = recording.resample(SIM_DT)
+    steps = round(seconds / SIM_DT)
+    longest = max(s.stop - s.start for s in grid.stretches)
+    if longest <= max(steps, STATE_SAMPLES) + HALF:
+        raise UserError(
+            f"no trajectory is as long as a window of {seconds:g} s; the longest is {longest * SIM_DT:g} s"
+        )
+    still = np.ptp(grid.q, axis=0) < MOVED
+    dq, bristle, start_state = np.empty_like(grid.q), np.empty_like(grid.q), StartState.of(grid)
+    first = np.empty(len(grid.t), dtype=int)
+    starts: list[int] = []
+    lengths: list[int] = []
+    for s in grid.stretches:
+        first[s] = s.start
+        if s.stop - s.start <= STATE_SAMPLES:
+            continue
+        dq[s] = savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv=1, delta=SIM_DT, axis=0)
+        bristle[s] = presliding(dq[s], SIM_DT, PRESLIDING)
+        if not slowest:
+            whole = list(range(s.start + HALF, s.stop - max(steps, HALF), steps))
+            starts += whole
+            lengths += [steps] * len(whole)
+            continue
+        slow = (np.abs(dq[s]) < slowest) & ~still
+        if edges is not None:
+            between = (grid.tau[s] > edges[:, 0] - SCATTER) & (grid.tau[s] < edges[:, 1] + SCATTER)
+            slow &= maximum_filter1d(between, MAX_LATENCY_STEPS, axis=0, origin=(MAX_LATENCY_STEPS - 1) // 2)
+        found = _between_stops(np.flatnonzero(slow.any(1)), s.stop - s.start, steps)
+        starts += [s.start + start for start, _ in found]
+        lengths += [count for _, count in found]
+    if not starts:
+        raise UserError(
+            f"all joints hardly ever move at once: no {SHORTEST * seconds:g} s in which each is faster than "
+            f"{slowest:g} rad/s; record an excitation of r2s (arm=, data.excitation=), or use a friction family with "
+            "memory, friction.family=bristle"
+        )
+    at, length = np.array(starts), np.array(lengths)
+    if limit is not None and len(at) > limit:
+        keep = np.linspace(0, len(at) - 1, limit).round().astype(int)
+        at, length = at[keep], length[keep]
+    rows = np.minimum(at[:, None] + np.arange(steps), (at + length - 1)[:, None])
+    q0, dq0 = start_state(grid, at)
+    earlier = np.maximum(at[:, None] - np.arange(HISTORY, 0, -1), first[at][:, None])
+    return Windows(grid.t[at], q0, dq0, grid.tau[rows], grid.tau[earlier], grid.q[rows + 1], bristle[at], length)
+
+
+def _between_stops(slow: np.ndarray, count: int, steps: int) -> list[tuple[int, int]]:
+    """Return start and length of windows of at most `steps` between the slow rows of a stretch of `count` rows."""
+    out = []
+    for a, b in pairwise([-1, *slow.tolist(), count - 1]):
+        run = b - a - 2 - HALF  # the fit of the start state must not include earlier rows
+        if run < SHORTEST * steps:
+            continue
+        parts = -(-run // steps)
+        out += [(b - 1 - run + k * (run // parts), run // parts) for k in range(parts)]
+    return out
+
+
+@dataclass(frozen=True)
+class StartState:
+    """Start state of a replay: a cubic through 31 ms of measured angles and velocities, weighted by their noise.
+
+    Logged velocities are late, by half a step in a simulator or by a filter on an arm. Comparison with the derivative
+    of the angles gives the latency of each joint.
+
+    Attributes:
+        noise: (n,) rad, of the angles, robust. kernel: (n, 2, 2 STATE_SAMPLES) from angles and velocities to q and
+            dq.
+        sigma: (2, n) rad, rad/s, standard deviation of the state.
+    """
+
+    noise: np.ndarray
+    kernel: np.ndarray
+    sigma: np.ndarray
+
+    @staticmethod
+    def of(grid: Recording) -> "StartState":
+        """Return the fit for a recording at 1 kHz."""
+        n = grid.n_joints
+        seen = [s for s in grid.stretches if s.stop - s.start > STATE_SAMPLES]
+
+        def smooth(deriv: int) -> np.ndarray:
+            fits = (savgol_filter(grid.q[s], STATE_SAMPLES, 3, deriv, SIM_DT, axis=0) for s in seen)
+            return np.concatenate([np.zeros((1, n)), *fits])
+
+        q, dq = (np.concatenate([np.zeros((1, n)), *(a[s] for s in seen)]) for a in (grid.q, grid.dq))
+        noise = np.maximum(1.48 * np.median(np.abs(q - smooth(0)), axis=0), 3e-6)
+        ddq, lead = smooth(2), dq - smooth(1)
+        late = -(lead * ddq).sum(0) / np.maximum((ddq**2).sum(0), 1e-12)
+        off = np.maximum(np.sqrt(((lead + late * ddq) ** 2).mean(0)), 1e-5)
+        t, k = SIM_DT * (np.arange(STATE_SAMPLES) - HALF)[:, None], np.arange(4)
+        speeds = k * t ** np.maximum(k - 1, 0)
+        accelerations = k * (k - 1) * t ** np.maximum(k - 2, 0)
+        size = np.repeat(np.stack([noise, off], 1), STATE_SAMPLES, axis=1)  # (n, 2 S)
+        angles = np.broadcast_to(t**k, (n, STATE_SAMPLES, 4))
+        both = np.concatenate([angles, speeds - late[:, None, None] * accelerations], 1) / size[..., None]
+        cubic = np.linalg.pinv(both) / size[:, None]
+        # MuJoCo moves by the velocity at the end of a step: q(t) = q0 + v t + a t^2 / 2 starts from v - a h / 2
+        kernel = np.stack([cubic[:, 0], cubic[:, 1] - SIM_DT * cubic[:, 2]], 1)
+        return StartState(noise, kernel, np.sqrt(((kernel * size[:, None]) ** 2).sum(-1)).T)
+
+    def __call__(self, grid: Recording, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return q, dq (W, n) rad, rad/s at rows `at` (W,), each at least HALF rows from its stretch's ends."""
+        rows = at[:, None] + np.arange(STATE_SAMPLES) - HALF
+        seen = np.concatenate([grid.q[rows], grid.dq[rows]], 1)
+        q, dq = np.einsum("nks,wsn->kwn", self.kernel, seen)
+        return q, dq
+
+
+def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
+    """Return q (W, S, n) rad of an arm with these dynamics in each window."""
+    sim = Simulator(robot, dynamics, len(windows.q0), nthread)
+    sim.reset(windows.q0, windows.dq0, bristle=windows.bristle)
+    return sim.rollout(windows.delayed(dynamics.delay, dynamics.lag))["qpos"]

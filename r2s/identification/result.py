@@ -1,0 +1,152 @@
+"""The result of an identification: values, intervals, and what the data do not determine."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import t as student
+
+from r2s.identification.friction.breakaway import Breakaway
+from r2s.identification.friction.repeatability import certainty
+from r2s.identification.parameters import ParameterEstimate, ParameterSpace
+from r2s.identification.problem import Problem
+from r2s.physics.dynamics import Dynamics
+
+MAX_BREAKAWAY = 10.0  # Nm, bound of a breakaway torque
+UNSEEN = 0.9  # posterior over prior sigma above which the data hardly determine a value
+SHARPER = 4.0  # a parameter is identifiable if half its interval is less than its prior sigma over this
+NULL_SHARE = 0.5  # posterior over prior sigma above which a direction is listed as decided by the prior
+LISTED_PARTS, LEAST_PART = 6, 0.2  # parameters of such a direction: at most so many, with at least that part
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """The result.
+
+    Attributes:
+        space, found: the parameters and their estimate.
+        history: a row per step or generation of each search.
+        families: {"sigmoid": error of held-out torque, ...} relative to the best; empty if the family was given.
+        null_directions: combinations of parameters that only the prior decides: (posterior over prior sigma,
+            {name: part}), widest first.
+        unseen: names that keep their nominal value, because the data hardly determine them.
+        edges: breakaway commands from ramps, if there were any.
+        refused: whether replays disagreed with the torque fit and were discarded.
+    """
+
+    space: ParameterSpace
+    found: ParameterEstimate
+    history: pd.DataFrame
+    families: dict[str, float]
+    null_directions: list[tuple[float, dict[str, float]]]
+    unseen: list[str]
+    edges: Breakaway | None = None
+    refused: bool = False
+
+    @property
+    def x(self) -> np.ndarray:
+        """(P,) the values, SI units."""
+        return self.found.x
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The identified arm."""
+        return self.space.dynamics(self.found.x)
+
+    @property
+    def note(self) -> dict[str, Any]:
+        """Entries of parameters.yaml about the identification itself."""
+        null = [{"share_of_prior_left": round(s, 2), **parts} for s, parts in self.null_directions]
+        out = {"unseen_and_left_nominal": self.unseen, "decided_by_the_prior": null}
+        out |= {"families_compared": self.families, "replays_refused": self.refused}
+        unknown = self.edges.unknown if self.edges is not None else {}
+        return out | ({"breakaway_unknown": unknown} if unknown else {})
+
+    @property
+    def saved(self) -> tuple[ParameterSpace, ParameterEstimate]:
+        """Space and estimate for parameters.yaml, with breakaway torques from ramps as blocks of their own.
+
+        Their interval is Student's (friction/repeatability.py) plus the uncertainty of the offset. Without a release
+        the torque lies between the command that the joint held against and the bound; it is not identifiable and all
+        draws have the same value.
+        """
+        if self.edges is None:
+            return self.space, self.found
+        f, n = self.found, self.space.n
+        x = self.dynamics.breakaway
+        sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
+        got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
+        edges = self.space.dynamics(f.samples).breakaway
+        moves = 0.5 * np.ptp(np.quantile(edges, [0.025, 0.975], axis=0), axis=0)  # with the offset
+        most = student.ppf(0.975, freedom)
+        # the far tails of few degrees of freedom are no estimate of an arm, and policies train on these draws
+        drawn = np.clip(np.random.default_rng(0).standard_t(freedom, edges.shape), -2 * most, 2 * most)
+        edges = np.where(got, edges + scale * drawn, x)
+        edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
+        half = np.hypot(most * scale, moves)
+        held = self.edges.held + self.dynamics.offset[:, None]
+        low, high = np.where(got, x - half, held), np.where(got, x + half, held)
+        low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -MAX_BREAKAWAY), np.minimum(high[:, 0], 0.0)
+        high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], MAX_BREAKAWAY), np.maximum(low[:, 1], 0.0)
+        zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone is the scale of identifiability
+        columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
+        own = f.x, f.low, f.high, f.identifiable, f.samples
+        limit = np.full(n, MAX_BREAKAWAY)
+        space = replace(
+            self.space,
+            blocks=(*self.space.blocks, "breakaway_negative", "breakaway_positive"),
+            lower=np.concatenate([self.space.lower, -limit, 0 * limit]),
+            upper=np.concatenate([self.space.upper, 0 * limit, limit]),
+            breakaway_command=None,
+        )
+        return space, ParameterEstimate(*(np.concatenate([a, *b], -1) for a, b in zip(own, columns, strict=True)))
+
+
+def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], **story: Any) -> IdentificationResult:
+    """Return the result; values that the data hardly determine go back to nominal.
+
+    Args:
+        problem: the solved problem.
+        space: its parameters, with the breakaway and stiction found since.
+        sure: u, steps and information of the `Posterior`.
+        story: history, families, edges and refused of `IdentificationResult`.
+    """
+    u = np.array(sure["u"], dtype=float)
+    steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
+    prior = problem.sigma / space.width  # on the unit cube
+    u, unseen = _settle(u, problem.start, information + problem.prior_information(u), steps.std(0) / prior)
+    low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
+    half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
+    found = ParameterEstimate(space.from_unit(u), low, high, half < prior / SHARPER, space.from_unit(u + steps))
+    # in units of the prior: a direction without further information has an eigenvalue of 1
+    gained, directions = np.linalg.eigh(prior[:, None] * (information + problem.prior_information(u)) * prior)
+    null = []
+    for g, v in zip(gained, directions.T, strict=True):
+        if g < NULL_SHARE**-2:
+            parts = sorted(zip(space.names, v.tolist(), strict=True), key=lambda p: -abs(p[1]))[:LISTED_PARTS]
+            null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts if abs(part) > LEAST_PART}))
+    names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
+    return IdentificationResult(space, found, null_directions=null, unseen=names, **story)
+
+
+def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return u (P,) with unseen values at `start`, as many as cost nothing, and which (P,) bool those are.
+
+    A value may be unseen by itself and seen together with others, like the masses of two links in a row. So a value
+    goes back only if the others, refitted, explain data and prior as well: the sum of squares may rise by 1 in all.
+
+    Args:
+        u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.
+        share: (P,) posterior over prior sigma.
+    """
+    best, unseen = u, np.zeros(len(u), dtype=bool)
+    for k in np.argsort(-share, kind="stable")[: int((share > UNSEEN).sum())]:
+        some = unseen.copy()
+        some[k] = True
+        step = np.where(some, start - u, 0.0)
+        step[~some] = -np.linalg.solve(h[np.ix_(~some, ~some)], h[np.ix_(~some, some)] @ step[some])
+        if step @ h @ step <= 1.0:
+            best, unseen = u + step, some
+    return np.clip(best, 0.0, 1.0), unseen

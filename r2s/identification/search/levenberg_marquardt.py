@@ -1,0 +1,68 @@
+"""Bounded least squares on the unit cube: Levenberg-Marquardt that tries several damping factors in one batch.
+
+scipy's trust region factors the whole Jacobian by SVD at every step, which costs more than the physics (14,000 rows,
+110 columns), and tries one step at a time. benchmarks/least_squares.py compares it with MuJoCo's solver.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+DAMPING = 1e-3  # of the first step, relative to the diagonal of J^T J (Marquardt's scaling)
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6  # a Gauss-Newton step, and no step, in double precision
+TRIALS = np.array([1e-2, 1e-1, 1.0, 10.0])  # damping factors tried at once, relative to the last successful one
+RETRIES = 3  # batches of trials at one Jacobian
+
+
+def minimize(
+    residual: Callable[[np.ndarray], np.ndarray],
+    jacobian: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    max_evaluations: int,
+    ftol: float,
+    minutes: float = np.inf,
+    report: Callable[[dict], None] = lambda row: None,
+    name: str = "least_squares",
+) -> np.ndarray:
+    """Return u (P,) in the unit cube at a local minimum of the sum of squares near `start` (P,).
+
+    Args:
+        residual: (C, P) -> (C, R). jacobian: (P,) -> (R, P).
+        start, max_evaluations, ftol, minutes: see r2s/identification/search/least_squares.py.
+        report: called after every step. name: of the search, in its rows.
+    """
+    u, damping, began = np.clip(start, 0.0, 1.0), DAMPING, time.perf_counter()
+    r = residual(u[None])[0]
+    cost, tried = float(r @ r), 1
+    for k in range(max_evaluations):
+        j = jacobian(u)
+        gradient, hessian = j.T @ r, j.T @ j
+        tried += len(u) + 1
+        free = ~(((u <= 0.0) & (gradient > 0.0)) | ((u >= 1.0) & (gradient < 0.0)))
+        before = cost
+        for _ in range(RETRIES):
+            trials = np.stack([_step(u, gradient, hessian, free, f * damping) for f in TRIALS])
+            rows = residual(trials)
+            costs = (rows**2).sum(1)
+            tried += len(trials)
+            best = int(costs.argmin())
+            if costs[best] < cost:
+                u, r, cost, damping = trials[best], rows[best], float(costs[best]), TRIALS[best] * damping
+                break
+            damping *= 100.0 * TRIALS[-1]
+        damping = min(max(damping, LEAST_DAMPING), MOST_DAMPING)
+        report({"search": name, "evaluations": tried, "cost": cost, "done": k + 1, "total": max_evaluations})
+        if before - cost < ftol * before or time.perf_counter() - began > 60 * minutes:
+            break
+    return u
+
+
+def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
+    """Return u (P,) after a damped Gauss-Newton step of the `free` coordinates, clipped to the cube."""
+    h = hessian[np.ix_(free, free)]
+    diagonal = np.diag(h)
+    h = h + np.diag(damping * diagonal + 1e-12 * max(diagonal.max(initial=0.0), 1e-30))
+    out = u.copy()
+    out[free] -= np.linalg.solve(h, gradient[free])
+    return np.clip(out, 0.0, 1.0)

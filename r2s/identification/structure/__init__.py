@@ -1,0 +1,1 @@
+"""Model structure, selected by cross-validation: the friction family and the terms beside it."""

@@ -1,0 +1,42 @@
+"""Backward elimination: remove terms without which held-out torque is predicted as well.
+
+Gravity acts on links and payload alike, and fewer parameters generalize better: an arm whose published links are
+right needs a payload alone, an arm without payload needs its links.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from r2s.identification.structure.cross_validation import CrossValidation, clearly_worse
+from r2s.identification.terms import blocks_of
+
+
+def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
+    """Return {"needed": whether held-out motion needs each of the `terms`}; only `prunable` ones are tried.
+
+    The term with the most parameters is tried first. It is removed if the others predict not clearly worse than the
+    best model so far.
+    """
+    base = cv.space(terms)
+    folds = list(cv.split(base))
+    done = 0
+
+    def score(some: Sequence[str]) -> np.ndarray:
+        """Return (blocks, n) Nm^2, mean squares of held-out torque."""
+        nonlocal done
+        space = cv.space(some)
+        squares = np.concatenate([fold.score(space, cv.prior) for fold in folds])
+        done += 1
+        row = {"search": "terms", "evaluations": 0, "cost": float(squares.mean())}
+        cv.report(row | {"done": done, "total": 1 + len(prunable)})
+        return squares
+
+    kept, full = list(terms), score(terms)
+    best = full / full.mean(0)  # joints count alike
+    for name in sorted(prunable, key=lambda term: -sum(base.size(block) for block in blocks_of(term))):
+        some = [term for term in kept if term != name]
+        trial = score(some) / full.mean(0)
+        if not clearly_worse((trial - best).sum(1)):
+            kept, best = some, min(best, trial, key=np.mean)
+    return {"needed": [name in kept for name in terms]}

@@ -1,0 +1,97 @@
+"""Cross-validation within a recording: whole blocks of time, or of phase for periodic motion, are held out."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.problem import Problem, Report, fit_torque
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.terms import search_space
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+RATE_HZ = 50.0  # rows per second: model structures are compared on every second row of a fit
+GUARD_S = 0.1  # s, distance of the fitted rows from a held-out block: the low-pass spreads motion that far
+
+
+def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
+    """Return (rest, held out) for each fold, of `blocks` blocks; the rest keeps GUARD_S away from them."""
+    period = recording.period or np.inf
+    clock = recording.t % period if recording.period else recording.t
+    edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
+    pairs = []
+    for k in range(folds):
+        out, near = np.zeros((2, len(clock)), dtype=bool)
+        for low, high in edges[k::folds]:
+            inside = (clock >= low) & (clock <= high)
+            out |= inside
+            # distance on the circle of phases; without a period the way round is infinite
+            near |= inside | ((low - clock) % period < GUARD_S) | ((clock - high) % period < GUARD_S)
+        pairs.append((recording.select(~near), recording.select(out)))
+    return pairs
+
+
+class Fold(NamedTuple):
+    """Torque residuals of the fitted and of the held-out motion."""
+
+    fit: TorqueResidual
+    test: TorqueResidual
+
+    def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
+        """Return (blocks, n) Nm^2: mean square error of held-out torque over blocks of half a second, after a fit."""
+        own, test = self.fit.on(space), self.test
+        u, _ = fit_torque(Problem.of(own, own, prior))
+        square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
+        block = test.clusters[:: space.n]
+        sums = [(square[block == b].sum(0), test.seen[block == b].sum(0)) for b in np.unique(block)]
+        return np.stack([total / np.maximum(count, 1) for total, count in sums])
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Data and settings that the selections of family and terms share.
+
+    Attributes:
+        robot, nominal: the arm, and the start of every fit.
+        recording: training motion.
+        bounds, prior: see `search_space` and `Problem.of`.
+        folds: number of folds.
+        cutoff_hz: of the zero-phase filter.
+        report: called with a row of progress.
+    """
+
+    robot: Robot
+    nominal: Dynamics
+    recording: Recording
+    bounds: Mapping[str, Sequence[ArrayLike]]
+    prior: Mapping[str, ArrayLike]
+    folds: int
+    cutoff_hz: float
+    report: Report
+
+    def space(self, terms: Sequence[str], nominal: Dynamics | None = None) -> ParameterSpace:
+        """Return the parameter space of `terms`."""
+        return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording)
+
+    def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
+        """Yield the folds; see `held_out` and `TorqueResidual`."""
+        for pair in held_out(self.recording, self.folds, blocks):
+            fit, test = (
+                TorqueResidual(space, part, cutoff_hz=self.cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
+                for part in pair
+            )
+            yield Fold(fit, test)
+
+
+def clearly_worse(more: np.ndarray) -> bool:
+    """Return whether an error rises, `more` (blocks,) of it, by over one standard error of the mean.
+
+    The one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984.
+    """
+    return bool(more.mean() > more.std() / np.sqrt(len(more)))

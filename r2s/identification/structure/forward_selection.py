@@ -1,0 +1,92 @@
+"""Forward selection: add terms that clearly improve the prediction of held-out torque.
+
+Terms trade with each other (an offset with cable drag, a mass with a centre of mass), and a fit gives an absent term
+a value at the cost of its neighbours. So a term must improve the prediction to enter.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from r2s.identification.parameters import parameter_space
+from r2s.identification.problem import Problem, fit_torque, implicit_friction
+from r2s.identification.structure.cross_validation import CrossValidation, Fold
+from r2s.identification.terms import blocks_of
+from r2s.physics.actuation import EARLY
+from r2s.physics.robot import SIM_DT
+
+BLOCKS = 4  # of each fold, so that held-out motion has fast and slow parts like the rest
+CLEARLY = 2.0  # standard errors of the mean improvement, about 95 %
+
+
+def select_terms(
+    cv: CrossValidation, terms: Sequence[str], candidates: Sequence[str], slowest: float
+) -> dict[str, list[bool]]:
+    """Return {"entered": whether each of the `candidates` improves a model with `terms`}.
+
+    The candidate that helps most enters if the error falls by more than CLEARLY standard errors over blocks of half a
+    second; then the next. Torque is linear in most parameters, so each fold is fitted once without candidates and
+    each selection is one Gauss-Newton step from there.
+    """
+    space, folds = cv.space(terms), []
+    for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):
+        folds.append(_LinearizedFold(cv, fold, candidates))
+        cost = float(np.mean(folds[-1].squares([])))
+        cv.report({"search": "terms", "evaluations": 0, "cost": cost, "done": k + 1, "total": cv.folds})
+    usual = np.sqrt(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
+
+    def score(chosen: Sequence[str]) -> np.ndarray:
+        """Return (blocks,) the mean square over joints that count alike."""
+        return np.concatenate([f.squares(chosen) for f in folds]) @ (1.0 / usual**2)
+
+    chosen: list[str] = []
+    best = score(chosen)
+    while left := [name for name in candidates if name not in chosen]:
+        trials = [score([*chosen, name]) for name in left]
+        k = int(np.argmin([t.mean() for t in trials]))
+        less = best - trials[k]
+        if less.mean() < CLEARLY * less.std() / np.sqrt(len(less)):
+            break
+        chosen.append(left[k])
+        best = trials[k]
+    return {"entered": [name in chosen for name in candidates]}
+
+
+class _LinearizedFold:
+    """A fit to a part of a recording, linearized in its own and in the candidates' parameters."""
+
+    def __init__(self, cv: CrossValidation, fold: Fold, candidates: Sequence[str]):
+        fit, test = fold
+        space = fit.space
+        u, problem = fit_torque(Problem.of(fit, fit, cv.prior))
+        if fit.commanded and implicit_friction(problem, u, 0.0):
+            # a simulator's implicit friction would pass for a rotor that adds to the inertia
+            test = test.with_lead(EARLY * SIM_DT)
+            u, problem = fit_torque(problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT)))
+        problem = problem.torque_reweighted(u)
+        fit = problem.torque_data
+        names = [block for name in candidates for block in blocks_of(name)]
+        found = space.dynamics(space.from_unit(u))
+        more = parameter_space(space.robot, found, {name: cv.bounds[name] for name in names})
+        fit_more = fit.on(more).weighted_like(fit)
+        wide = Problem.of(fit_more, fit_more, cv.prior)
+        at_test = test.on(space).weighted_like(fit), test.on(more).weighted_like(fit)
+        self._own = len(u)
+        self._where = {name: [more.where(block) for block in blocks_of(name)] for name in candidates}
+        r = problem.torque_residual(u[None])[0]
+        j = np.concatenate([fit.jacobian(u), fit_more.jacobian(wide.start)], 1)
+        prior = np.concatenate([problem.weight, wide.weight]) ** 2
+        pull = np.concatenate([problem.weight**2 * (u - problem.start), np.zeros(len(wide.start))])
+        self._hessian, self._gradient = j.T @ j + np.diag(prior), j.T @ r[: len(fit.clusters)] + pull
+        self._change = np.concatenate([at_test[0].jacobian(u), at_test[1].jacobian(wide.start)], 1)
+        self._left = at_test[0](space.from_unit(u)[None])[0]
+        self._joints, self._block = space.n, np.unique(test.clusters, return_inverse=True)[1]
+
+    def squares(self, chosen: Sequence[str]) -> np.ndarray:
+        """Return (blocks, n), the sum of squares of held-out torque in each block with the terms `chosen`."""
+        free = np.concatenate([np.arange(self._own), *(self._own + w for name in chosen for w in self._where[name])])
+        step = -np.linalg.solve(self._hessian[np.ix_(free, free)], self._gradient[free])
+        r = self._left + self._change[:, free] @ step
+        out = np.zeros((self._block.max() + 1, self._joints))
+        np.add.at(out, (self._block, np.tile(np.arange(self._joints), len(r) // self._joints)), r**2)
+        return out

@@ -1,0 +1,129 @@
+"""Simulated arms in parallel, with controller and safety filter, for training, evaluation and prediction."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+from r2s.physics.safety_filter import filter_limits
+from r2s.physics.simulator import Simulator
+from r2s.tasks.task import State, Task
+
+ALL = slice(None)
+
+
+class VectorArms:
+    """`width` arms, each with its own dynamics, for `r2s.tasks.rollout.rollout`.
+
+    Every ms of a control period: command -> control law -> soft start, low-pass, clip, rate limit -> safety filter ->
+    delay and lag -> physics. Kinematics follow at its end. States hold true speeds and, separately, sensor noise.
+
+    Attributes:
+        speeds: None: true speeds need no smoothing.
+
+    Args:
+        robot, task: the arm, and the task with its controller.
+        dynamics: of `width` arms, or of one for all.
+        nthread: threads, 0: all cores.
+        soft_start_s: s, fade-in of an episode's torque.
+        seed: of the sensor noise, which restarts when all arms are placed.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: Task,
+        dynamics: Dynamics,
+        width: int,
+        nthread: int = 0,
+        soft_start_s: float = 0.0,
+        seed: int | np.random.SeedSequence = 0,
+    ):
+        self.robot, self.width = robot, width
+        torque, self._period = task.torque_limit(robot), 1 / task.ctrl_hz
+        self.sim = Simulator(robot, dynamics, width, nthread, control=task.control(robot))
+        self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s)
+        self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
+        self.speeds = None
+        self._limited = np.zeros(width)  # cycles before the last step
+        self._steps, self._stopped = np.zeros(width, dtype=np.int64), np.zeros(width, dtype=bool)
+        self.seed(seed)
+        self._sigma, self._noise = np.zeros((2, width, robot.n))
+        self._sigma[:] = dynamics.speed_noise
+
+    def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
+        """Replace the dynamics, delay and lag of the arms `ids`."""
+        self.sim.set_dynamics(dynamics, ids)
+        self._sigma[ids] = dynamics.speed_noise
+
+    def push(self, tau: np.ndarray) -> None:
+        """Apply external joint torques tau (width, n) Nm until the next call."""
+        self.sim.push(tau)
+
+    def place(self, starts: np.ndarray, first: int = 0, ids: np.ndarray | None = None) -> State:
+        """Reset the arms `ids` (None: all) to rest at starts (m, n) rad; return the state of all."""
+        self.sim.reset(starts, np.zeros_like(starts), ids)
+        at = slice(None) if ids is None else ids
+        self._steps[at], self._limited[at] = 0, 0.0
+        if ids is None:
+            self.seed(self._seed)
+        self._sense(at)
+        return self.read()
+
+    def seed(self, seed: int | np.random.SeedSequence) -> None:
+        """Restart the sensor noise from this seed."""
+        self._seed, self._rng = seed, np.random.default_rng(seed)
+
+    def _sense(self, at: np.ndarray | slice = ALL) -> None:
+        """Draw the sensor noise of these arms for the present state."""
+        if self._sigma.any():
+            sigma = self._sigma[at]
+            self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
+
+    def read(self) -> State:
+        """Return the present state of all arms; its arrays are views."""
+        sim, t = self.sim, self._steps * self._period
+        limited = (sim.limited - self._limited) / self._substeps
+        noise = self._noise if self._sigma.any() else None
+        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, sim.effort, self._stopped, limited, noise)
+
+    def step(self, command: np.ndarray) -> State:
+        """Run one control period with commands (width, c) of the controller; return the state after it.
+
+        Raises:
+            FloatingPointError: a command is not finite.
+        """
+        check_finite("action", command, self._steps)
+        self._limited[:] = self.sim.limited
+        self.sim.command(command, self._noise)
+        self.sim.rollout(self._none, record=())
+        self.sim.kinematics()
+        self._steps += 1
+        self._sense()
+        return self.read()
+
+    def end(self) -> np.ndarray:
+        """Return (width,) False: simulated arms do not stop."""
+        return self._stopped
+
+    def state(self) -> dict:
+        """Return a copy of the state of simulation and noise for `set_state`."""
+        own = {name: getattr(self, name).copy() for name in ("_steps", "_limited", "_sigma", "_noise")}
+        return {"sim": self.sim.state()} | own | {"_rng": self._rng.bit_generator.state}
+
+    def set_state(self, state: Mapping) -> None:
+        """Restore what `state` returned; the same commands then give the same states, bit for bit."""
+        self.sim.set_state(state["sim"])
+        self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
+        self._sigma[:], self._noise[:] = state["_sigma"], state["_noise"]
+        self._rng.bit_generator.state = state["_rng"]
+
+
+def check_finite(what: str, rows: np.ndarray, steps: np.ndarray) -> None:
+    """Raise FloatingPointError if a row of (m, k) is not finite; `steps` (m,): steps of the episodes so far."""
+    finite = np.isfinite(rows)
+    if not finite.all():
+        arm = int((~finite.all(-1)).argmax())
+        value = rows[arm][~finite[arm]][0]
+        raise FloatingPointError(f"{what} of arm {arm} is {value} at step {steps[arm]} of its episode")

@@ -1,0 +1,225 @@
+"""Check the overrides of a command line before Hydra runs: a mistake is one line, with the nearest match."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError, choices, nearest
+from r2s.stages.build import CONF, STAGES, unread
+
+COMMANDS = ("look", "list", "export")
+OPTIONAL = ("tracker", "experiment")  # groups that may have no option
+EXTENSIBLE = ("tune.space",)  # keys that + may add to
+NO_OPTION = "base"  # a file that the options of a group share
+SEARCHPATH = "hydra.searchpath"
+# old names of keys and values, with the new ones
+RENAMED = {
+    "arm.friction": "arm.friction_scale",
+    "arm.late": "arm.extra_delay_s",
+    "arm.load": "arm.declared_payload",
+    "arm.make": "arm.variant",
+    "arm.make=1": "arm.variant=rigid",
+    "arm.make=2": "arm.variant=elastic",
+    "friction.hold": "friction.stiction_model",
+    "identify.extra": "identify.candidate_terms",
+    "identify.spare": "identify.prunable_terms",
+    "only_missing": "skip_completed",
+    "reward.limited": "reward.filter_penalty",
+    "reward.limited_most": "reward.max_filter_rate",
+    "stage=watch": "stage=estimate",
+    "task.bandwidth": "control.bandwidth, with control=computed_torque",
+    "task.base": "control",
+    "task.base=model": "control=computed_torque",
+    "task.base=none": "control=torque",
+    "task.residual": "control.residual, with control=computed_torque",
+    "watch": "estimate",
+}
+EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm"}  # launcher -> extra that installs it
+
+
+def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool = False) -> None:
+    """Check the overrides of a job, or of all jobs of a sweep.
+
+    Args:
+        words: KEY=VALUE and GROUP=OPTION. config_dir: --config-dir. multirun: whether -m was given.
+
+    Raises:
+        UserError: an unknown option, an option that no job reads, a grid without -m, or a missing folder.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    if config_dir and not Path(config_dir).is_dir():
+        siblings = [p.name for p in Path(config_dir).absolute().parent.glob("*/")]
+        raise UserError(f"--config-dir: no folder '{config_dir}'{nearest(Path(config_dir).name, siblings)}")
+    own = [f"{SEARCHPATH}=[file://{Path(config_dir).resolve()}]"] if config_dir else []
+    of_hydra = [w for w in words if w.lstrip("+~").startswith(("hydra.", "hydra/"))]
+    words = [w for w in words if w not in of_hydra]
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+
+        def options(group: str) -> list[str]:
+            return [o for o in loader.get_group_options(group) if o != NO_OPTION]
+
+        groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
+        _check_hydra(of_hydra, own, {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")})
+        try:
+            names, jobs = _jobs(words, own, groups)
+            configs = [compose("config", job, return_hydra_config=True) for job in jobs]
+        except (HydraException, OmegaConfBaseException, UnknownOption):
+            raise _first_mistake(words, own, groups) from None
+        if not multirun and configs[0].hydra.sweeper.get("params"):
+            raise UserError(f"this is a grid of jobs, and only -m runs it: python run.py -m {' '.join(words)}")
+        _check_configs(configs, jobs, names, groups)
+    GlobalHydra.instance().clear()
+
+
+def _check_configs(
+    configs: Sequence[Any], jobs: Sequence[list[str]], names: Sequence[str], groups: Mapping[str, Any]
+) -> None:
+    """Check stage, root, switches and unread options of the composed configs of `jobs`."""
+    from hydra import compose
+    from omegaconf import OmegaConf
+
+    for cfg in configs:  # Hydra needs root before the job can check it
+        if cfg.get("stage") not in STAGES:
+            raise UserError(f"stage: expected one of {choices(STAGES)}, got {cfg.get('stage')}")
+        root = OmegaConf.to_container(cfg, resolve=False)["root"]  # type: ignore[call-overload,index]
+        if isinstance(root, bool) or not isinstance(root, str | int | float):
+            raise UserError(f"root: expected a folder, got {root}")
+    defaults: dict[tuple[str, ...], Any] = {}
+    for cfg, job in zip(configs, jobs, strict=True):
+        selected = tuple(w for w in job if w.lstrip("+").split("=", 1)[0] in (*groups, SEARCHPATH))
+        if selected not in defaults:
+            defaults[selected] = compose("config", list(selected))
+        _check_switches(cfg, names, defaults[selected])
+    for name in names:
+        reasons = [unread(name, cfg) for cfg in configs]
+        if reasons and all(reasons):
+            raise UserError(reasons[0])
+
+
+def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
+    """Raise UserError if Hydra refuses one of its own options."""
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    for k, word in enumerate(words):
+        try:
+            compose("config", [*own, *words[: k + 1]], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException) as error:
+            if word.partition("=")[2] in EXTRAS:
+                package = EXTRAS[word.partition("=")[2]]
+                raise UserError(f"{word}: not installed here; pip install 'r2s[{package}]'") from None
+            before = compose("config", [*own, *words[:k]], return_hydra_config=True)
+            known = [*(f"hydra.{key}" for key in _keys(before.hydra)), *groups]
+            raise _mistake(word, error, groups, known) from None
+
+
+class UnknownOption(Exception):  # noqa: N818 (its message is made where the options are known)
+    """An override adds a key that nothing reads."""
+
+
+def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return the typed keys and groups, and jobs that contain every value of each sweep at least once."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    names, jobs = [], [own]
+    for word in words:
+        parsed = OverridesParser.create().parse_override(word)
+        names.append(parsed.key_or_group)
+        if parsed.is_add() and parsed.key_or_group not in (*groups, *EXTENSIBLE):  # Hydra accepts any new key
+            raise UnknownOption
+        if not parsed.is_sweep_override() and not parsed.is_delete() and parsed.key_or_group in groups:
+            check_option(parsed.key_or_group, parsed.value(), groups[parsed.key_or_group])
+        values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
+        trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
+        first = jobs[0]
+        jobs = [[*job, trials[0]] for job in jobs] + [[*first, trial] for trial in trials[1:]]
+    return names, jobs
+
+
+def _check_switches(cfg: Any, names: Sequence[str], defaults: Any) -> None:
+    """Raise UserError if an option of `names` is a boolean in `defaults`, but not in `cfg`."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    for name in names:
+        try:
+            default, value = OmegaConf.select(defaults, name), OmegaConf.select(cfg, name)
+        except OmegaConfBaseException:  # an interpolation without target; the stage reports it
+            continue
+        if isinstance(default, bool) and not isinstance(value, bool):
+            raise UserError(f"{name}: expected true or false, got {value!r}")
+
+
+def check_option(group: str, value: Any, options: Sequence[str]) -> None:
+    """Raise UserError if the option of a group is no string, for which Hydra raises a traceback later."""
+    words = value if isinstance(value, list) else [value]
+    if not all(isinstance(w, str) for w in words) or not (words or group in OPTIONAL):
+        raise UserError(f"{group}: expected one of {choices(options)}, got {value}")
+
+
+def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> UserError:
+    """Return the error of the first override that Hydra refuses after those before it."""
+    from hydra import compose
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    known = [*_keys(compose("config", own)), *groups]
+    for k, word in enumerate(words):
+        job = [word]
+        try:
+            names, jobs = _jobs(words[: k + 1], own, groups)
+            for job in jobs:
+                cfg = compose("config", job)
+        except UnknownOption:
+            name = word.lstrip("+~").split("=", 1)[0]
+            return UserError(renamed(word) or f"unknown option '{name}'{nearest(name, known)}")
+        except (HydraException, OmegaConfBaseException) as error:
+            return _mistake(job[-1], error, groups, known)  # in a sweep, the value that Hydra refuses
+        if names[-1] in groups:
+            known = [*_keys(cfg), *groups]
+    raise AssertionError("Hydra accepts each override, but not all of them")
+
+
+def renamed(override: str) -> str | None:
+    """Return one line with the current name of an override that uses an old one; None if its name is current."""
+    word = override.lstrip("+~")
+    if word in RENAMED:
+        return f"{word} is now {RENAMED[word]}"
+    key = word.split("=", 1)[0]
+    for old, new in RENAMED.items():
+        if key == old or key.startswith(f"{old}."):
+            return f"{key} is now {new}{key.removeprefix(old)}"
+    return None
+
+
+def _keys(node: Any, prefix: str = "") -> Iterator[str]:
+    from omegaconf import DictConfig, OmegaConf
+
+    for k in node:
+        yield prefix + str(k)
+        if not OmegaConf.is_missing(node, k) and isinstance(node._get_node(k), DictConfig) and node[k] is not None:
+            yield from _keys(node[k], f"{prefix}{k}.")
+
+
+def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
+    """Return the error of an override that Hydra refuses with `error`."""
+    if "=" not in word:
+        return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
+    key, value = word.split("=", 1)
+    bare = key.lstrip("+~")
+    if (line := renamed(word)) and (bare not in known or word in RENAMED):
+        return UserError(line)
+    for option in [v.strip() for v in value.strip("[]").split(",")] if value.startswith("[") else [value]:
+        if bare in groups and option not in groups[bare]:
+            return UserError(
+                f"{bare}: no option '{option}'; allowed: {choices(groups[bare])}{nearest(option, groups[bare])}"
+            )
+    if bare not in known:
+        return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
+    return UserError(f"{word}: {' '.join(str(error).split())}")

@@ -1,0 +1,241 @@
+"""Collision of arms with themselves and the table, compiled, for many arms at once.
+
+Bodies are the geoms of the robot's file. If some geoms of the file collide, the others are visual and do not count.
+Planes and height fields belong to the surroundings. Meshes count as their convex hulls, as in MuJoCo, and signed
+distance fields as their bounding spheres. Pairs without a check:
+
+- table: geoms of the base, and of links whose joints are all vertical; their height never changes.
+- links: neighbours, which touch in their joint, and geoms closer than HOUSING_M at q_home. These are parts of one
+  joint's housing two links apart, as in the Panda's shoulder.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.errors import UserError
+from r2s.physics import convex
+from r2s.physics.convex import BODY, BOUND, closer_than, support_point
+from r2s.physics.kinematics import POSE, link_frames, pose_axes, write_pose
+from r2s.physics.newton_euler import links_of, product, rotate
+from r2s.physics.robot import Robot
+
+TABLE_M = 0.0  # m, default height of the table in the base frame
+HOUSING_M = 0.045  # m, geoms closer than this at q_home are parts of one joint's housing
+LINK, LOCAL, WIDTH = BODY, BODY + 1, BODY + 1 + POSE  # columns of a body: its link (-1: the base), its pose in it
+
+
+@dataclass(frozen=True)
+class CollisionPairs:
+    """The pairs of a model to check.
+
+    Attributes:
+        above: geoms to keep above the table. pairs: pairs of geoms to keep apart.
+        link: (ngeom,) number of the joint that moves each geom, from 1; 0: the base.
+    """
+
+    above: list[int]
+    pairs: list[tuple[int, int]]
+    link: np.ndarray
+
+
+def collision_pairs(
+    robot: Robot, model: mujoco.MjModel, *, table: bool = True, may_touch: Collection[tuple[str, str]] = ()
+) -> CollisionPairs:
+    """Return the pairs of `robot.model` to check, against the table only with `table`.
+
+    may_touch: pairs of body names, or of a body name and "table", that are not checked.
+    """
+    link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
+    solid = ~np.isin(model.geom_type, [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD])
+    colliding = solid & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    geoms = np.flatnonzero(colliding if colliding.any() else solid).tolist()
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    lifts = np.abs(data.xaxis[:, 2]) <= 1 - 1e-9  # joints with an axis that is not vertical
+    free = {frozenset(pair) for pair in may_touch}
+    body = [model.body(b).name for b in model.geom_bodyid]
+    above = [g for g in geoms if table and lifts[: link[g]].any() and {body[g], "table"} not in free]
+    data.qpos[:] = robot.q_home
+    mujoco.mj_kinematics(model, data)
+    pairs = [
+        (a, b)
+        for a in geoms
+        for b in geoms
+        if link[b] - link[a] >= 2
+        and {body[a], body[b]} not in free
+        and mujoco.mj_geomDistance(model, data, a, b, 1.0, None) >= HOUSING_M
+    ]
+    return CollisionPairs(above, pairs, link)
+
+
+def link_name(model: mujoco.MjModel, geom: int) -> str:
+    """Return "link 'hand'" for a geom of the body hand."""
+    body = model.geom_bodyid[geom]
+    return f"link '{model.body(body).name}'" if model.body(body).name else f"the link of body {body}"
+
+
+class _Scene(NamedTuple):
+    """Bodies (G, WIDTH), hull vertices (V, 3), body rows in `above` (A,) and `pairs` (P, 2); table and margin, m."""
+
+    bodies: np.ndarray
+    vertices: np.ndarray
+    above: np.ndarray
+    pairs: np.ndarray
+    table: float
+    margin: float
+
+
+class CollisionCheck:
+    """Collision check of many arms; called with q (m, n) rad, it returns (m,) bool.
+
+    Attributes:
+        names: of the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
+
+    Args:
+        robot: its file's geoms.
+        table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, or no table if the arm is
+            below that at q_home, as a hanging arm is.
+        margin: m, a smaller distance counts as a collision.
+        may_touch: pairs of body names, or of a body name and "table", that are not checked.
+
+    Raises:
+        UserError: a pair touches at q_home.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        table: float | None = TABLE_M,
+        margin: float = 0.0,
+        may_touch: Collection[tuple[str, str]] = (),
+    ):
+        model = robot.model(gravity=False)
+        optional = table is None
+        table = TABLE_M if table is None else table
+        found = collision_pairs(robot, model, table=bool(np.isfinite(table)), may_touch=may_touch)
+        geoms = sorted({*found.above, *(g for pair in found.pairs for g in pair)})
+        self._links = links_of(robot, robot.mass, robot.com, robot.inertia)
+        bodies, vertices = _bodies(robot, model, geoms, found.link, self._links)
+        row = {g: k for k, g in enumerate(geoms)}
+        above = np.array([row[g] for g in found.above], dtype=int)
+        pairs = np.array([(row[a], row[b]) for a, b in found.pairs], dtype=int).reshape(-1, 2)
+        self._scene = _Scene(bodies, vertices, above, pairs, float(table), float(margin))
+        self.names = [f"{link_name(model, g)} and the table" for g in found.above]
+        self.names += [f"{link_name(model, a)} and {link_name(model, b)}" for a, b in found.pairs]
+        at_home = int(self.first_contact(robot.q_home[None])[0])
+        if optional and 0 <= at_home < len(found.above):
+            self._scene, at_home = self._scene._replace(table=-np.inf), -1
+        if at_home >= 0:
+            raise UserError(f"{robot.name}: {self.names[at_home]} at {table:g} m touch at robot.q_home")
+
+    def __call__(self, q: np.ndarray) -> np.ndarray:
+        """Return whether each arm at q (m, n) rad collides, (m,)."""
+        return self.first_contact(q) >= 0
+
+    def first_contact(self, q: np.ndarray) -> np.ndarray:
+        """Return the index (m,) in `names` of the first colliding pair of each arm, -1 for none."""
+        q = np.ascontiguousarray(q, dtype=float)
+        out = np.empty(len(q), dtype=np.int64)
+        _first_contacts(q, self._links, self._scene, out)
+        return out
+
+
+def _bodies(
+    robot: Robot, model: mujoco.MjModel, geoms: list[int], link: np.ndarray, links: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows (G, WIDTH) of these geoms and the vertices (V, 3) of their hulls."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.zeros(robot.n)
+    mujoco.mj_kinematics(model, data)
+    frames = np.empty((robot.n, POSE))
+    link_frames(links, np.zeros(robot.n), frames, np.empty((robot.n, 3)))
+    rows, vertices = np.zeros((len(geoms), WIDTH)), [np.zeros((0, 3))]
+    for row, g in zip(rows, geoms, strict=True):
+        place, axes = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
+        row[LINK] = link[g] - 1
+        if link[g]:
+            frame = frames[link[g] - 1]
+            rotation = frame[3:].reshape(3, 3)
+            place, axes = rotation.T @ (place - frame[:3]), rotation.T @ axes
+        row[LOCAL : LOCAL + 3], row[LOCAL + 3 :] = place, axes.ravel()
+        row[convex.FIRST] = sum(len(v) for v in vertices)
+        row[convex.KIND], row[convex.RADIUS], row[convex.SIZE : convex.SIZE + 3], hull = _shape(model, g)
+        row[convex.COUNT], row[BOUND] = len(hull), model.geom_rbound[g]
+        vertices.append(hull)
+    return rows, np.concatenate(vertices)
+
+
+def _shape(model: mujoco.MjModel, g: int) -> tuple[int, float, np.ndarray, np.ndarray]:
+    """Return kind, radius, half sizes (3,) and hull (V, 3) of a geom."""
+    size, kind, none = model.geom_size[g], mujoco.mjtGeom, np.zeros((0, 3))
+    match model.geom_type[g]:
+        case kind.mjGEOM_SPHERE:
+            return convex.POINT, size[0], np.zeros(3), none
+        case kind.mjGEOM_CAPSULE:
+            return convex.SEGMENT, size[0], np.array([0, 0, size[1]]), none
+        case kind.mjGEOM_CYLINDER:
+            return convex.CYLINDER, 0.0, np.array([size[0], size[0], size[1]]), none
+        case kind.mjGEOM_BOX:
+            return convex.BOX, 0.0, size, none
+        case kind.mjGEOM_ELLIPSOID:
+            return convex.ELLIPSOID, 0.0, size, none
+        case kind.mjGEOM_MESH:
+            from scipy.spatial import ConvexHull
+
+            mesh = model.geom_dataid[g]
+            first = model.mesh_vertadr[mesh]
+            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+            return convex.HULL, 0.0, np.zeros(3), points[ConvexHull(points).vertices]
+        case _:
+            return convex.POINT, model.geom_rbound[g], np.zeros(3), none
+
+
+@njit(cache=True, error_model="numpy")
+def _first_contacts(q, links, scene, out):
+    bodies, n = scene.bodies, len(links)
+    frames, axes, poses, work = (
+        np.empty((n, POSE)),
+        np.empty((n, 3)),
+        np.empty((len(bodies), POSE)),
+        np.empty((10, 3)),
+    )
+    for arm in range(len(q)):
+        link_frames(links, q[arm], frames, axes)
+        for g in range(len(bodies)):
+            body, link = bodies[g], int(bodies[g, LINK])
+            if link < 0:
+                for c in range(POSE):
+                    poses[g, c] = body[LOCAL + c]
+                continue
+            f = frames[link]
+            R = pose_axes(f)
+            x, y, z = rotate(R, body[LOCAL], body[LOCAL + 1], body[LOCAL + 2])
+            write_pose(poses[g], f[0] + x, f[1] + y, f[2] + z, product(R, body, LOCAL + 3))
+        out[arm] = _first_pair(scene, poses, work)
+
+
+@njit(cache=True, error_model="numpy")
+def _first_pair(scene, poses, work):
+    """Return the index of the first colliding pair, -1 for none."""
+    bodies, vertices, above, pairs, table, margin = scene
+    for k in range(len(above)):
+        body, pose = bodies[above[k]], poses[above[k]]
+        if pose[2] - body[BOUND] > table + margin:
+            continue
+        if support_point(body, vertices, pose, 0.0, 0.0, -1.0)[2] - body[convex.RADIUS] <= table + margin:
+            return k
+    for k in range(len(pairs)):
+        a, b = pairs[k, 0], pairs[k, 1]
+        p, r = poses[a], poses[b]
+        x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
+        far = bodies[a, BOUND] + bodies[b, BOUND] + margin
+        if x * x + y * y + z * z <= far * far and closer_than(margin, bodies[a], p, bodies[b], r, vertices, work):
+            return len(above) + k
+    return -1

@@ -1,0 +1,118 @@
+"""Compiled control laws: what turns a command into joint torques once a millisecond.
+
+A control law is a compiled function
+
+    law(q, dq, command, parameters, memory, out)
+
+    q, dq       (n,) rad, rad/s, measured in this cycle
+    command     (c,), set once per control period: the policy's action in SI units, then the setpoint of the task
+    parameters  (p,), fixed for a motion
+    memory      (k,), the law's own state; zeros when a motion begins
+    out         (n,) Nm, the target torque, without gravity
+
+The same function runs in MuJoCo's callback during training (mujoco_callback.py), in the driver of every arm
+(r2s/arm/driver.py) and in an exported bundle. Room control/ says which law a controller uses, and with which
+parameters. The laws live here because numba keeps compiled code per room, and MuJoCo's callback contains them.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from numba.extending import is_jitted
+
+from r2s.compiled import njit
+
+
+@njit(cache=True, error_model="numpy")
+def torque_law(q, dq, command, parameters, memory, out):
+    """The command is the torque: `control=torque`."""
+    for j in range(len(q)):
+        out[j] = command[j]
+
+
+@njit(cache=True, error_model="numpy")
+def computed_torque_law(q, dq, command, parameters, memory, out):
+    """Computed torque: feedforward, and a critically damped PD law weighted with the mass matrix.
+
+    tau = command torque + feedforward + M (w^2 (q_d - q) + 2 w (dq_d - dq)), updated every `hold` cycles.
+
+    command: torque (n), feedforward (n) Nm, q_d (n) rad, dq_d (n) rad/s, M (n n) kg m^2. parameters: w rad/s, hold
+    cycles. memory: cycles since the update, torque of the update (n).
+    """
+    n = len(q)
+    if memory[0] == 0.0:
+        w = parameters[0]
+        for j in range(n):
+            torque = command[j] + command[n + j]
+            for k in range(n):
+                error = w**2 * (command[2 * n + k] - q[k]) + 2 * w * (command[3 * n + k] - dq[k])
+                torque += command[(4 + j) * n + k] * error
+            memory[1 + j] = torque
+    for j in range(n):
+        out[j] = memory[1 + j]
+    memory[0] = (memory[0] + 1.0) % parameters[1]
+
+
+BUILT_IN = (torque_law, computed_torque_law)
+_laws: list[Callable] = [*BUILT_IN]
+
+
+def law_number(law: Callable) -> int:
+    """Return the number of a compiled law in `chain`; a new one is registered."""
+    law = law if is_jitted(law) else njit(law)
+    if law not in _laws:
+        _laws.append(law)
+    return _laws.index(law)
+
+
+def registered() -> tuple[Callable, ...]:
+    """Return all laws, in the order of their numbers."""
+    return tuple(_laws)
+
+
+@njit(cache=True)
+def _no_law(number, q, dq, command, parameters, memory, out):
+    for j in range(len(q)):
+        out[j] = 0.0
+
+
+def _either(own_number: int, own: Callable, others: Callable) -> Callable:
+    @njit(inline="always")
+    def law(number, q, dq, command, parameters, memory, out):
+        if number == own_number:
+            own(q, dq, command, parameters, memory, out)
+        else:
+            others(number, q, dq, command, parameters, memory, out)
+
+    return law
+
+
+@cache
+def chain(laws: tuple[Callable, ...]) -> Callable:
+    """Return the compiled function (number, q, dq, command, parameters, memory, out) that calls one of these laws."""
+    law: Callable = _no_law
+    for k in reversed(range(len(laws))):
+        law = _either(k, laws[k], law)
+    return law
+
+
+control_law = chain(BUILT_IN)
+
+
+@njit(cache=True, error_model="numpy")
+def _run_built_in(number, q, dq, command, parameters, memory, out):
+    for i in range(len(q)):
+        memory[:] = 0.0
+        control_law(number, q[i], dq[i], command[i], parameters, memory, out[i])
+
+
+def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
+    """Return the torques (m, n) Nm of m arms in the first cycle of a motion: q, dq (m, n), command (m, c)."""
+    out = np.empty(q.shape)
+    if law in BUILT_IN:
+        _run_built_in(BUILT_IN.index(law), q, dq, command, parameters, np.zeros(memory), out)
+        return out
+    for i in range(len(q)):
+        law(q[i], dq[i], command[i], parameters, np.zeros(memory), out[i])
+    return out

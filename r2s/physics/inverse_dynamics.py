@@ -1,0 +1,96 @@
+"""Inverse dynamics of an arm with gravity compensation: rigid-body torque, friction, offset and drag."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.newton_euler import WORK, equations, links_of
+from r2s.physics.robot import Robot
+
+SLIDES = 0.01  # rad/s, width of the sign change of load-dependent friction, as in physics.friction
+
+
+@dataclass(frozen=True)
+class InverseDynamics:
+    """Inverse dynamics of one arm behind its gravity compensation.
+
+    Attributes:
+        robot: the arm; its nominal links are the model of the gravity compensation.
+        dynamics: estimated dynamics of the arm.
+    """
+
+    robot: Robot
+    dynamics: Dynamics
+
+    @cached_property
+    def _links(self) -> tuple[np.ndarray, np.ndarray]:
+        r, d = self.robot, self.dynamics
+        return links_of(r, d.mass, d.com, d.inertia), links_of(r, r.mass, r.com, r.inertia)
+
+    def rigid(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n) Nm of links and rotors at q, dq, ddq (m, n) rad, rad/s, rad/s^2.
+
+        M ddq + C dq + g minus g of the nominal links, which the arm compensates.
+        """
+        own, nominal = self._links
+        out = np.empty_like(q)
+        _rigid(own, nominal, self.robot.gravity, self.dynamics.armature, (q, dq, ddq), out)
+        return out
+
+    def mass(self, q: np.ndarray) -> np.ndarray:
+        """Return the mass matrices (m, n, n) kg m^2 at q (m, n) rad, rotors included."""
+        out = np.empty((*q.shape, q.shape[1]))
+        _mass(self._links[0], self.robot.gravity, self.dynamics.armature, q, out)
+        return out
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
+        """Return the command (m, n) Nm, without gravity; `sliding` (m, n) rad/s are the speeds for friction."""
+        d = self.dynamics
+        out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
+        if d.drag.any():
+            out -= d.drag[:, 0] * np.sin(q) + d.drag[:, 1] * np.cos(q)
+        if d.load.any():
+            gravity = np.empty_like(q)
+            none = np.zeros_like(q)
+            _rigid(self._links[1], self._links[1], self.robot.gravity, none[0], (q, none, none), gravity, True)
+            out += d.load * np.abs(gravity) * np.tanh(sliding / SLIDES)
+        return out
+
+
+@njit(cache=True, error_model="numpy")
+def _rigid(links, nominal, gravity, armature, motion, out, full_gravity=False):
+    """Write the torque (m, n) Nm of a motion (q, dq, ddq); `full_gravity`: without gravity compensation."""
+    q, dq, ddq = motion
+    m, n = q.shape
+    mass, bias, compensated, at_rest = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
+    work = np.empty((n, WORK))
+    for i in range(m):
+        equations(links, gravity, q[i], dq[i], mass, bias, work)
+        if full_gravity:
+            compensated[:] = 0.0
+        else:
+            _gravity_torque(nominal, gravity, q[i], at_rest, compensated, work)
+        for j in range(n):
+            torque = bias[j] - compensated[j] + armature[j] * ddq[i, j]
+            for k in range(n):
+                torque += mass[j, k] * ddq[i, k]
+            out[i, j] = torque
+
+
+@njit(cache=True, error_model="numpy")
+def _gravity_torque(links, gravity, q, at_rest, out, work):
+    mass = np.empty((len(q), len(q)))
+    equations(links, gravity, q, at_rest, mass, out, work)
+
+
+@njit(cache=True, error_model="numpy")
+def _mass(links, gravity, armature, q, out):
+    n = q.shape[1]
+    bias, at_rest, work = np.empty(n), np.zeros(n), np.empty((n, WORK))
+    for i in range(len(q)):
+        equations(links, gravity, q[i], at_rest, out[i], bias, work)
+        for j in range(n):
+            out[i, j, j] += armature[j]

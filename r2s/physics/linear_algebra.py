@@ -1,0 +1,100 @@
+"""Cholesky factorization and solution of small symmetric positive definite systems, for compiled code.
+
+For the 7 joints of an arm these loops are faster than a LAPACK call. A root is the lower triangle L of A = L L^T with
+1 / L[i, i] on the diagonal, so that a solution multiplies instead of divides (Golub and Van Loan, Matrix
+Computations, 4th ed. 2013, section 4.2). A packed matrix is its lower triangle row by row, (n (n + 1) / 2,), as
+MuJoCo stores the mass matrix of a serial arm.
+"""
+
+import numpy as np
+
+from r2s.compiled import njit
+
+
+@njit(cache=True, error_model="numpy")
+def packed_element(packed, i, k):
+    """Return element (i, k) of a packed symmetric matrix."""
+    return packed[i * (i + 1) // 2 + k] if i >= k else packed[k * (k + 1) // 2 + i]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def unpack(packed, scale, diagonal, out):
+    """Write the lower triangle of a packed matrix plus scale diag(diagonal (n,)) into `out` (n, n)."""
+    for i in range(len(diagonal)):
+        row = i * (i + 1) // 2
+        for k in range(i):
+            out[i, k] = packed[row + k]
+        out[i, i] = packed[row + i] + scale * diagonal[i]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def factor(matrix, root):
+    """Write the root of the lower triangle of `matrix` (n, n), which may be `root` itself."""
+    for i in range(len(root)):
+        d = matrix[i, i]
+        for k in range(i):
+            r = matrix[i, k]
+            for c in range(k):
+                r -= root[i, c] * root[k, c]
+            r *= root[k, k]
+            root[i, k] = r
+            d -= r * r
+        root[i, i] = 1.0 / np.sqrt(d)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def solve(root, x):
+    """Replace x (n,) by the solution of A y = x."""
+    n = len(x)
+    for i in range(n):
+        s = x[i]
+        for c in range(i):
+            s -= root[i, c] * x[c]
+        x[i] = s * root[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for c in range(i + 1, n):
+            s -= root[c, i] * x[c]
+        x[i] = s * root[i, i]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def factor_active(matrix, active, root):
+    """Write the root of the rows and columns i of `matrix` with active[i] != 0; `matrix` may be `root` itself."""
+    for i in range(len(active)):
+        if active[i] == 0.0:
+            continue
+        d = matrix[i, i]
+        for k in range(i):
+            if active[k] == 0.0:
+                continue
+            r = matrix[i, k]
+            for c in range(k):
+                if active[c] != 0.0:
+                    r -= root[i, c] * root[k, c]
+            r *= root[k, k]
+            root[i, k] = r
+            d -= r * r
+        root[i, i] = 1.0 / np.sqrt(d)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def solve_active(root, active, x):
+    """Replace x (n,) by the solution for the active rows and columns, and by 0 elsewhere."""
+    n = len(x)
+    for i in range(n):
+        s = 0.0
+        if active[i] != 0.0:
+            s = x[i]
+            for c in range(i):
+                if active[c] != 0.0:
+                    s -= root[i, c] * x[c]
+            s *= root[i, i]
+        x[i] = s
+    for i in range(n - 1, -1, -1):
+        if active[i] != 0.0:
+            s = x[i]
+            for c in range(i + 1, n):
+                if active[c] != 0.0:
+                    s -= root[c, i] * x[c]
+            x[i] = s * root[i, i]

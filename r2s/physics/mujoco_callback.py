@@ -1,0 +1,367 @@
+"""Friction, control law, safety filter and motors inside MuJoCo's physics step: one compiled callback.
+
+`install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` then gives each simulation
+its own arm at full speed. The callback contains the friction laws (friction.py), and with `Simulator.drive` also the
+control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the motors (actuation.py), which
+need feedback every millisecond. It is the control callback, the last one before accelerations, because stiction
+(stick_slip.py) depends on all other forces.
+
+The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
+qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D. This is exact to first order, and
+stable where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
+"""
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import mujoco
+import numpy as np
+from llvmlite import ir
+from numba import carray, types
+from numba.extending import intrinsic, is_jitted
+
+from r2s.compiled import cfunc, njit
+from r2s.physics.actuation import SLOTS, condition_joint, motor_torque
+from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
+from r2s.physics.control_laws import chain, control_law, registered
+from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
+from r2s.physics.linear_algebra import packed_element
+from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, filter_torque
+from r2s.physics.safety_filter import STEP as TAU_STEP
+from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_velocity
+
+# Columns of jnt_user. MARK identifies our models: the callback is global in a process and must leave others alone.
+MARK, FAMILY, P1 = range(3)
+OFFSET, BREAK_NEG, BREAK_POS, DQ_MIN, DAMPING = range(P1 + PHI, P1 + PHI + 5)
+DRAG_SIN, DRAG_COS, LOAD, STEP, LINK, BODY = range(DAMPING + 1, DAMPING + 7)  # LINK: whether the next twelve are used
+MASS_ERROR, MOMENT_ERROR, MASS, MOMENT = BODY + 1, BODY + 2, BODY + 5, BODY + 6  # 1, 3, 1, 3 wide
+NET, REST_NEG, REST_POS = range(MOMENT + 3, MOMENT + 6)  # NET: stick_slip.py holds. REST: friction as sliding begins
+GRAVITY = REST_POS + 1  # 3 wide
+DELAY, LAG, LEVEL = range(GRAVITY + 3, GRAVITY + 6)  # LEVEL: of friction, for the safety filter
+LIMITS = LEVEL + 1  # of the safety filter, COLUMNS wide; 0: no filter
+# The path of a command: number of the control law (NO_CONTROL: `rollout` gives efforts), cycles of the soft start,
+# factor of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
+CONTROL, FADE, LOW_PASS, TARGET_MAX, COMMANDS, MEMORIES, PARAMETERS = range(LIMITS + COLUMNS, LIMITS + COLUMNS + 7)
+WIDTH = PARAMETERS + 1
+NO_CONTROL = -1.0
+MARKER = 7_202_020.0
+# Rows of `joint`, which a step computes. REST and EDGES have two each, of the negative and the positive direction.
+SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
+# Rows of n in `userdata`: bristles, last command, motor state, cycle count (one number), number of cycles that the
+# safety filter changed (one number), low-pass state, effort, noise of the measured speeds, and SLOTS of commands.
+# Behind them: command, memory and parameters of the control law.
+BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
+KEPT = LINE + SLOTS
+USUAL = 7  # joints that the driver's part is compiled for; others run slower
+
+# the index of a law is its number in `jnt_user`
+_BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
+_laws: list[Callable] = [*_BUILT_IN]
+
+
+def number(family: Family, hold: str) -> int:
+    """Return the number of a family's law in `jnt_user`; a new law is first compiled into the callback (seconds)."""
+    law = family.native if hold == "command" or family.sharp is None else family.sharp
+    if law not in _laws:
+        _laws.append(law)
+        install()
+    return _laws.index(law)
+
+
+def install() -> None:
+    """Register the callback in MuJoCo, once per process. Models without MARKER in `jnt_user` are untouched."""
+    _callback(tuple(_laws), registered())
+
+
+def _either(number: int, own: Callable, others: Callable) -> Callable:
+    """Return the compiled function that calls `own` for its number, else `others`."""
+    own = own if is_jitted(own) else njit(own)
+
+    @njit(inline="always")
+    def law(asked, p, v, h, memory):
+        if asked == number:
+            return own(p, v, h, memory)
+        return others(asked, p, v, h, memory)
+
+    return law
+
+
+@njit
+def _no_law(asked, p, v, h, memory):
+    return 0.0, 0.0
+
+
+def _in_order(laws: tuple[Callable, ...]) -> Callable:
+    """Return the compiled function that calls one of these laws by its index."""
+    law: Callable = _no_law
+    for k in reversed(range(len(laws))):
+        law = _either(k, laws[k], law)
+    return law
+
+
+_law = _in_order(_BUILT_IN)
+
+
+@intrinsic
+def _as_doubles(typingctx, address):
+    def codegen(context, builder, signature, args):
+        return builder.inttoptr(args[0], ir.DoubleType().as_pointer())
+
+    return types.CPointer(types.float64)(types.int64), codegen
+
+
+@intrinsic
+def _stack(typingctx, count):  # NumPy's own arrays cost a step a tenth of its time
+    def codegen(context, builder, signature, args):
+        return builder.alloca(ir.DoubleType(), args[0])
+
+    return types.CPointer(types.float64)(types.int64), codegen
+
+
+@njit(inline="always")
+def _weight(mass, hx, hy, hz, anchor, axis, gravity):
+    """Return Nm of gravity about a joint: axis . ((h - mass anchor) x gravity), with first moments h kg m."""
+    x, y, z = hx - mass * anchor[0], hy - mass * anchor[1], hz - mass * anchor[2]
+    level = gravity[0] * (axis[1] * z - axis[2] * y) + gravity[1] * (axis[2] * x - axis[0] * z)
+    return level + gravity[2] * (axis[0] * y - axis[1] * x)
+
+
+@njit(inline="always")
+def _first_moment(mass, xpos, xmat, h):
+    """Return the first moment (3) kg m in the world of a body with mass kg and h (3) kg m in its frame."""
+    x = mass * xpos[0] + xmat[0] * h[0] + xmat[1] * h[1] + xmat[2] * h[2]
+    y = mass * xpos[1] + xmat[3] * h[0] + xmat[4] * h[1] + xmat[5] * h[2]
+    z = mass * xpos[2] + xmat[6] * h[0] + xmat[7] * h[1] + xmat[8] * h[2]
+    return x, y, z
+
+
+@cache
+def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) -> Any:
+    """Compile the force with these friction and control laws, in the order of their numbers, and install it."""
+    force = _force_at(_struct_offsets())
+    names = dict(globals())
+    if own := laws[len(_BUILT_IN) :]:
+        friction = FunctionType(_friction.py_func.__code__, {**globals(), "_law": _in_order(laws)})
+        names["_friction"] = njit(error_model="numpy", forceinline=True)(friction)
+    if own_control := control_laws[len(BUILT_IN_CONTROL) :]:
+        drive = FunctionType(_drive.py_func.__code__, {**globals(), "control_law": chain(control_laws)})
+        names["_drive"] = njit(error_model="numpy", forceinline=True)(drive)
+    if own or own_control:
+        force = FunctionType(force.__code__, names, closure=force.__closure__)
+    signature = types.void(types.CPointer(types.int64), types.CPointer(types.int64))
+    compiled = cfunc(signature, error_model="numpy", cache=not (own or own_control))(force)
+    mujoco.set_mjcb_control(compiled.ctypes)
+    return compiled  # kept alive by the cache: MuJoCo holds only the address
+
+
+def _force_at(at: dict[str, int]) -> Callable:
+    """Return the force to compile; `at`: byte offsets of the fields of mjModel and mjData.
+
+    The offsets are integers in its closure: numba's cache takes them into account.
+    """
+    nv_at, nbody_at, nuser_at = (at[k] // 8 for k in ("nv", "nbody", "nuser_jnt"))
+    user_at, damping_at = (at[k] // 8 for k in ("jnt_user", "dof_damping"))
+    q_at, dq_at, applied_at, passive_at, bias_at, mass_at, memory_at, xpos_at, xmat_at, anchor_at, axis_at = (
+        at[k] // 8 for k in _DATA_FIELDS
+    )
+    model_words, data_words = (max(at[k] for k in fields) // 8 + 1 for fields in (_MODEL_FIELDS, _DATA_FIELDS))
+
+    def friction_force(model_ptr, data_ptr):
+        model = carray(model_ptr, (model_words,))
+        if model[nuser_at] != WIDTH:
+            return
+        data, n = carray(data_ptr, (data_words,)), model[nv_at]
+        user = carray(_as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
+        if user[0, LIMITS + TAU_MAX] > 0.0 and user[0, MARK] == MARKER:
+            fields = data[q_at], data[dq_at], data[applied_at], data[bias_at], data[mass_at], data[memory_at]
+            if n == USUAL:
+                _drive(USUAL, model[user_at], fields)
+            else:
+                _drive(n, model[user_at], fields)
+        sizes = n, model[nbody_at]
+        forces = model[damping_at], data[applied_at], data[passive_at], data[bias_at], data[mass_at], data[memory_at]
+        _friction(
+            sizes,
+            user,
+            data[q_at],
+            data[dq_at],
+            forces,
+            (data[xpos_at], data[xmat_at], data[anchor_at], data[axis_at]),
+        )
+
+    return friction_force
+
+
+@njit(error_model="numpy", forceinline=True)
+def _friction(sizes, user, q, dq, forces, places):
+    """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
+
+    Args:
+        sizes: joints and bodies. user: (n, WIDTH), of jnt_user. The others are addresses of MuJoCo's arrays.
+        forces: damping, applied, passive, bias, M, userdata. places: xpos, xmat, xanchor, xaxis.
+    """
+    n, nbody = sizes
+    q, dq = carray(_as_doubles(q), (n,)), carray(_as_doubles(dq), (n,))  # type: ignore[call-arg]
+    damping, applied = carray(_as_doubles(forces[0]), (n,)), carray(_as_doubles(forces[1]), (n,))
+    passive, bias = carray(_as_doubles(forces[2]), (n,)), carray(_as_doubles(forces[3]), (n,))
+    mass, memory = carray(_as_doubles(forces[4]), (n * (n + 1) // 2,)), carray(_as_doubles(forces[5]), (n,))
+    xpos, xmat = carray(_as_doubles(places[0]), (nbody, 3)), carray(_as_doubles(places[1]), (nbody, 9))
+    anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))
+    net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py holds, all joints of an arm or none
+    joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
+    # mass and first moment of everything beyond a joint: errors of the compensation, and nominal
+    em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(n - 1, -1, -1):
+        if user[j, MARK] != MARKER:
+            return
+        v = 0.0 if net and abs(dq[j]) < TINY else dq[j]
+        friction, slope = _law(user[j, FAMILY], user[j, P1 : P1 + PHI], v, user[j, STEP], memory[j : j + 1])
+        pull, loaded = user[j, OFFSET], 0.0
+        if user[j, DRAG_SIN] != 0.0 or user[j, DRAG_COS] != 0.0:
+            pull += user[j, DRAG_SIN] * np.sin(q[j]) + user[j, DRAG_COS] * np.cos(q[j])
+        if user[j, LINK] != 0.0:
+            body, gravity = int(user[j, BODY]), user[j, GRAVITY : GRAVITY + 3]
+            error, nominal = user[j, MASS_ERROR], user[j, MASS]
+            x, y, z = _first_moment(error, xpos[body], xmat[body], user[j, MOMENT_ERROR : MOMENT_ERROR + 3])
+            em, ex, ey, ez = em + error, ex + x, ey + y, ez + z
+            pull += _weight(em, ex, ey, ez, anchor[j], axis[j], gravity)
+            x, y, z = _first_moment(nominal, xpos[body], xmat[body], user[j, MOMENT : MOMENT + 3])
+            lm, lx, ly, lz = lm + nominal, lx + x, ly + y, lz + z
+            loaded = user[j, LOAD] * abs(_weight(lm, lx, ly, lz, anchor[j], axis[j], gravity))
+            sign = np.sign(v) if net else np.tanh(v / WIDTH_DQ)
+            friction += loaded * sign
+            slope += 0.0 if net else loaded * (1.0 - sign * sign) / WIDTH_DQ
+        slope = max(slope, 0.0)  # an implicit falling branch would remove inertia
+        # mj_passive has already subtracted dof_damping * v with the slope of the step before: correct it
+        force = (damping[j] - user[j, DAMPING]) * v - friction
+        damping[j] = user[j, DAMPING] + slope
+        drive = applied[j] + pull
+        held = not net and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
+        passive[j] += force + (-applied[j] if held else pull)
+        if net:
+            joint[SPEED, j], joint[FRICTION, j], joint[LOADED, j] = v, friction, loaded
+            joint[FORCE, j] = passive[j] + applied[j] - bias[j]
+            slow |= abs(v) <= user[j, DQ_MIN] or v == 0.0
+    if net:
+        work = carray(_stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
+        if slow or any_reversal(mass, damping, user[0, STEP], joint[SPEED], joint[FORCE], work):
+            _hold((mass, damping, bias, applied, passive), dq, user, joint, work)
+
+
+@njit(error_model="numpy", forceinline=True)
+def _drive(n, user, fields):
+    """Replace the applied torques by what the joints get: control law, conditioning, safety filter, motors.
+
+    Called with a constant n, it is compiled for that n: loops unroll, and the filter costs half (benchmarks/law.py).
+
+    Args:
+        n: joints. user, fields: addresses of MuJoCo's arrays.
+    """
+    user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
+    q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
+    applied, bias = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[3]), (n,))
+    mass, kept = carray(_as_doubles(fields[4]), (n * (n + 1) // 2,)), carray(_as_doubles(fields[5]), (KEPT, n))
+    if user[0, CONTROL] != NO_CONTROL:
+        c, k, p = int(user[0, COMMANDS]), int(user[0, MEMORIES]), int(user[0, PARAMETERS])
+        rest = carray(_as_doubles(fields[5]), (KEPT * n + c + k + p,))[KEPT * n :]
+        speed = carray(_stack(n), (n,))  # type: ignore[call-arg]
+        for j in range(n):
+            speed[j] = dq[j] + kept[NOISE, j]
+        control_law(user[0, CONTROL], q, speed, rest[:c], rest[c + k :], rest[c : c + k], applied)
+        for j in range(n):
+            target = min(max(applied[j], -user[j, TARGET_MAX]), user[j, TARGET_MAX])
+            kept[FILTERED, j], kept[EFFORT, j] = condition_joint(
+                target, kept[FILTERED, j], kept[EFFORT, j], kept[CYCLE, 0] + 1.0, user[0, LOW_PASS], user[0, FADE],
+                user[j, LIMITS + TAU_MAX], user[j, LIMITS + TAU_STEP],
+            )  # fmt: skip
+            applied[j] = kept[EFFORT, j]
+    desk = carray(_stack((2 * n + WORK) * n), (2 * n + WORK, n))
+    cycle = SLOTS + int(kept[CYCLE, 0])
+    sent = kept[LINE + cycle % SLOTS]
+    level, limits = user[:, LEVEL], user[:, LIMITS : LIMITS + COLUMNS]
+    arm = JointDynamics(q, dq, mass, bias)
+    kept[LIMITED, 0] += filter_torque(arm, applied, kept[SENT], 1.0, level, limits, desk, sent)
+    kept[SENT, :] = sent
+    motor_torque(kept[LINE:], kept[MOTOR], cycle, user[0, DELAY], user[0, LAG], applied)
+    kept[CYCLE, 0] += 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _hold(forces, dq, user, joint, work):
+    """Change the passive force of a step so that it ends with the velocities of stick_slip.py.
+
+    Args:
+        forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), of
+            `_friction`. work: (n + 4, n), anything.
+    """
+    mass, damping, bias, applied, passive = forces
+    n, h = len(dq), user[0, STEP]
+    coming, rest, edges = joint[COMING], joint[REST : REST + 2], joint[EDGES : EDGES + 2]
+    for j in range(n):
+        joint[FORCE, j] += joint[FRICTION, j]
+        rest[0, j], rest[1, j] = user[j, REST_NEG] - joint[LOADED, j], user[j, REST_POS] + joint[LOADED, j]
+        edges[0, j], edges[1, j] = min(user[j, BREAK_NEG], rest[0, j]), max(user[j, BREAK_POS], rest[1, j])
+    dq_min = max(user[0, DQ_MIN], TINY)
+    loads = JointForces(joint[SPEED], joint[FORCE], joint[FRICTION], rest, edges)
+    if not coming_velocity(mass, damping, h, loads, dq_min, work, coming):
+        return
+    for j in range(n):
+        passive[j] = bias[j] - applied[j] + damping[j] * (coming[j] - dq[j])
+    for k in range(n):
+        change = (coming[k] - dq[k]) / h
+        if change != 0.0:
+            for j in range(n):
+                passive[j] += packed_element(mass, j, k) * change
+
+
+_MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
+_DATA_FIELDS = (  # in the order of `_force_at`
+    *("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "M", "userdata"),
+    *("xpos", "xmat", "xanchor", "xaxis"),
+)
+
+
+def _struct_offsets() -> dict[str, int]:
+    """Return byte offsets within mjModel and mjData, found in live structs.
+
+    Pointers are found by the address of their NumPy view, sizes by their index in mjModel's introspection.
+    """
+    joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
+    spec = mujoco.MjSpec.from_string(
+        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='{3 * KEPT}'/><worldbody>{joints}</worldbody></mujoco>"
+    )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    sizes = [f.name for f in _size_fields()]
+    offsets = {name: 8 * sizes.index(name) for name in ("nv", "nbody", "nuser_jnt")}
+
+    def scan(struct: Any, names: tuple[str, ...]) -> None:
+        word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))
+        missing = {getattr(struct, name).ctypes.data: name for name in names}
+        k = 0
+        while missing:  # ends: every array's address is in its struct
+            if name := missing.pop(word[k], None):
+                offsets[name] = 8 * k
+            k += 1
+
+    scan(model, ("jnt_user", "dof_damping"))
+    scan(data, _DATA_FIELDS)
+    seen = np.ctypeslib.as_array(ctypes.cast(model._address, ctypes.POINTER(ctypes.c_int64)), (len(sizes),))
+    if seen[sizes.index("nv")] != model.nv or seen[sizes.index("nuser_jnt")] != WIDTH:
+        raise RuntimeError(f"mujoco {mujoco.__version__}: mjModel is not laid out as its introspection says")
+    return offsets
+
+
+def _size_fields() -> list[Any]:
+    """Return mjModel's leading integer fields, all mjtSize (64 bit), in order."""
+    from mujoco.introspect import structs
+
+    fields: list[Any] = []
+    for field in structs.STRUCTS["mjModel"].fields:
+        if str(field.type) != "mjtSize":
+            break
+        fields.append(field)
+    return fields

@@ -1,0 +1,240 @@
+"""Safety filter: the last stage before an arm limits accelerations near speed and position limits.
+
+The same compiled function runs in training and on every arm. Its input is a target torque behind the low-pass filter
+(r2s/physics/actuation.py); M is the arm's mass matrix. Three rules:
+
+1. The policy's torque fades out as a joint approaches its velocity limit or a position limit.
+2. The acceleration a = M^-1 (tau - Coriolis torque) of each joint satisfies -RATE (v + dq) <= a <= RATE (v - dq),
+   where v is the speed allowed at q. Of all torques with this property the filter sends the nearest to the target, by
+   Gauss' principle of least constraint: the difference is the torque of stops at the joints. Friction widens the
+   bounds and does nothing else, so an overestimated friction never accelerates a joint.
+3. The torque is clipped to its range, and its rate is limited by one common factor for all joints: the command moves
+   along the straight line from the last command. The torques that satisfy rule 2 are a convex set, so rule 2 holds on
+   that line. A rate limit per joint would violate it if two joint axes are almost parallel.
+
+Rule 2 is a control barrier function per joint (Ames et al., European Control Conference 2019). It is continuous in
+state and target, so it causes no chattering, and RATE tolerates the latency of an arm.
+"""
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.linear_algebra import factor, factor_active, solve, solve_active, unpack
+from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.robot import SIM_DT, Robot
+
+# Latency budget, s: delays up to 8 ms and lags up to 3 ms on real arms, and one cycle.
+LATENCY_S = 0.012
+# 1/s. A first-order loop with delay d does not overshoot for rate * d <= 1/e: at equality s + rate exp(-s d) = 0 has
+# a double real root.
+RATE = round(1 / (math.e * LATENCY_S))
+APPROACH = 0.25 * RATE  # 1/s, approach to a position limit: critical damping of the second-order loop
+ALLOWED = 0.66  # share of dq_max that the filter allows; unmodelled friction adds to it (docs/explanation/safety.md)
+FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it fades from ALLOWED on
+# Distance from a position limit at which the allowed speed towards it is 0: rad, but at most a tenth of the range.
+# From there on the policy's torque fades out over the share Q_FADE_SHARE of that distance.
+Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
+ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
+# s, duration of a braking ramp of the allowed speed. With 0.1 s the torque of the base reached 60 Nm, fell at 1 Nm/ms
+# too late, and threw a stretched elbow forward (docs/explanation/safety.md).
+BRAKE_S = 0.15
+TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
+PIVOTS = 5  # block pivoting rounds before single pivots, which always terminate (Murty 1974)
+ROUNDS = 100
+FRICTION_WIDTH = 0.05  # rad/s, width of the sign change of friction
+FRICTION_SHARE = 0.5  # share of the friction estimate that widens the bounds; only of joints with added inertia
+DELAY_PHASE = 1.25  # rad, phase lag that the delay may cause in a loop; pi / 2 is the stability limit
+
+# Columns of the limits (n, COLUMNS), one row per joint.
+Q_LOW, Q_HIGH, Q_FADE, DQ_ALLOWED, DECELERATION, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
+COLUMNS = STEP + 1
+WORK = 7  # rows of `work` beside 2 n
+_DDQ, _LOW, _HIGH, _STOP, _SIDE, _NEXT, _SLACK = range(WORK)
+
+
+class JointDynamics(NamedTuple):
+    """State and dynamics of an arm in a cycle: q, dq (n,) rad, rad/s; packed mass matrix; Coriolis torque (n,) Nm."""
+
+    q: np.ndarray
+    dq: np.ndarray
+    mass: np.ndarray
+    bias: np.ndarray
+
+
+def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
+    """Return the limits (n, COLUMNS) of `filter_torque`.
+
+    Light joints get added inertia (column ADDED), so that a full action of this joint or of a coupled one just passes
+    from rest. The added inertia makes the joint's loop faster than RATE, so DELAY_PHASE bounds it.
+
+    Args:
+        robot: position, velocity, torque and rate limits, and the mass matrix at home.
+        torque: (n,) Nm, largest target torque.
+    """
+    out = np.empty((robot.n, COLUMNS))
+    inside = np.minimum(Q_MARGIN, 0.1 * (robot.q_max - robot.q_min))
+    out[:, Q_LOW], out[:, Q_HIGH], out[:, Q_FADE] = robot.q_min + inside, robot.q_max - inside, Q_FADE_SHARE * inside
+    out[:, DQ_ALLOWED], out[:, DQ_MAX] = ALLOWED * robot.dq_max, robot.dq_max
+    deceleration, offset = robot.velocity_envelope or (np.full(robot.n, np.inf), np.zeros(robot.n))
+    out[:, DECELERATION], out[:, OFFSET] = 2 * ENVELOPE_SHARE**2 * deceleration, ENVELOPE_SHARE * offset
+    mobility = InverseInertia(robot)(robot.q_home[None])[0]
+    inertia = 1 / np.diag(mobility)
+    most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
+    equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm at the joint with the effect of any full action
+    out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
+    out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
+    return out
+
+
+class SafetyFilter:
+    """The safety filter of one arm with the mass matrix of its model.
+
+    Attributes:
+        changed: number of cycles in which the filter changed the target.
+
+    Args:
+        model: one arm without gravity. robot, torque: see `filter_limits`. friction: (n,) Nm, see `filter_torque`.
+    """
+
+    def __init__(self, model: mujoco.MjModel, robot: Robot, torque: np.ndarray, friction: np.ndarray):
+        self._model, self._data, self._limits = model, mujoco.MjData(model), filter_limits(robot, torque)
+        self._friction = friction
+        self._work = np.empty((2 * robot.n + WORK, robot.n))
+        self.changed = 0
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray, effort: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """Return the command (n,) Nm for the effort (n,) Nm at q, dq (n,), after the command `last` (n,) Nm."""
+        data, out = self._data, np.empty_like(effort)
+        data.qpos[:], data.qvel[:] = q, dq
+        mujoco.mj_fwdPosition(self._model, data)
+        mujoco.mj_fwdVelocity(self._model, data)
+        arm = JointDynamics(q, dq, data.M, data.qfrc_bias)
+        self.changed += filter_torque(arm, effort, last, 1.0, self._friction, self._limits, self._work, out)
+        return out
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def filter_torque(arm, effort, last, share, friction, limits, work, out):
+    """Write the command (n,) Nm of a cycle into `out`; return whether rule 1 or 2 changed the effort.
+
+    Args:
+        arm: `JointDynamics`, finite.
+        effort: (n,) Nm, target. last: (n,) Nm, the command that the arm applied last.
+        share: of the allowed speeds, 1 except while braking.
+        friction: (n,) Nm, estimated friction, at least 0.
+        limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), any content.
+    """
+    q, dq, n = arm.q, arm.dq, len(arm.q)
+    ddq, low, high, root = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
+    kept = _torque_share(q, dq, limits)
+    for j in range(n):
+        out[j] = kept * effort[j]
+        ddq[j] = out[j] - arm.bias[j]
+    unpack(arm.mass, 1.0, limits[:, ADDED], root)
+    factor(root, root)
+    solve(root, ddq)
+    inside = True
+    for j in range(n):
+        up = _speed_limit(limits[j, Q_HIGH] - q[j], share, limits[j])
+        down = _speed_limit(q[j] - limits[j, Q_LOW], share, limits[j])
+        high[j], low[j] = RATE * (up - dq[j]), -RATE * (down + dq[j])
+        inside &= low[j] <= ddq[j] <= high[j]
+    if not inside:
+        _widen(low, high, dq, out, friction, limits, work)
+        inside = True
+        for j in range(n):
+            inside &= low[j] <= ddq[j] <= high[j]
+    if not inside:
+        _stop_torque(ddq, low, high, work)
+        for j in range(n):
+            out[j] += work[2 * n + _STOP, j]
+    scale = 1.0
+    for j in range(n):
+        out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]
+        if abs(out[j]) > limits[j, STEP]:
+            scale = min(scale, limits[j, STEP] / abs(out[j]))
+    for j in range(n):
+        out[j] = last[j] + min(max(scale * out[j], -limits[j, STEP]), limits[j, STEP])
+    return kept < 1.0 or not inside
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _torque_share(q, dq, limits):
+    """Return the share of the policy's torque that remains near a limit: rule 1."""
+    near = 0.0
+    for j in range(len(q)):
+        near = max(near, (abs(dq[j]) / limits[j, DQ_MAX] - ALLOWED) / (FADED - ALLOWED))
+        near = max(near, max(q[j] - limits[j, Q_HIGH], limits[j, Q_LOW] - q[j]) / limits[j, Q_FADE])
+    return 1.0 - min(near, 1.0)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _speed_limit(distance, share, limits):
+    """Return the allowed speed, rad/s, at a distance (rad) from a position limit; negative beyond the limit."""
+    speed = min(share * limits[DQ_ALLOWED], APPROACH * distance)
+    if distance > 0.0 and limits[DECELERATION] < np.inf:
+        speed = min(speed, np.sqrt(limits[DECELERATION] * distance + limits[OFFSET] ** 2) - limits[OFFSET])
+    return speed
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _widen(low, high, dq, out, friction, limits, work):
+    """Widen the bounds by the acceleration that friction of all joints can take; leave M^-1 in `work`."""
+    n = len(low)
+    root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
+    for j in range(n):
+        slack[j] = 0.0
+        if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # friction opposes motion, or the torque of a joint at rest
+            slack[j] = FRICTION_SHARE * friction[j] * abs(np.tanh(dq[j] / FRICTION_WIDTH + out[j] / friction[j]))
+    for k in range(n):
+        for j in range(n):
+            mobility[k, j] = 1.0 if j == k else 0.0
+        solve(root, mobility[k])
+        wider = 0.0
+        for j in range(n):
+            wider += abs(mobility[k, j]) * slack[j]
+        low[k] -= wider
+        high[k] += wider
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _stop_torque(ddq, low, high, work):
+    """Write the torque (n,) Nm of stops at the joints into row _STOP of `work`, which contains M^-1.
+
+    It solves the linear complementarity problem low <= ddq + M^-1 stop <= high, in which a stop pushes inwards and
+    only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).
+    """
+    n = len(ddq)
+    root, mobility = work[:n], work[n : 2 * n]
+    stop, side, following = work[2 * n + _STOP], work[2 * n + _SIDE], work[2 * n + _NEXT]
+    for k in range(n):
+        side[k] = 1.0 if ddq[k] > high[k] else (-1.0 if ddq[k] < low[k] else 0.0)
+    for iteration in range(ROUNDS):
+        for i in range(n):
+            if side[i] != 0.0:
+                stop[i] = (high[i] if side[i] > 0.0 else low[i]) - ddq[i]
+        factor_active(mobility, side, root)
+        solve_active(root, side, stop)
+        done = True
+        for j in range(n - 1, -1, -1):
+            reached = ddq[j]
+            for k in range(n):
+                reached += mobility[j, k] * stop[k]
+            following[j] = side[j]
+            if side[j] * stop[j] > 0.0:
+                following[j] = 0.0  # this stop would pull outwards
+            elif side[j] == 0.0:
+                beyond = -1.0 if reached < low[j] - TOLERANCE else 0.0
+                following[j] = 1.0 if reached > high[j] + TOLERANCE else beyond
+            done &= following[j] == side[j]
+        if done:
+            return
+        for j in range(n - 1, -1, -1):
+            if following[j] != side[j]:
+                side[j] = following[j]
+                if iteration >= PIVOTS:
+                    break

@@ -1,0 +1,162 @@
+"""Detection of repeated motion, so that a train/validation split does not leak.
+
+The comparison of two pieces of motion covers every lag at once (correlation by FFT). Their squared distance is
+|a|^2 + |b|^2 - 2 a b, summed over the rows that both have.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+STEP = 0.02  # s, grid of the comparison
+TOLERANCE = 0.01  # rad RMS, tracking difference between two repetitions of one motion
+MIN_MOTION = 3.0  # standard deviation of a joint's motion, in tolerances: ten peak to peak
+OVERLAP_S = 0.5  # s, minimum length of a repetition
+PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
+MAX_COMPARED = 60  # tracks compared with each track, and pieces searched for; bounds the computing time
+PIECE_S, PIECE_MOTION = 1.0, 0.3  # s, rad: minimum duration and range of a piece in `overlap`
+
+
+class Track:
+    """Motion between two restarts of the clock, resampled at STEP; NaN in gaps of the log."""
+
+    def __init__(self, t: np.ndarray, q: np.ndarray, stretches: Sequence[slice]):
+        """Resample q (T, n) rad, logged at t (T,) s, over `stretches` of rows with increasing t."""
+        self.stretches = list(stretches)
+        self.start = float(t[stretches[0].start])
+        grid = np.arange(self.start, t[stretches[-1].stop - 1] + 1e-9, STEP)
+        self.q = np.full((len(grid), q.shape[1]), np.nan)
+        for s in stretches:
+            inside = (grid >= t[s.start]) & (grid <= t[s.stop - 1])
+            self.q[inside] = np.stack([np.interp(grid[inside], t[s], x) for x in q[s].T], axis=1)
+
+    @property
+    def end(self) -> float:
+        """Time of the last row, s."""
+        return self.start + STEP * (len(self.q) - 1)
+
+
+def tracks_of(t: np.ndarray, q: np.ndarray, stretches: Sequence[slice], each: bool = False) -> list[Track]:
+    """Return a track per run of the clock t (T,) s, or per stretch if `each`; drop tracks shorter than OVERLAP_S."""
+    cut = [0, *(k for k in range(1, len(stretches)) if each or _new_run(t, stretches[k - 1 : k + 1])), len(stretches)]
+    tracks = [Track(t, q, stretches[a:b]) for a, b in pairwise(cut)]
+    return [track for track in tracks if len(track.q) * STEP >= OVERLAP_S]
+
+
+def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
+    """Return whether the clock restarts, or pauses longer than PAUSE_S, between two stretches."""
+    pause = t[two[1].start] - t[two[0].stop - 1]
+    return bool(pause <= 0 or pause > PAUSE_S)
+
+
+def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[float | None, np.ndarray]:
+    """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
+
+    With these shifts, the same motion has the same phase in all tracks. The period is None without a repetition. If
+    a motion repeats in another track but not within one, the period covers all tracks: no phase then occurs twice
+    within a track.
+    """
+    shift, found, period = np.zeros(len(tracks)), False, None
+    for k, b in enumerate(tracks):
+        if period is None and (lag := _own_lag(b, tolerance)):
+            period = lag * STEP
+        for i, a in enumerate(tracks[: min(k, MAX_COMPARED)]):
+            if (other := _lag(a, b, tolerance)) is not None:
+                shift[k] = shift[i] + a.start + other * STEP - b.start
+                found = True
+                break
+    if period is None and found:
+        starts, ends = (np.array([getattr(x, name) for x in tracks]) + shift for name in ("start", "end"))
+        period = float(ends.max() - starts.min()) + STEP
+    return period, np.where(np.abs(shift) > 2 * STEP, shift, 0.0)  # smaller shifts are below the grid's resolution
+
+
+def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
+    """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once."""
+    pieces = [piece for track in other for piece in _pieces(track.q)]
+    pieces = pieces[:: 1 + len(pieces) // MAX_COMPARED]
+    repeated = 0
+    for piece in pieces:
+        for track in training:
+            square, _, count = _distances(track.q, piece)
+            if ((square < TOLERANCE**2).all(1) & (count >= 0.9 * len(piece))).any():
+                repeated += 1
+                break
+    return repeated / max(len(pieces), 1)
+
+
+def _pieces(q: np.ndarray) -> list[np.ndarray]:
+    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces of at least PIECE_S and PIECE_MOTION."""
+    pieces, start, shortest = [], 0, round(PIECE_S / STEP)
+    for k in range(len(q)):
+        if np.isnan(q[k, 0]):
+            start = k + 1
+        elif k + 1 - start >= shortest and np.ptp(q[start : k + 1], axis=0).max() > PIECE_MOTION:
+            pieces.append(q[start : k + 1])
+            start = k + 1
+    return pieces
+
+
+def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare a (A, n) with b (B, n) rad, NaN in gaps, at the L lags -(B - 1) to A - 1.
+
+    Returns mean squares of a[k + lag] - b[k] (L, n), variances of b[k] over the common rows (L, n), and the number
+    of common rows (L,).
+    """
+    size = 1 << int(len(a) + len(b) - 1).bit_length()
+    middle = np.nanmean(a, axis=0)  # centring reduces the round-off of the differences
+    spectra = []
+    for x in (a, b):
+        seen = ~np.isnan(x[:, :1])
+        filled = np.where(seen, x - middle, 0.0)
+        spectra.append([np.fft.rfft(part, size, axis=0) for part in (seen.astype(float), filled, filled**2)])
+    (seen_a, a1, a2), (seen_b, b1, b2) = spectra
+    lags = np.arange(1 - len(b), len(a))
+
+    def summed(spectrum: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(spectrum, size, axis=0)[lags]
+
+    count = np.round(summed(seen_a * seen_b.conj())[:, 0]).astype(int)
+    rows = np.maximum(count, 1)[:, None]
+    square = summed(a2 * seen_b.conj() + seen_a * b2.conj() - 2 * a1 * b1.conj()) / rows
+    variance = summed(seen_a * b2.conj()) / rows - (summed(seen_a * b1.conj()) / rows) ** 2
+    return np.maximum(square, 0.0), variance, count
+
+
+def _errors(a: np.ndarray, b: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the RMS distance per joint (L,) rad and the number of common rows (L,) at every lag.
+
+    The distance is inf where the common part is shorter than OVERLAP_S or moves less than MIN_MOTION.
+    """
+    square, variance, count = _distances(a, b)
+    counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * tolerance) ** 2)
+    return np.where(counts, np.sqrt(square.mean(1)), np.inf), count
+
+
+def _own_lag(track: Track, tolerance: float) -> int | None:
+    """Return the first lag, in rows, after which a track repeats itself."""
+    q, least = track.q, round(OVERLAP_S / STEP)
+    error = _errors(q, q, tolerance)[0][len(q) - 1 :]  # from lag 0
+    error[:least] = np.inf
+    for run in _runs(error < tolerance):
+        best = run.start + int(error[run].argmin())
+        if best > least:  # a match at the smallest lag is slow motion, not a repetition
+            return best
+    return None
+
+
+def _lag(a: Track, b: Track, tolerance: float) -> int | None:
+    """Return the lag, in rows, at which b repeats a; of several, the one with the most common rows."""
+    error, count = _errors(a.q, b.q, tolerance)
+    runs = _runs(error < tolerance)
+    if not runs:
+        return None
+    longest = max(runs, key=lambda run: count[run].max())
+    return longest.start + int(error[longest].argmin()) - (len(b.q) - 1)
+
+
+def _runs(mask: np.ndarray) -> list[slice]:
+    """Return the unbroken runs of a mask (L,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,1 @@
+"""Comparison of trainings over seeds, and of adapters over transfers."""

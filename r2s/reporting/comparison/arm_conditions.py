@@ -1,0 +1,69 @@
+"""Test conditions of an arm in words: payload, warm friction, late commands."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+NOMINAL = "nominal"
+IDENTITY = ("_target_", "name", "variant", "seed", "noise")  # keys of conf/arm that say which arm it is
+SETTINGS: dict[str, tuple[Any, str]] = {  # keys that set a condition: nominal value, words
+    "payload": (0.0, "{} kg"),
+    "declared_payload": (0.0, "{} kg declared"),
+    "friction_scale": (1.0, "friction x {}"),
+    "extra_delay_s": (0.0, "{} s later"),
+    "stiffness": (None, "stiffness {}"),
+}
+# keys in the config of an older run, and the values of its `make`
+RENAMED = {"make": "variant", "load": "declared_payload", "friction": "friction_scale", "late": "extra_delay_s"}
+VARIANTS = {1: "rigid", 2: "elastic"}
+
+
+def current(arm: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arm's config with the present keys: the older `make: 1` is `variant: rigid`."""
+    return {RENAMED.get(k, k): VARIANTS.get(v, v) if k == "make" else v for k, v in arm.items()}
+
+
+def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, Any]:
+    """Return the settings of conf/arm that differ from nominal: {"payload": 1.0}.
+
+    Args:
+        arm: its config (`current`). typed: overrides such as "arm.live", which count as settings too.
+    """
+    own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
+    keys = dict.fromkeys([*SETTINGS, *(RENAMED.get(k, k) for k in own)])
+    values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
+    return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and (_size(v) or "payload" not in k)}
+
+
+def in_words(settings: Mapping[str, Any]) -> str:
+    """Return a `condition` as "1.0 kg, 0.005 s later"; NOMINAL if it is empty."""
+    return ", ".join(_words(k, v) for k, v in settings.items()) or NOMINAL
+
+
+def order(settings: Mapping[str, Any]) -> tuple:
+    """Return the sort key of a `condition`: nominal first, then by setting and size."""
+    keys = list(SETTINGS)
+    each = [(keys.index(k) if k in keys else len(keys), k, _size(v), str(v)) for k, v in settings.items()]
+    return len(each), each
+
+
+def _plain(value: Any) -> Any:
+    """Return 1.0 for 1 and for {"mass": 1}, which are the same condition."""
+    if isinstance(value, Mapping) and set(value) == {"mass"}:
+        value = value["mass"]
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _size(value: Any) -> float:
+    if isinstance(value, Mapping):
+        value = value.get("mass", 0.0)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _words(key: str, value: Any) -> str:
+    if key not in SETTINGS:
+        return f"{key}={value}"
+    more = ""
+    if isinstance(value, Mapping):
+        more = "".join(f", {k}={v}" for k, v in value.items() if k != "mass")
+        value = _size(value)
+    return SETTINGS[key][1].format(value) + more

@@ -1,0 +1,94 @@
+"""Groups of trainings: the seeds of one setting, named by their overrides."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r2s.reporting.comparison.trainings import Trained
+
+LONGEST = 40  # letters of a label: a longer one takes the room of the figure
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Runs by setting.
+
+    Attributes:
+        members: {"tqc, dr=paper": [seeds ...]}; no label is longer than `LONGEST` letters.
+        key: {"tqc #1": "tqc, calibration=..., dr=identified"}, full names of the numbered labels.
+    """
+
+    members: dict[str, list[Trained]]
+    key: dict[str, str]
+
+
+def group(runs: Sequence[Trained]) -> Groups:
+    """Return the runs grouped by settings, all seeds together.
+
+    A label is the algorithm and the overrides of the settings that differ; the rest is default. A label too long for
+    figures becomes a number, explained in `Groups.key`.
+    """
+    sets: dict[str, list[Trained]] = {}
+    for run in runs:
+        same = repr((run.algo, sorted(run.settings.items(), key=lambda item: item[0])))
+        sets.setdefault(same, []).append(run)
+    members: dict[str, list[Trained]] = {}
+    key: dict[str, str] = {}
+    for name, seeds in zip(_names(list(sets.values())), sets.values(), strict=True):
+        label = name
+        if len(name) > LONGEST:
+            label = f"{seeds[0].algo[: LONGEST - 5]} #{len(key) + 1}"
+            key[label] = name
+        members.setdefault(label, []).extend(seeds)
+    return Groups(members, key)
+
+
+def _names(sets: Sequence[Sequence[Trained]]) -> list[str]:
+    """Return a name per set."""
+    varied = _varied(sets)
+    typed = [{k: v for run in seeds for k, v in run.typed.items()} for seeds in sets]
+    parts = []
+    for seeds, words in zip(sets, typed, strict=True):
+        own = varied[seeds[0].algo]
+        shown = {k: v for k, v in sorted(words.items()) if any(s == k or s.startswith(f"{k}.") for s in own)}
+        if "experiment" in words and any(w.get("experiment") != words["experiment"] for w in typed):
+            shown["experiment"] = words["experiment"]
+        shown.pop("algo", None)
+        if "calibration" in shown:
+            shown["calibration"] = Path(shown["calibration"]).name
+        parts.append({_short(k): v for k, v in shown.items()})
+    names = [_joined(seeds[0].algo, p) for seeds, p in zip(sets, parts, strict=True)]
+    for name in list(names):
+        twins = [k for k, other in enumerate(names) if other == name]
+        if len(twins) > 1:  # they differ in settings without an override, as in an experiment's file
+            changed = differing([sets[k][0].settings for k in twins])
+            for k in twins:
+                more = {_short(s): sets[k][0].settings[s] for s in changed if s in sets[k][0].settings}
+                names[k] = _joined(sets[k][0].algo, parts[k] | more)
+    return names
+
+
+def _varied(sets: Sequence[Sequence[Trained]]) -> dict[str, list[str]]:
+    """Return per algorithm the settings that differ: its own among its runs, all others among all runs."""
+    settings = [seeds[0].settings for seeds in sets]
+    common = [k for k in differing(settings) if not k.startswith("algo.")]
+    out = {}
+    for algo in dict.fromkeys(seeds[0].algo for seeds in sets):
+        own = differing([seeds[0].settings for seeds in sets if seeds[0].algo == algo])
+        out[algo] = [k for k in own if k.startswith("algo.")] + common
+    return out
+
+
+def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the keys whose values differ or are missing somewhere."""
+    keys = dict.fromkeys(k for s in settings for k in s)
+    return [k for k in keys if len({repr(s.get(k)) for s in settings}) > 1]
+
+
+def _short(key: str) -> str:
+    return key.removeprefix("algo.").removeprefix("budget.")
+
+
+def _joined(algo: str, parts: Mapping[str, Any]) -> str:
+    return ", ".join([algo, *(f"{k}={v}" for k, v in parts.items())])

@@ -1,0 +1,99 @@
+"""Scores of groups of trainings by their last evaluation; a group has all seeds of one setting."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from r2s.reporting.comparison.statistics import improvement, interquartile_mean, interval
+from r2s.reporting.comparison.trainings import Trained
+from r2s.tasks.measures import MeasureTable
+
+Grouped = Mapping[str, Sequence[Trained]]
+
+
+def measures_in(grouped: Grouped) -> MeasureTable:
+    """Return the measures of the runs' task."""
+    return next(iter(grouped.values()))[0].measures
+
+
+def scores(group: Sequence[Trained], measure: str) -> np.ndarray:
+    """Return the last evaluation (S,) of every seed."""
+    return np.array([r.last[measure] for r in group])
+
+
+def summary_table(grouped: Grouped) -> pd.DataFrame:
+    """Return a row per group and measure: seeds, mean, interquartile mean and its 95 % interval."""
+    rows, table = [], measures_in(grouped)
+    for label, group in grouped.items():
+        for measure in dict.fromkeys((*table.comparison, *table.scores)):
+            x = scores(group, measure)
+            low, high = interval([x], lambda d: interquartile_mean(d[0]))
+            row = {"group": label, "measure": measure, "seeds": len(x), "mean": x.mean()}
+            rows.append(row | {"iqm": float(interquartile_mean(x)), "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def improvement_table(grouped: Grouped) -> pd.DataFrame:
+    """Return per pair of groups the probability that a run of the first is better than one of the second."""
+    rows, table = [], measures_in(grouped)
+    pairs = [(first, second) for first in grouped for second in grouped if first != second]
+    for first, second in pairs:
+        for measure in table.selection:
+            sign = table[measure].sign
+            pair = [sign * scores(grouped[label], measure) for label in (first, second)]
+            low, high = interval(pair, lambda d: improvement(*d))
+            row = {"better": first, "than": second, "measure": measure}
+            rows.append(row | {"probability": float(improvement(*pair)), "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
+    """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
+
+    best, median and worst are over settings, each the interquartile mean of its seeds. spread is best minus median,
+    with a 95 % interval that draws seeds within each setting: a small spread means little tuning.
+
+    Args:
+        grouped: trainings. measure: key; None: the last of `MeasureTable.selection`.
+    """
+    table = measures_in(grouped)
+    rows, measure = [], measure or table.selection[-1]
+    sign = table[measure].sign
+
+    def spread(drawn: list[np.ndarray]) -> np.ndarray:
+        means = sign * np.stack([interquartile_mean(x) for x in drawn])
+        return means.max(0) - np.median(means, axis=0)
+
+    for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
+        strata = [scores(g, measure) for g in grouped.values() if g[0].algo == algo]
+        if len(strata) < 2:
+            continue
+        each = sign * np.array([interquartile_mean(x) for x in strata])
+        low, high = interval(strata, spread)
+        row = {"algo": algo, "settings": len(strata), "best": sign * each.max(), "median": sign * np.median(each)}
+        row |= {"worst": sign * each.min(), "spread": each.max() - np.median(each), "low": low, "high": high}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
+    """Return one measure of an `improvement_table` as strings: rows are better than columns, both numbered."""
+    rows = table[table["measure"] == measure]
+    labels = list(dict.fromkeys(rows["better"]))
+    number = {label: str(i + 1) for i, label in enumerate(labels)}
+    square = rows.pivot(index="better", columns="than", values="probability").loc[labels, labels]
+    cells = square.map(lambda p: "-" if np.isnan(p) else f"{p:.2f}").rename(columns=number)
+    return cells.set_axis([f"{number[label]}: {label}" for label in labels]).rename_axis("better \\ than", axis=0)
+
+
+def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Return column x (points,), and of column y (3, points) interquartile mean, lowest and highest seed.
+
+    The seeds' curves are interpolated on the range that all of them cover.
+    """
+    curves = [r.curve for r in group]
+    grid = np.linspace(max(c[x].iloc[0] for c in curves), min(c[x].iloc[-1] for c in curves), points)
+    with np.errstate(invalid="ignore"):  # infinite if arms were stopped: no curve there
+        values = np.stack([np.interp(grid, c[x], c[y]) for c in curves], -1)
+    return grid, np.stack([interquartile_mean(values), values.min(-1), values.max(-1)])

@@ -1,0 +1,59 @@
+"""Statistics for few seeds: interquartile mean, stratified bootstrap, probability of improvement.
+
+Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice (NeurIPS 2021).
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+DRAWS = 2000  # of a bootstrap, as in Agarwal et al.
+
+
+def interquartile_mean(x: np.ndarray) -> np.ndarray:
+    """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
+
+    If a quarter is no whole number of values, the value at its edge counts in part.
+    """
+    x, s = np.sort(x, axis=-1), x.shape[-1]
+    weight = np.clip(np.minimum(np.arange(1, s + 1) - s / 4, s - s / 4 - np.arange(s)), 0.0, 1.0)
+    return np.where(weight > 0, x, 0.0) @ (weight / weight.sum())  # 0 x inf would be nan
+
+
+def interval(
+    strata: Sequence[np.ndarray], statistic: Callable[[list[np.ndarray]], np.ndarray], seed: int = 0
+) -> tuple[float, float]:
+    """Return the 95 % interval of a statistic by a stratified bootstrap.
+
+    Args:
+        strata: arrays (S,), a score per seed. seed: of the bootstrap.
+        statistic: maps the draws (D, S) of each stratum to (D,).
+    """
+    rng = np.random.default_rng(seed)
+    drawn = [x[rng.integers(len(x), size=(DRAWS, len(x)))] for x in strata]
+    found, levels = statistic(drawn), [0.025, 0.975]
+    if np.isfinite(found).all():
+        low, high = np.quantile(found, levels)
+    else:  # infinities cannot be interpolated
+        low, high = np.quantile(found, levels, method="inverted_cdf")
+    return float(low), float(high)
+
+
+def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Return the means (DRAWS, A) of a paired bootstrap: it draws arms, and episodes of each arm, for all A alike.
+
+    Args:
+        each: per arm (E, A), a row per episode. rng: of the draws.
+    """
+    draws = []
+    for _ in range(DRAWS):
+        arms = [each[i] for i in rng.integers(len(each), size=len(each))]
+        draws.append(np.concatenate([a[rng.integers(len(a), size=len(a))] for a in arms]).mean(0))
+    return np.array(draws)
+
+
+def improvement(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the probability (...) that a value of x (..., S) exceeds one of y (..., T); a tie counts half."""
+    above = x[..., :, None] > y[..., None, :]
+    same = x[..., :, None] == y[..., None, :]
+    return (above + 0.5 * same).mean((-1, -2))

@@ -1,0 +1,210 @@
+"""Finished trainings, read from their run folders, and which of them are comparable."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from r2s.errors import UserError
+from r2s.reporting.measures import measures_of
+from r2s.tasks.measures import MeasureTable
+
+# config groups that a training reads, beside its seed; runs with equal values are seeds of one group
+READ = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward")
+ALIKE = ("robot", "task")  # config groups that comparable runs share
+FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
+MOST_BUDGETS = 2.0  # largest ratio of two comparable budgets: beyond it the longer training wins by its length
+CONTROLLERS = ("oracle", "computed_torque")  # model-based, not trained
+UNFINISHED = {"running": "unfinished"}
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One finished run of stage=train.
+
+    Attributes:
+        folder, seed, algo: of the run.
+        settings: what it read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
+        alike: what comparable runs share: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
+        typed: overrides of its settings: {"dr": "paper", "algo.lr": "5e-4"}.
+        toy: it ran with +experiment=toy, which is too short to learn.
+        minutes: its budget, None if the budget is in env_steps.
+        measures: of its task. curve: evaluations.csv, on the goals that selected its best policy.
+        last: measures of its last policy on goals without selection, from summary.json.
+    """
+
+    folder: Path
+    seed: int
+    algo: str
+    settings: dict[str, Any]
+    alike: dict[str, Any]
+    typed: dict[str, str]
+    toy: bool
+    minutes: float | None
+    measures: MeasureTable
+    curve: pd.DataFrame
+    last: dict[str, float]
+
+    @property
+    def learned(self) -> bool:
+        """False for a model-based controller."""
+        return self.last["env_steps"] > 0
+
+
+def read_trainings(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
+    """Return the finished trainings among run folders, and {name: reason} of the other folders.
+
+    Raises:
+        UserError: there is no finished training.
+    """
+    trained, others = trainings_among(folders)
+    if not trained:
+        seen = f"; got {'; '.join(by_reason(others))}" if others else ""
+        raise UserError(f"runs: expected finished runs of stage=train (runs='runs/train/*'){seen}")
+    return trained, others
+
+
+def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[str, str]]:
+    """Return the same as `read_trainings`; the list may be empty."""
+    trained, others = [], {}
+    for folder in map(Path, folders):
+        if why := why_not(folder, "train", FILES):
+            others[folder.name] = why
+            continue
+        try:
+            trained.append(_read(folder))
+        except (KeyError, TypeError, ValueError, yaml.YAMLError):  # a file edited by hand
+            others[folder.name] = "unreadable"
+    return trained, others
+
+
+def why_not(folder: Path, stage: str, files: Iterable[str]) -> str:
+    """Return why a folder is no finished run of `stage` with these files, "" if it is one."""
+    try:
+        meta = json.loads((folder / "meta.json").read_text())
+        seen, status = meta.get("stage", "train"), meta["status"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return "no run folder"
+    if seen != stage:
+        return f"stage={seen}"
+    if status != "done":
+        return UNFINISHED.get(status, status)
+    missing = [name for name in files if not (folder / name).is_file()]
+    return f"no {missing[0]}" if missing else ""
+
+
+def typed_in(folder: Path) -> dict[str, str]:
+    """Return the overrides of a run: {"dr": "paper", "algo.lr": "5e-4"}."""
+    words = yaml.safe_load((folder / "overrides.yaml").read_text()) or []
+    pairs = (word.lstrip("+~").partition("=") for word in words)
+    return {key: value for key, _, value in pairs}
+
+
+def _read(folder: Path) -> Trained:
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    algo, budget = config["algo"], config.get("budget", {})
+    name = algo.get("name") or algo["_target_"].rpartition(".")[2].lower()
+    read = set(READ)
+    if config.get("calibration"):
+        read -= {"friction", "inertia"}  # the calibration replaces them
+    if name in CONTROLLERS:
+        read -= {"budget", "reward"}
+    typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
+    measures = measures_of(folder)
+    curve, last = _evaluations(folder, measures)
+    alike = dict(flat({k: v for k, v in config.items() if k in ALIKE}))
+    return Trained(
+        folder,
+        int(config["seed"]),
+        name,
+        dict(flat({k: v for k, v in config.items() if k in read})),
+        alike | {"evaluation.episodes": config.get("evaluation", {}).get("episodes")},
+        typed,
+        typed.get("experiment") == "toy",
+        None if budget.get("env_steps") else budget.get("minutes"),
+        measures,
+        curve,
+        last,
+    )
+
+
+def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
+    """Return evaluations.csv and the last policy's row; a lower-is-better measure without a value is infinite.
+
+    Such a measure has no value if the arm was stopped in all episodes. summary.json has null there.
+
+    Raises:
+        ValueError: another measure has no value, or there is no evaluation.
+    """
+    curve = pd.read_csv(folder / "evaluations.csv")
+    if curve.empty:
+        raise ValueError("no evaluation")
+    last = json.loads((folder / "summary.json").read_text())["last"]
+    last = {k: np.nan if v is None else float(v) for k, v in last.items()}
+    keys = list(dict.fromkeys((*measures.comparison, *measures.selection, *measures.scores)))
+    for key in (k for k in keys if measures[k].lower_is_better):
+        curve[key] = curve[key].astype(float).fillna(np.inf)
+        last[key] = np.inf if np.isnan(last[key]) else last[key]
+    rows = curve[["env_steps", "wall_clock_s", *keys]].astype(float).to_numpy()
+    if np.isnan([*rows.ravel(), *(last[k] for k in keys)]).any():
+        raise ValueError("a measure without a value")
+    return curve, last
+
+
+def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
+    """Return the largest set of comparable runs, and {name: reason} of the others.
+
+    Runs are comparable if robot, task and evaluation agree and no budget exceeds another `MOST_BUDGETS` times. Of two
+    sets of equal size the one without toys wins, then the one with more env steps.
+    """
+    learned = [r for r in trained if r.learned] or list(trained)
+
+    def size(first: Trained) -> tuple[int, bool, float]:
+        members = sum(not _difference(r, first) for r in learned)
+        return members, not first.toy, first.last["env_steps"]
+
+    first = max(learned, key=size)
+    apart = {r.folder.name: why for r in trained if (why := _difference(r, first))}
+    return [r for r in trained if r.folder.name not in apart], apart
+
+
+def _difference(run: Trained, first: Trained) -> str:
+    """Return why a run is not comparable with `first`, which has the smallest budget of its set; "" if it is."""
+    if run.toy != first.toy:
+        return "+experiment=toy" if run.toy else "not +experiment=toy"
+    keys = [k for k in first.alike | run.alike if run.alike.get(k) != first.alike.get(k)]
+    if keys:
+        part = {"robot": "another robot", "task": "another task"}.get(keys[0].split(".")[0], "another evaluation")
+        values = f"{run.alike.get(keys[0])}, not {first.alike.get(keys[0])}"
+        return f"{part}: {keys[0]}" + (f" is {values}" if len(values) <= 40 else " differs")
+    if not run.learned:
+        return ""
+    if run.minutes and first.minutes:
+        ratio, words = run.minutes / first.minutes, f"{run.minutes:g} min, not {first.minutes:g}"
+    else:
+        mine, others = (r.last["env_steps"] for r in (run, first))
+        ratio, words = mine / others, f"{mine:.0f} env steps, not {others:.0f}"
+    return "" if 1 <= ratio <= MOST_BUDGETS else f"another budget: {words}"
+
+
+def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[str]:
+    """Return {name: reason} as ["a, b (failed)", "c (unfinished)"], `most` names per reason, each cut to `width`."""
+    reasons: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")
+    more = {reason: f" and {len(names) - most} more" * (len(names) > most) for reason, names in reasons.items()}
+    return [f"{', '.join(names[:most])}{more[reason]} ({reason})" for reason, names in reasons.items()]
+
+
+def flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield ("a.b", value) of nested dicts, without `_target_`."""
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{key}.")
+        elif key != "_target_":
+            yield f"{prefix}{key}", value

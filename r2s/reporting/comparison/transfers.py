@@ -1,0 +1,170 @@
+"""Finished transfers to an arm, read from their run folders, and which of them are comparable."""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from r2s.files import DAMAGED
+from r2s.reporting.comparison.arm_conditions import condition, current
+from r2s.reporting.comparison.trainings import flat, typed_in, why_not
+from r2s.reporting.measures import measures_of
+from r2s.tasks.measures import MeasureTable
+from r2s.tasks.rollout import Episodes, episode_measures, select_episodes
+
+FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
+ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that are no settings of the adapter
+
+
+@dataclass(frozen=True)
+class Transferred:
+    """One finished run of stage=transfer with an arm.
+
+    Attributes:
+        folder: of the run. start: its start time, from meta.json. policy: absolute path of the policy's run folder.
+        adapter: name in conf/adapt. settings: of the adapter: {"filter_s": 0.087}.
+        arm: "twin, rigid, seed 0". condition: settings of the arm (`condition`). robot: its config in the training.
+        measures: of the task. length: of an episode, with the policy's rate: "4 s at 100 Hz". goals: how many.
+        us: median time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
+        episodes: a row per episode, indexed by goal: `MeasureTable.transfer`, the gap, and arm_stopped (0 or 1).
+    """
+
+    folder: Path
+    start: str
+    policy: str
+    adapter: str
+    settings: dict[str, Any]
+    arm: str
+    condition: dict[str, Any]
+    robot: dict[str, Any]
+    measures: MeasureTable
+    length: str
+    goals: int
+    us: float
+    episodes: pd.DataFrame
+
+
+def read_transfers(folders: Sequence[str | Path]) -> tuple[list[Transferred], dict[str, str]]:
+    """Return the finished transfers to an arm among run folders, and {name: reason} of the other folders."""
+    found, others = [], {}
+    for folder in map(Path, folders):
+        why = why_not(folder, "transfer", FILES)
+        if not why:
+            try:
+                found.append(_read(folder))
+                continue
+            except FileNotFoundError:
+                why = "no episode on an arm"
+            except (KeyError, TypeError, AttributeError, yaml.YAMLError, *DAMAGED):  # a file edited by hand
+                why = "unreadable"
+        others[folder.name] = why
+    return found, others
+
+
+def _read(folder: Path) -> Transferred:
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    policy = yaml.safe_load((folder / "policy.yaml").read_text())
+    meta = json.loads((folder / "meta.json").read_text())
+    arm, adapt, measures = current(config["arm"]), config["adapt"], measures_of(folder)
+    ran = _load(folder, arm["name"])
+    row = json.loads((folder / "summary.json").read_text())[arm["name"]]
+    step = float(ran.t[0])
+    words = {"name": "{}", "variant": "{}", "seed": "seed {}"}
+    return Transferred(
+        folder,
+        str(meta["start"]),
+        os.path.abspath(config["policy"]),
+        adapt["name"],
+        dict(flat({k: v for k, v in adapt.items() if k != "name" and k not in ARM_SPECIFIC})),
+        ", ".join(word.format(arm[k]) for k, word in words.items() if k in arm),
+        condition(arm, typed_in(folder)),
+        dict(flat(policy["robot"])),
+        measures,
+        f"{step * len(ran.t):g} s at {1 / step:g} Hz",
+        int(row["asked"]),
+        0.0 if adapt["name"] == "none" else _cost(folder / "timing.csv"),
+        _episodes(folder, arm["name"], ran, measures),
+    )
+
+
+def _load(folder: Path, label: str) -> Episodes:
+    with np.load(folder / f"episodes_{label}.npz", allow_pickle=False) as saved:
+        return Episodes(**saved)
+
+
+def _cost(path: Path) -> float:
+    if not path.is_file():
+        return np.nan
+    table = pd.read_csv(path).set_index("what")["median_ms"]
+    return 1e3 * float(table.get("adapter", np.nan))
+
+
+def _episodes(folder: Path, label: str, ran: Episodes, measures: MeasureTable) -> pd.DataFrame:
+    """Return `Transferred.episodes`; an older run without episodes_*.csv is measured again."""
+    path, names = folder / f"episodes_{label}.csv", list(_names(ran.goal))
+    table = pd.read_csv(path) if path.is_file() else _measured_again(folder, ran, names, measures)
+    return table.set_axis(names)
+
+
+def _measured_again(folder: Path, ran: Episodes, names: Sequence[str], measures: MeasureTable) -> pd.DataFrame:
+    from r2s.tasks.reach import ReachTask
+    from r2s.tasks.track import TRACK, TrackTask
+
+    predicted = None
+    if (folder / "episodes_predicted.npz").is_file():
+        model = _load(folder, "predicted")
+        at = {name: k for k, name in enumerate(_names(model.goal))}
+        if set(names) <= at.keys():
+            predicted = select_episodes(model, np.array([at[name] for name in names]))
+    return pd.DataFrame(episode_measures(TrackTask() if measures == TRACK else ReachTask(), ran, predicted))
+
+
+def _names(goals: np.ndarray) -> Iterator[str]:
+    """Yield a name per goal that all transfers share; equal goals are numbered.
+
+    Goals computed on two machines may differ in their last digits, so they are rounded to 10 micrometres.
+    """
+    seen: Counter[bytes] = Counter()
+    for goal in goals:
+        key = np.rint(1e5 * np.asarray(goal, dtype=float)).astype(np.int64).tobytes()
+        seen[key] += 1
+        yield f"{sha256(key).hexdigest()[:16]}.{seen[key]}"
+
+
+def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
+    """Return the largest set of comparable transfers, and {name: reason} of the others.
+
+    Transfers are comparable if robot, task and goals agree. Of equal policy, adapter, arm and condition the last run
+    counts.
+    """
+    first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
+    apart = {r.folder.name: why for r in found if (why := _difference(r, first))}
+    last: dict[str, Transferred] = {}
+    for run in sorted((r for r in found if r.folder.name not in apart), key=lambda r: r.start):
+        key = repr((run.policy, run.adapter, sorted(run.settings.items()), run.arm, run.condition))
+        if key in last:
+            apart[last[key].folder.name] = "repeated later"
+        last[key] = run
+    return [r for r in found if r.folder.name not in apart], apart
+
+
+def _difference(run: Transferred, first: Transferred) -> str:
+    """Return why a transfer is not comparable with `first`; "" if it is."""
+    if keys := [k for k in first.robot | run.robot if run.robot.get(k) != first.robot.get(k)]:
+        return f"another robot: robot.{keys[0]} differs"
+    one, other = (r.measures[r.measures.selection[0]].title for r in (run, first))
+    if one != other:
+        return f"another task: selected by {one}, not {other}"
+    if run.length != first.length:
+        return f"another task: {run.length}, not {first.length}"
+    if run.goals != first.goals:
+        return f"another evaluation: evaluation.episodes is {run.goals}, not {first.goals}"
+    return "" if set(run.episodes.index) & set(first.episodes.index) else "other goals"

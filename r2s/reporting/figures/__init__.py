@@ -1,0 +1,1 @@
+"""Figures (PNG): panels and colours, learning curves, episodes."""

@@ -1,0 +1,28 @@
+"""Thinning of long logs for figures, and clocks without pauses."""
+
+import numpy as np
+
+MOST_POINTS = 4000  # points of a line in a figure: three per pixel of a panel
+PAUSE = 0.1  # s, drawn length of a pause of any length
+
+
+def thin(count: int, most: int = MOST_POINTS) -> slice:
+    """Return a slice that keeps at most `most` of `count` rows."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def at_rate(t: np.ndarray, rate: float) -> np.ndarray:
+    """Return the indices of t (T,) s nearest to a clock of `rate` Hz, first and last row included."""
+    grid = np.arange(t[0], t[-1], 1 / rate)
+    return np.unique(np.append(np.searchsorted(t, grid).clip(max=len(t) - 1), len(t) - 1))
+
+
+def without_pauses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a clock (T,) s from zero in which each pause of t (T,) s lasts `PAUSE`, and the rows after a pause.
+
+    A pause is a step of more than five median steps, or a step back (a log that restarts its clock).
+    """
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    jump = (steps <= 0) | (steps > 5 * usual)
+    return np.concatenate([[0.0], np.cumsum(np.where(jump, PAUSE, steps))]), np.flatnonzero(jump) + 1

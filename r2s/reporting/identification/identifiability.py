@@ -1,0 +1,89 @@
+"""The limits of an identification: parameters and combinations that its data do not constrain."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from r2s.identification.link_inertia import LINK
+from r2s.identification.result import SHARPER, IdentificationResult
+from r2s.reporting.document import Item
+
+MOST_LINES = 10  # null directions listed
+EDGE = 5e-4  # share of a parameter's range that counts as its bound
+
+
+def identifiability(found: IdentificationResult) -> list[Item]:
+    """Return sentences about parameters that are kept nominal or at a bound, and about null directions."""
+    space = found.space
+    count, total = int(found.found.identifiable.sum()), len(space.names)
+    items: list[Item] = [
+        f"The search has {total} parameters; the data identify {count} of them individually. A parameter is "
+        f"identifiable (no ?) if its 95 % interval is narrower than {2 / SHARPER:g} standard deviations of its prior."
+    ]
+    if found.refused:
+        items.append(
+            "The replays contradict the torque of moving joints by more than the errors of both allow. They were "
+            "rejected: the parameters come from the torque."
+        )
+    if found.unseen:
+        items.append(
+            "Kept at their nominal values, because the data hardly constrain them beyond the prior (or because the "
+            f"joint's refit did not predict held-out motion better): {_grouped(found.unseen, space.n)}."
+        )
+    u = space.to_unit(found.x)
+    edge = np.where(u < EDGE, space.lower, np.where(u > 1 - EDGE, space.upper, np.nan))
+    names = [n for n, e in zip(space.names, edge, strict=True) if np.isfinite(e) and e != 0 and n not in found.unseen]
+    if names:
+        items.append(
+            "At a bound of the search (identify.bounds), so that the best value may lie beyond it: "
+            f"{_grouped(names, space.n)}."
+        )
+    return items + (_null_directions(found) if found.null_directions else [])
+
+
+def _null_directions(found: IdentificationResult) -> list[Item]:
+    """Return the combinations that the prior decides; those of parameters kept nominal are only counted."""
+
+    def kept(parts: Mapping[str, float]) -> float:
+        square = {name: part**2 for name, part in parts.items()}
+        return sum(v for name, v in square.items() if name in found.unseen) / max(sum(square.values()), 1e-12)
+
+    listed = [(share, parts) for share, parts in found.null_directions if parts and kept(parts) < 0.5]
+    lines = [f"{100 * share:.0f} %: {_combination(parts)}" for share, parts in listed[:MOST_LINES]]
+    if more := len(found.null_directions) - len(lines):
+        few = len(listed) <= MOST_LINES
+        what = "mostly of parameters kept nominal" if few else "of smaller shares or of parameters kept nominal"
+        lines.append(f"{'and ' * bool(lines)}{more} {'more, ' * bool(lines)}{what}: see parameters.yaml")
+    words = (
+        "Combinations that the prior decides instead of the data: a change along them hardly changes the predicted "
+        "recording. The percentage is the remaining share of the prior's standard deviation, which is also the unit "
+        "of the coefficients."
+    )
+    return [words, lines]
+
+
+def _place(name: str) -> tuple[str, str, str]:
+    """Return block, "joint" or "link", and number of a name such as phi1[3]; "" and "" for the whole arm."""
+    block, _, number = name.rstrip("]").partition("[")
+    kind = "link" if block in LINK or block == "inertia_scale" else "joint"
+    return block.removeprefix("link_"), kind if number else "", number
+
+
+def _grouped(names: Sequence[str], n: int = 0) -> str:
+    """Return "phi3 of joints 1, 4; alpha of all links" for names such as phi3[1]; n is the number of joints."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        block, kind, at = _place(name)
+        groups.setdefault((block, kind), []).append(at)
+    words = []
+    for (block, kind), places in groups.items():
+        where = f"all {kind}s" if len(places) == n else f"{kind}{'s' * (len(places) > 1)} {', '.join(places)}"
+        words.append(f"{block} of {where}" if kind else block)
+    return "; ".join(words)
+
+
+def _combination(parts: Mapping[str, float]) -> str:
+    """Return "0.81 d1 of link 3 - 0.57 d2 of link 3"; a direction has no sign, so the first part is positive."""
+    flip = -1.0 if next(iter(parts.values())) < 0 else 1.0
+    terms = [f"{'-' if flip * part < 0 else '+'} {abs(part):.2f} {_grouped([name])}" for name, part in parts.items()]
+    return " ".join(terms).removeprefix("+ ")

@@ -1,0 +1,78 @@
+"""Identified parameters as table cells: nominal → identified, 95 % interval, identifiability."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from r2s.identification.parameters import TIMING, WHOLE_ARM, ParameterEstimate, ParameterSpace, units
+from r2s.identification.result import SHARPER
+from r2s.physics.robot import Robot
+from r2s.reporting.document import KEPT
+from r2s.reporting.tables import number
+
+LEGEND = (
+    f"[ ]: 95 % interval; ?: the interval is wider than {2 / SHARPER:g} standard deviations of the prior; "
+    f"{KEPT}: the data hardly constrain the value"
+)
+
+
+class Value(NamedTuple):
+    """Nominal and identified value of a parameter, its 95 % interval, and whether it is `kept` nominal."""
+
+    old: float
+    new: float
+    low: float
+    high: float
+    identifiable: bool = True
+    kept: bool = False
+
+    def times(self, factor: float) -> "Value":
+        """Return the value in another unit."""
+        old, new, low, high = (factor * x for x in self[:4])
+        return Value(old, new, low, high, self.identifiable, self.kept)
+
+    @property
+    def cell(self) -> str:
+        """Cell "old → new" over "[low, high]"."""
+        if self.kept:
+            return f"{number(self.old)}\n{KEPT}"
+        return f"{number(self.old)} → {self.found}\n{self.interval}"
+
+    @property
+    def found(self) -> str:
+        """The new value, with "?" if it is not identifiable."""
+        return number(self.new) + ("" if self.identifiable else " ?")
+
+    @property
+    def interval(self) -> str:
+        """Cell "[low, high]"."""
+        return KEPT if self.kept else f"[{number(self.low)}, {number(self.high)}]"
+
+
+def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
+    """Return the values of a block: one per joint or link, or one of the whole arm; `kept` are names kept nominal."""
+    parts = (space.start, found.x, found.low, found.high, found.identifiable, np.isin(space.names, list(kept)))
+    return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
+
+
+def of_whole_arm(space: ParameterSpace, found: ParameterEstimate, kept: Sequence[str] = ()) -> dict[str, Value]:
+    """Return {"delay, ms": Value, "payload_mass, kg": Value, ...} of the parameters of the whole arm."""
+    out = {}
+    for block in (b for b in space.blocks if b in WHOLE_ARM):
+        value = values(space, found, block, kept)[0]
+        milliseconds = block in TIMING
+        out[f"{block}, {'ms' if milliseconds else units()[block]}"] = value.times(1e3) if milliseconds else value
+    return out
+
+
+def named(block: str) -> str:
+    """Return a block's column heading, with its unit."""
+    unit = units()[block]
+    return block if unit == "1" else f"{block}\n{unit}"
+
+
+def per_joint(robot: Robot, columns: Mapping[str, Sequence[str]], index: str = "joint") -> pd.DataFrame:
+    """Return a table with a row per joint or link."""
+    return pd.DataFrame(dict(columns), index=pd.Index([str(j + 1) for j in range(robot.n)], name=index))

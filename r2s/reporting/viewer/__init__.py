@@ -1,0 +1,1 @@
+"""The rerun recording: its data, its layout, and the viewer's process."""

@@ -1,0 +1,198 @@
+"""Arms of a recording: links, goals, the end effector's trail, error and torque plots."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import rerun as rr
+
+from r2s.physics.robot import Robot
+from r2s.reporting.figures.colours import colours
+from r2s.reporting.figures.log_rows import at_rate
+from r2s.reporting.viewer.data import Episode
+from r2s.reporting.viewer.layout import SPACING, entity, log_series, rgb, starts_of
+from r2s.tasks.measures import Measure
+
+FRAMES_HZ = 50.0
+TRAIL_EVERY = 3  # frames per point of a trail
+GOAL_RADIUS = 0.025  # m, the paper's success distance of 5 cm as a diameter
+GOAL = "#ff5252"
+WORST_M = 0.01  # m, error of a path from which its trail is red
+
+
+class _Arm(NamedTuple):
+    """An arm of the recording; `frames` are the rows of each episode that are logged."""
+
+    stream: rr.RecordingStream
+    base: str
+    model: mujoco.MjModel
+    episodes: Sequence[Episode]
+    frames: Sequence[np.ndarray]
+    starts: np.ndarray
+    colour: str
+
+    def clocks(self) -> list[np.ndarray]:
+        """Return the time of the logged rows of each episode, s."""
+        parts = zip(self.starts, self.episodes, self.frames, strict=False)
+        return [start + e.t[f] - e.t[0] for start, e, f in parts]
+
+    def send(self, name: str, style: rr.AsComponents, columns: Any, per_episode: bool) -> None:
+        """Send what changes at every logged row, or once per episode."""
+        times = self.starts[: len(self.episodes)] if per_episode else np.concatenate(self.clocks())
+        path = f"{self.base}/{name}"
+        self.stream.log(path, style, static=True)
+        self.stream.send_columns(path, indexes=[rr.TimeColumn("time", duration=times)], columns=columns)
+
+
+def log_arms(
+    stream: rr.RecordingStream, robot: Robot, episodes: Mapping[str, Sequence[Episode]], error: Measure
+) -> None:
+    """Log an arm per label side by side; `error` names and scales the distance plot."""
+    stream.log("arms", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    model, palette, starts = robot.model(gravity=False), colours(episodes), starts_of(episodes)
+    for i, (label, sequence) in enumerate(episodes.items()):
+        base, colour = entity("arms", label), palette[label]
+        y = (i - (len(episodes) - 1) / 2) * SPACING
+        stream.log(base, rr.Transform3D(translation=[0, y, 0]), static=True)
+        name = rr.Points3D([[0, 0, _height(model)]], radii=0.001, labels=label, colors=rgb(colour), show_labels=True)
+        stream.log(f"{base}/label", name, static=True)
+        for body in _shown_bodies(model):
+            _shapes(stream, model, body, _link(base, model, body), colour)
+        arm = _Arm(stream, base, model, sequence, [at_rate(e.t, FRAMES_HZ) for e in sequence], starts, colour)
+        _motion(arm)
+        (_paths if sequence[0].moves else _goals)(arm)
+        _plots(arm, label, error)
+
+
+def _plots(arm: _Arm, label: str, error: Measure) -> None:
+    """Log the error and the torque of each joint; a nan after each episode interrupts the line."""
+    ends = [np.append(clock, clock[-1] + 1 / FRAMES_HZ) for clock in arm.clocks()]
+    index = [rr.TimeColumn("time", duration=np.concatenate(ends))]
+
+    def line(path: str, values: Sequence[np.ndarray]) -> None:
+        log_series(arm.stream, path, index, np.concatenate([np.append(v, np.nan) for v in values]), label, arm.colour)
+
+    pairs = list(zip(arm.episodes, arm.frames, strict=True))
+    line(entity("distance", label), [error.scale * e.distance[f] for e, f in pairs])
+    for j in range(arm.episodes[0].tau.shape[1]):
+        line(entity("command", f"joint {j + 1}", label), [e.tau[f, j] for e, f in pairs])
+
+
+def _motion(arm: _Arm) -> None:
+    """Log the poses of the links."""
+    index = rr.TimeColumn("time", duration=np.concatenate(arm.clocks()))
+    q = np.concatenate([e.q[f] for e, f in zip(arm.episodes, arm.frames, strict=True)])
+    for body, (position, quaternion) in _poses(arm.model, q).items():
+        columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
+        arm.stream.send_columns(_link(arm.base, arm.model, body), indexes=[index], columns=columns)
+
+
+def _goals(arm: _Arm) -> None:
+    """Log a goal per episode and the growing trail of the end effector."""
+    pairs = list(zip(arm.episodes, arm.frames, strict=True))
+    trail = [e.ee[[*f[:k:TRAIL_EVERY], row]] for e, f in pairs for k, row in enumerate(f)]
+    style = rr.LineStrips3D.from_fields(colors=rgb(arm.colour), radii=0.005)
+    arm.send("trail", style, rr.LineStrips3D.columns(strips=trail), per_episode=False)
+    goals = rr.Points3D.columns(positions=np.stack([e.goal for e in arm.episodes]))
+    arm.send("goal", rr.Points3D.from_fields(colors=rgb(GOAL), radii=GOAL_RADIUS), goals, per_episode=True)
+
+
+def _paths(arm: _Arm) -> None:
+    """Log the path of each episode, its current point, and the trail, coloured by its error."""
+    pairs = list(zip(arm.episodes, arm.frames, strict=True))
+    grey = rr.LineStrips3D.from_fields(colors=[150, 150, 150], radii=0.0015)
+    arm.send("path", grey, rr.LineStrips3D.columns(strips=[e.goal for e in arm.episodes]), per_episode=True)
+    points = rr.Points3D.columns(positions=np.concatenate([e.goal[f] for e, f in pairs]))
+    arm.send("goal", rr.Points3D.from_fields(colors=rgb(GOAL), radii=0.4 * GOAL_RADIUS), points, per_episode=False)
+    pieces: list[np.ndarray] = []
+    shades: list[np.ndarray] = []
+    lengths: list[int] = []
+    for e, f in pairs:
+        rows = f[::TRAIL_EVERY]
+        of_piece = _shades(e.distance[rows[1:]])
+        for k in range(len(f)):
+            past = k // TRAIL_EVERY
+            pieces += [e.ee[rows[i : i + 2]] for i in range(past)]
+            shades += list(of_piece[:past])
+            lengths.append(past)
+    if pieces:
+        columns = rr.LineStrips3D.columns(strips=pieces, colors=np.array(shades)).partition(lengths)
+        arm.send("trail", rr.LineStrips3D.from_fields(radii=0.004), columns, per_episode=False)
+
+
+def _shades(error: np.ndarray) -> np.ndarray:
+    """Return (T, 3) colours of errors (T,) m: green at 0, yellow at WORST_M / 2, red from WORST_M."""
+    share = np.clip(error / WORST_M, 0.0, 1.0)[:, None]
+    low, middle, high = np.array([[61, 170, 109], [235, 200, 60], [255, 60, 60]], dtype=float)
+    warm = np.where(share < 0.5, low + 2 * share * (middle - low), middle + (2 * share - 1) * (high - middle))
+    return warm.astype(np.uint8)
+
+
+def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """Return the geoms that MuJoCo's own viewer shows (groups 0-2) but planes; all geoms if there are none."""
+    shown = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+    return shown if len(shown) else np.arange(model.ngeom)
+
+
+def _shown_bodies(model: mujoco.MjModel) -> list[int]:
+    return sorted({int(body) for body in model.geom_bodyid[_shown_geoms(model)]})
+
+
+def _link(base: str, model: mujoco.MjModel, body: int) -> str:
+    return base + entity("links", model.body(body).name or f"body {body}")
+
+
+def _height(model: mujoco.MjModel) -> float:
+    """Return the height of the arm's label above the base, m: clear of the arm."""
+    return 0.85 * float(np.linalg.norm(model.body_pos[1:], axis=1).sum())
+
+
+def _poses(model: mujoco.MjModel, q: np.ndarray) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Return {body: ((T, 3) m, (T, 4) quaternion x y z w)} in the base frame at q (T, n)."""
+    data = mujoco.MjData(model)
+    position, quaternion = np.empty((len(q), model.nbody, 3)), np.empty((len(q), model.nbody, 4))
+    for k, angles in enumerate(q):
+        data.qpos[:] = angles
+        mujoco.mj_kinematics(model, data)
+        position[k], quaternion[k] = data.xpos, np.roll(data.xquat, -1, axis=1)
+    return {body: (position[:, body], quaternion[:, body]) for body in _shown_bodies(model)}
+
+
+def _shapes(stream: rr.RecordingStream, model: mujoco.MjModel, body: int, path: str, colour: str) -> None:
+    """Log the geoms of one link in its frame; dark geoms (joints) take the arm's colour."""
+    for geom in _shown_geoms(model)[model.geom_bodyid[_shown_geoms(model)] == body]:
+        own = 255 * model.geom_rgba[geom, :3]
+        own = rgb(colour) if own.mean() < 100 else own
+        shape = _shape(model, int(geom), own.astype(np.uint8))
+        if shape is None:
+            continue
+        frame = f"{path}/geom{geom}"
+        quaternion = np.roll(model.geom_quat[geom], -1)
+        stream.log(frame, rr.Transform3D(translation=model.geom_pos[geom], quaternion=quaternion), static=True)
+        stream.log(frame, shape, static=True)
+
+
+def _shape(model: mujoco.MjModel, geom: int, colour: np.ndarray) -> rr.AsComponents | None:
+    """Return a geom as a shape of rerun in the geom's frame, None for a type without one (plane, height field)."""
+    radius, half, _ = size = model.geom_size[geom]
+    kind = mujoco.mjtGeom
+    solid: dict[str, Any] = {"colors": colour, "fill_mode": rr.components.FillMode.Solid}
+    match int(model.geom_type[geom]):
+        case kind.mjGEOM_CAPSULE:
+            below = [[0, 0, -half]]  # rerun's capsule starts at its frame, MuJoCo's is centred on it
+            return rr.Capsules3D(lengths=2 * half, radii=radius, translations=below, **solid)
+        case kind.mjGEOM_CYLINDER:
+            return rr.Cylinders3D(lengths=2 * half, radii=radius, **solid)
+        case kind.mjGEOM_SPHERE:
+            return rr.Ellipsoids3D(radii=[radius], **solid)
+        case kind.mjGEOM_ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=size, **solid)
+        case kind.mjGEOM_BOX:
+            return rr.Boxes3D(half_sizes=size, **solid)
+        case kind.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+            faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
+            return rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=colour)
+    return None

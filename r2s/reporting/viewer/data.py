@@ -1,0 +1,102 @@
+"""Content of a recording: episodes, torques, learning curves, figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from r2s.tasks.measures import Measure, MeasureTable
+from r2s.tasks.rollout import Episodes
+
+SHOWN = 4  # episodes of a recording or figure, as in the paper's
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of one arm; positions are in the arm's base frame.
+
+    Attributes:
+        t: (T,) s. q: (T, n) rad. ee: (T, 3) m. goal: (3,) m, or (T, 3) of a path. tau: (T, n) Nm, commanded.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    ee: np.ndarray
+    goal: np.ndarray
+    tau: np.ndarray
+
+    @property
+    def moves(self) -> bool:
+        """Whether the goal is a path."""
+        return self.goal.ndim == 2
+
+    @property
+    def distance(self) -> np.ndarray:
+        """(T,) m from the end effector to the goal, or to the path's current point."""
+        return np.linalg.norm(self.ee - self.goal, axis=-1)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first row to the last."""
+        return float(self.t[-1] - self.t[0])
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Measured (T, n) Nm and predicted {label: (T, n) Nm} torque over t (T,) s."""
+
+    t: np.ndarray
+    measured: np.ndarray
+    predicted: dict[str, np.ndarray]
+
+    @classmethod
+    def load(cls, run: Path) -> "Overlay":
+        """Return what stage=identify saved as torque.npz of its run folder."""
+        with np.load(run / "torque.npz", allow_pickle=False) as saved:
+            return cls(saved["t"], saved["measured"], {k: saved[k] for k in ("nominal", "identified")})
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a recording shows; the layout has tabs for the given parts only.
+
+    Attributes:
+        measures: of the task, for `episodes` and `curves`.
+        episodes: {label: episodes}, one arm per label; all k-th episodes start together.
+        overlays: {label: Overlay}, a tab of torque plots each.
+        curves: {run: evaluations.csv}, which share a tab.
+        figures: {name: PNG}, a tab each; "learning" joins the tab of the curves.
+        torque: (n,) Nm, limits drawn beside the commanded torque.
+    """
+
+    measures: MeasureTable | None = None
+    episodes: Mapping[str, Sequence[Episode]] = field(default_factory=dict)
+    overlays: Mapping[str, Overlay] = field(default_factory=dict)
+    curves: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    figures: Mapping[str, Path] = field(default_factory=dict)
+    torque: np.ndarray | None = None
+
+    @property
+    def learning(self) -> list[Measure]:
+        """Measures of the learning figure and of comparisons that some run has."""
+        table = self.measures
+        if table is None:
+            return []
+        keys = dict.fromkeys((*table.curves, *table.comparison))
+        return [table[key] for key in keys if any(key in curve for curve in self.curves.values())]
+
+
+def first(e: Episodes) -> list[Episode]:
+    """Return the first `SHOWN` episodes."""
+    return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i]) for i in range(min(SHOWN, len(e.goal)))]
+
+
+def saved_episodes(run: Path) -> dict[str, list[Episode]]:
+    """Return {simulator or arm: its first episodes} of a run of stage=transfer; empty for other runs."""
+    out = {}
+    for path in sorted(run.glob("episodes_*.npz")):
+        with np.load(path, allow_pickle=False) as saved:
+            out[path.stem.removeprefix("episodes_")] = first(Episodes(**saved))
+    return out

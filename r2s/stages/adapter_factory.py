@@ -1,0 +1,89 @@
+"""The adapter of conf/adapt, made with the identified model of the arm."""
+
+import filecmp
+from dataclasses import replace
+from pathlib import Path
+
+from r2s.errors import UserError
+from r2s.stages.build import loaded, part, plain
+
+RECORDINGS = ("train.npz", "validation.npz")  # of an identification
+PARAMETERS = "parameters.yaml"
+TORQUE = "commanded"  # adapters compare the commanded torque with the motion
+BESIDE = ("calibration",)  # key of conf/adapt that is no argument of the adapter
+
+
+def calibrated(calibration, robot):
+    """Return the identified dynamics, and posterior draws and recordings without a payload, each None if missing."""
+    from r2s.identification.parameter_file import load_parameters, load_posterior
+    from r2s.recordings.readers import read
+
+    space, x = load_parameters(calibration, robot)
+    folder = run_folder(calibration)
+    posterior = (space, load_posterior(folder, space)) if (folder / "posterior.npz").is_file() else None
+    unloaded = None
+    if all((folder / name).is_file() for name in RECORDINGS):
+        unloaded = tuple(read(folder / name, torque=TORQUE) for name in RECORDINGS)
+    return space.dynamics(x), posterior, unloaded
+
+
+def with_declared_payload(cfg, robot, dynamics):
+    """Return the dynamics with arm.declared_payload in the gravity compensation."""
+    from r2s.physics.payload import mass_and_moment, payload_of
+
+    key = "declared_payload"
+    if not cfg.arm.get(key):
+        return dynamics
+    return replace(dynamics, declared_payload=mass_and_moment(robot, payload_of(plain(cfg.arm)[key], f"arm.{key}")))
+
+
+def make_adapter(cfg, robot, source):
+    """Return the adapter of conf/adapt under the policy of the run folder `source`, or None for adapt=none.
+
+    Its model is adapt.calibration=, or the one the policy was trained on.
+
+    Raises:
+        UserError: no arm, no identified model, or a model identified from another torque than the commanded one.
+    """
+    from r2s.adaptation.adapters import AdapterContext
+
+    if "_target_" not in cfg.adapt:
+        return None
+    name = f"adapt={cfg.adapt.name}"
+    if cfg.arm.name == "none":
+        raise UserError(f"{name}: an adapter needs an arm, got arm=none; give another arm=, or adapt=none")
+    folder = calibration_of(cfg, source)
+    torque = (loaded(folder / PARAMETERS).get("source") or {}).get("torque", TORQUE)
+    if torque != TORQUE:
+        raise UserError(f"{name}: expected a model identified with data.torque={TORQUE}, got {torque} ({folder})")
+    dynamics, posterior, unloaded = calibrated(folder, robot)
+    if unloaded is None:
+        print(f"{name}: {folder} has no recordings; the uncertainty of its model comes from priors")
+    dynamics = with_declared_payload(cfg, robot, dynamics)
+    return part(cfg.adapt, "adapt", AdapterContext(robot, dynamics, posterior, unloaded), beside=BESIDE)
+
+
+def calibration_of(cfg, source):
+    """Return the run folder with the adapter's model: adapt.calibration, or the one of the policy's training.
+
+    A training keeps the model without the recordings; the identification's own folder has both, if it still exists.
+    """
+    if cfg.adapt.get("calibration"):
+        folder = run_folder(cfg.adapt.calibration)
+        if not (folder / PARAMETERS).is_file():
+            raise UserError(f"adapt.calibration: '{cfg.adapt.calibration}' is no run folder of stage=identify")
+        return folder
+    first = loaded(source / "config.yaml").calibration
+    if not first:
+        raise UserError(
+            f"adapt={cfg.adapt.name}: the policy of {source} has no identified model; give "
+            "adapt.calibration=RUN_FOLDER of stage=identify"
+        )
+    first = Path(first)
+    same = (first / PARAMETERS).is_file() and filecmp.cmp(first / PARAMETERS, source / PARAMETERS, shallow=False)
+    return first if same else source
+
+
+def run_folder(path):
+    """Return the folder of a path to a run folder or to a file in it."""
+    return Path(path) if Path(path).is_dir() else Path(path).parent

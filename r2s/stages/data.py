@@ -1,0 +1,245 @@
+"""Training motion, validation motion and breakaway ramps of stage=identify, from files or recorded on an arm."""
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from r2s.errors import Stopped, UserError, check_number
+from r2s.files import located
+from r2s.stages.build import opened_source
+from r2s.stages.parts import called, plain
+
+MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as the path to a start
+
+
+@dataclass(frozen=True)
+class ArmData:
+    """Motion to record on an arm: data=arm.
+
+    Attributes:
+        torque: level of the recorded torque, commanded or measured.
+        seconds: of each of the two motions.
+        excitation_seed: of the first motion, and 1 more of the second.
+        excitation: file of the first motion; None: it is optimized.
+        ramp_poses: postures at which every joint is ramped both ways; 0: no ramps.
+
+    Raises:
+        UserError: a number outside its range.
+    """
+
+    kind: str
+    torque: str
+    seconds: float
+    excitation_seed: int
+    excitation: str | None
+    ramp_poses: int
+
+    def __post_init__(self):
+        from r2s.excitation.fourier import LEAST_S, LONGEST_S
+
+        check_number("data.seconds", self.seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
+        check_number("data.excitation_seed", self.excitation_seed, "[0, inf)", whole=True)
+        check_number("data.ramp_poses", self.ramp_poses, "[0, inf)", whole=True)
+        if self.torque not in ("commanded", "measured"):
+            raise UserError(f"data.torque: expected commanded or measured, got '{self.torque}'")
+
+
+@dataclass(frozen=True)
+class SimulatedData(ArmData):
+    """Motion to record on a simulated arm of known dynamics: data=simulated.
+
+    Attributes:
+        truth: its dynamics (`make_truth`). delay, lag: s, of its actuation.
+        position_noise, velocity_noise: standard deviations of its sensors, rad and rad/s.
+    """
+
+    truth: str
+    delay: float
+    lag: float
+    position_noise: float
+    velocity_noise: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        for name in ("delay", "lag", "position_noise", "velocity_noise"):
+            check_number(f"data.{name}", getattr(self, name), "[0, inf)")
+
+
+@dataclass(frozen=True)
+class FileData:
+    """The user's own recording: data=recording; see `read` of r2s/recordings/readers.py and conf/data/recording.yaml.
+
+    Raises:
+        UserError: a number outside its range.
+    """
+
+    kind: str
+    path: str
+    torque: str | None
+    torque_constant: list[float] | float | None
+    validation: str | None
+    ramps: str | None
+    period: float | None
+    max_gap_s: float
+    columns: dict[str, str | None]
+    topic: str | None
+    joints: list[str] | None
+
+    def __post_init__(self):
+        check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
+        if self.period is not None:
+            check_number("data.period", self.period, "(0, inf)")
+
+    @property
+    def files(self) -> list[Path | str]:
+        """All files of the recordings and ramps."""
+        from r2s.recordings.readers import files_of
+
+        motion = [f for path in (self.path, self.validation) if path for f in files_of(path)]
+        return [*motion, *([self.ramps] if self.ramps else [])]
+
+
+def file_data(cfg):
+    """Return the `FileData` of a config; keys that only other kinds of data have are ignored."""
+    own = {f.name for f in fields(FileData)}
+    given = {k: v for k, v in plain(cfg.data).items() if k in own}
+    given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
+    return called(FileData, "data", given)
+
+
+def read_motion(robot, file, share):
+    """Return training and validation motion of a `FileData`; they must not have motion in common.
+
+    Args:
+        share: of the recording that is held out without a validation file.
+    """
+    import numpy as np
+
+    from r2s.identification.checks import check_recording
+    from r2s.recordings.readers import read
+
+    keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    how = {k: getattr(file, k) for k in keys}
+    how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
+    recording = read(file.path, **how)
+    check_recording(robot, recording)
+    if file.period is None and (periodic := recording.in_phase()) is not recording:
+        recording = periodic
+        if not file.validation:
+            print(f"the motion repeats after {recording.period:.2f} s: validation holds out a phase of every period")
+    if not file.validation:
+        return recording.split(share)
+    if os.path.realpath(file.validation) == os.path.realpath(file.path):
+        raise UserError("data.validation is the training file itself: it must hold other motion")
+    validation = read(file.validation, **how)
+    check_recording(robot, validation)
+    rows = {row.tobytes() for row in np.column_stack([recording.q, recording.dq])}
+    same = sum(row.tobytes() in rows for row in np.column_stack([validation.q, validation.dq]))
+    if same > 0.01 * len(validation.t):
+        raise UserError(
+            f"data.validation: {same} of its {len(validation.t)} rows are rows of the training file; it must hold "
+            "other motion"
+        )
+    if (overlap := validation.overlap(recording)) > MAX_OVERLAP:
+        raise UserError(
+            f"data.validation: {100 * overlap:.0f} % of its motion repeats the training file; it must hold other "
+            "motion (to hold out a part of a periodic motion, leave data.validation=null)"
+        )
+    return recording, validation
+
+
+def read_user_ramps(robot, file):
+    """Return the ramps of a `FileData`, or None; their columns have the names of the recording's."""
+    from r2s.identification.checks import check_ramps
+    from r2s.recordings.ramps import read_ramps
+
+    if not file.ramps:
+        return None
+    columns = dict(file.columns)
+    if file.torque != "commanded":
+        columns["tau"] = None  # it names another torque; ramps are of the command
+    ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
+    check_ramps(robot, ramps)
+    return ramps
+
+
+def ramp_poses(cfg, robot):
+    """Return the postures (., n) rad of the ramps; raise UserError if no path leads there."""
+    from r2s.arm.ramp import check_paths, poses_about
+
+    poses = poses_about(robot, cfg.data.ramp_poses if cfg.data.torque == "commanded" else 0)
+    if len(poses):
+        check_paths(robot, poses, what="data.ramp_poses")
+    return poses
+
+
+def record_motion(cfg, robot, motion, k, label):
+    """Return the k-th recording of an arm, of a given motion or of one optimized for data.seconds."""
+    from r2s.arm.recorder import record
+    from r2s.excitation.fourier import fourier
+    from r2s.progress import Progress
+
+    progress = Progress(label)
+    if motion is None:
+        seed, gravity = cfg.data.excitation_seed + k, cfg.data.torque == "measured"
+        motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=gravity)
+    with opened_source(cfg, robot, k) as arm:  # one client at a time
+        out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+    progress.close(f"{out.duration:.1f} s of motion")
+    return motion, out
+
+
+def record_ramps(cfg, robot):
+    """Return the ramps of the breakaway protocol about the home posture, or None for data.ramp_poses=0."""
+    from r2s.arm.ramp import ramp
+    from r2s.progress import Progress
+
+    poses = ramp_poses(cfg, robot)
+    if not len(poses):
+        return None
+    progress = Progress("ramp the joints until they move")
+    with opened_source(cfg, robot, 2) as arm:
+        out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
+    progress.close(f"{out.recording.duration:.1f} s of ramps")
+    return out
+
+
+def record_arm(cfg, robot, run, motion):
+    """Return training motion, validation motion and ramps of an arm; a resumed run reads the files that it has.
+
+    Args:
+        run: the run folder of the files. motion: the first excitation; None: it is optimized.
+
+    Raises:
+        Stopped: the arm was stopped; the motion so far is <name>_until_stop.npz.
+    """
+    from r2s.arm.interface import ArmStopped
+    from r2s.recordings.ramps import read_ramps
+    from r2s.recordings.readers import read
+
+    def one(name, motion, k):
+        path = run.folder / f"{name}.npz"
+        if not path.is_file():
+            try:
+                motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
+            except ArmStopped as stop:
+                if stop.recording is not None:
+                    stop.recording.save(run.folder / f"{name}_until_stop.npz")
+                raise
+            motion.save(run.folder / f"excitation_{name}.csv")
+            out.save(path)
+        return read(path, torque=cfg.data.torque)
+
+    try:
+        train = one("train", motion, 0)
+        validation = one("validation", None, 1)
+        path = run.folder / "ramps.npz"
+        ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot)
+        if ramps is not None and not path.is_file():
+            ramps.save(path)
+    except ArmStopped as stop:
+        done = [name for name in ("train", "validation") if (run.folder / f"{name}.npz").is_file()]
+        kept = f"{' and '.join(done)} motion is kept, " if done else ""
+        raise Stopped(f"while the arm was recorded: {stop}; {kept}resume={run.folder} goes on") from None
+    return train, validation, ramps

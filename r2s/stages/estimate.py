@@ -1,0 +1,137 @@
+"""stage=estimate: payload, friction and offsets of a working arm or of a recording, cycle by cycle."""
+
+from dataclasses import replace
+
+from r2s.errors import Stopped, UserError, check_number, nearest
+from r2s.files import located
+from r2s.stages.adapter_factory import calibrated, with_declared_payload
+from r2s.stages.build import called, check_source, make_dynamics, make_robot, open_run, opened_source, plain
+
+WHY = {
+    "arm": "only data=arm moves an arm",
+    "friction": "calibration= sets the friction",
+    "inertia": "calibration= sets the links",
+}
+LIMIT_SHARE = 0.6  # of the speed and acceleration limits, for motion with an unknown payload
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    keys = {"robot", "calibration", "data", "estimate"} | (set() if cfg.calibration else {"friction", "inertia"})
+    return keys | ({"arm"} if cfg.data.kind == "arm" else set())
+
+
+def estimate(cfg, overrides):
+    """Recording or arm -> estimate.csv, figures: payload, friction and offsets at every moment, with intervals."""
+    from r2s.adaptation.adapters import AdapterContext
+    from r2s.adaptation.estimator import Estimator
+    from r2s.adaptation.offline_estimation import estimate_recording, format_estimate, table
+    from r2s.reporting.estimate_page import draw_estimate, write_estimate_recording
+
+    check_number("estimate.every_s", cfg.estimate.every_s, "(0, inf)")
+    robot = make_robot(cfg)
+    recording = given_recording(cfg, robot)
+    dynamics, posterior, unloaded = make_dynamics(cfg, robot), None, None
+    if cfg.calibration:
+        dynamics, posterior, unloaded = calibrated(cfg.calibration, robot)
+    if cfg.data.kind == "arm":
+        dynamics = with_declared_payload(cfg, robot, dynamics)
+    inputs = [str(located(cfg.data.path))] if recording is not None else []
+    parents = [str(cfg.calibration)] if cfg.calibration else []
+    with open_run(cfg, overrides, inputs, parents=parents) as run:
+        if recording is None:
+            recording = record_arm(cfg, robot)
+            recording.save(run.folder / "recording.npz")
+        estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
+        printed = -float("inf")
+
+        def report(now):
+            nonlocal printed
+            if now.changed:
+                print(f"{now.t:7.2f} s  payload changed")
+            if now.t - printed >= cfg.estimate.every_s:
+                print(format_estimate(now))
+                printed = now.t
+
+        estimates = estimate_recording(robot, estimator, recording, report)
+        if not estimates:
+            raise UserError(f"data: {recording.duration:g} s are too short for an estimate")
+        rows, last = table(estimates), estimates[-1]
+        rows.to_csv(run.folder / "estimate.csv", index=False, float_format="%.6g")
+        source = "calibration" if unloaded else "priors"
+        run.summary({"seconds": recording.duration} | summary(last, estimator.changes) | {"noise_from": source})
+        draw_estimate(run.figure("payload"), run.figure("friction"), rows, estimator.changes)
+        write_estimate_recording(run.folder / "recording.rrd", rows)
+        print(format_estimate(last))
+    print(f"written: {run.folder}")
+
+
+def given_recording(cfg, robot):
+    """Return the recording of data=recording, with a row per millisecond; None if an arm makes one.
+
+    Raises:
+        UserError: no such file, another torque than the commanded one, or an arm that cannot be moved.
+    """
+    from r2s.adaptation.offline_estimation import at_rate
+    from r2s.recordings.readers import read
+    from r2s.stages.data import ArmData, SimulatedData
+
+    if cfg.data.kind != "recording":
+        called(SimulatedData if cfg.data.kind == "simulated" else ArmData, "data", plain(cfg.data))
+    if cfg.data.torque != "commanded":
+        raise UserError(f"data.torque: expected commanded for stage=estimate, got {cfg.data.torque}")
+    if cfg.data.kind != "recording":
+        check_source(cfg, robot)
+        return None
+    path = located(cfg.data.path)
+    if not path.exists():
+        near = nearest(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
+        raise UserError(f"data.path: no such file: {path}{near}")
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    settings = {k: plain(cfg.data)[k] for k in ("torque", "columns", "max_gap_s", "topic", "joints")}
+    recording = read(str(path), **settings, n_joints=robot.n, model_joints=names if all(names) else None)
+    return at_rate(robot, recording)
+
+
+def record_arm(cfg, robot):
+    """Return the recording of an arm that moves for data.seconds, or along data.excitation."""
+    from r2s.arm.interface import ArmStopped
+    from r2s.arm.recorder import record
+    from r2s.excitation.fourier import fourier
+    from r2s.excitation.motion import load
+    from r2s.progress import Progress
+
+    if cfg.data.excitation:
+        motion = load(cfg.data.excitation, robot)
+    else:
+        slow = replace(robot, dq_max=LIMIT_SHARE * robot.dq_max, ddq_max=LIMIT_SHARE * robot.ddq_max)
+        motion = fourier(slow, duration=cfg.data.seconds, seed=cfg.data.excitation_seed)
+    progress = Progress("record the arm")
+    try:
+        with opened_source(cfg, robot, 0) as arm:
+            out = record(arm, motion, loaded=True, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+    except ArmStopped as stop:
+        if stop.recording is None:
+            raise Stopped(f"while the arm was recorded: {stop}") from None
+        progress.close(f"stopped: {stop}")
+        return stop.recording
+    progress.close(f"{out.duration:.1f} s of motion")
+    return out
+
+
+def summary(last, changes):
+    """Return the last estimate and the times of payload changes, for summary.json."""
+    centre = [None if c != c else round(float(c), 5) for c in (*last.centre, *last.centre_half)]  # nan is no JSON
+    return {
+        "mass_kg": last.mass,
+        "mass_kg_half": last.mass_half,
+        "centre_m": centre[:3],
+        "centre_m_half": centre[3:],
+        "inertia_kg_m2": last.tensor.tolist(),
+        "friction": last.friction.tolist(),
+        "friction_half": last.friction_half.tolist(),
+        "offset_Nm": last.offset.tolist(),
+        "offset_Nm_half": last.offset_half.tolist(),
+        "rests": last.rests,
+        "changes_s": changes,
+    }

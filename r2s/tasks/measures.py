@@ -1,0 +1,161 @@
+"""The measures of a task: key, unit, direction, and how tables and figures show them.
+
+A task class names its `measure_table`. Training and transfer write it into their run folder as measures.json, so that
+tables, pages and comparisons read a folder without the task's class.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError, choices, nearest
+from r2s.files import atomic_write
+
+FILE = "measures.json"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One measure of a policy's episodes, a column of evaluations.csv.
+
+    Attributes:
+        key: column of evaluations.csv. short: column heading of a table. title: name in figures and sentences.
+        unit: unit of the shown value, "" if dimensionless. scale: shown value / stored value.
+        digits: decimals shown. lower_is_better: direction.
+        root_mean_square: several values are averaged as the root of their mean square.
+    """
+
+    key: str
+    short: str
+    title: str
+    unit: str = ""
+    scale: float = 1.0
+    digits: int = 1
+    lower_is_better: bool = False
+    root_mean_square: bool = False
+
+    @property
+    def column(self) -> str:
+        """Short name and unit, for a table."""
+        return f"{self.short}, {self.unit}" if self.unit else self.short
+
+    @property
+    def heading(self) -> str:
+        """Title and unit, for a figure."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
+    @property
+    def sign(self) -> float:
+        """-1 if lower is better, else 1."""
+        return -1.0 if self.lower_is_better else 1.0
+
+    def cell(self, value: float | None, digits: int | None = None) -> str:
+        """Return a stored value as shown; "-" if it is missing or not finite."""
+        if value is None or not isfinite(value):
+            return "-"
+        return f"{self.scale * value:.{self.digits if digits is None else digits}f}"
+
+    def in_words(self, value: float | None) -> str:
+        """Return "success at 1 cm 98 %"."""
+        return f"{self.title} {self.cell(value)} {self.unit}".strip()
+
+
+# measures of any task: transfer gap (r2s/tasks/rollout.py), safety filter, limits and stops
+COMMON = (
+    Measure("ee_path_rmse_mm", "path gap", "path gap to the prediction", "mm", 1, 2, True, root_mean_square=True),
+    Measure("tau_rmse_Nm", "torque gap", "torque gap to the prediction", "Nm", 1, 2, True, root_mean_square=True),
+    Measure("limited", "filter active", "cycles changed by the safety filter", "%", 100, 1, True),
+    Measure("q_left_rad", "limit margin", "margin to the position limits", "rad", 1, 2),
+    Measure("collision", "collisions", "episodes that end in a collision", "%", 100, 1, True),
+    Measure("stops", "stops", "stops of the arm", digits=0, lower_is_better=True),
+)
+GAP = COMMON[0]
+
+
+@dataclass(frozen=True)
+class MeasureTable:
+    """The measures of a task, and which of them each table and figure shows. Entries of the lists are keys.
+
+    Attributes:
+        measures: the task's own; COMMON are known besides.
+        selection: what trainings are compared by. The first must exist in a row, the last ranks groups.
+        rows: columns of the table with a row per simulator and arm.
+        comparison: columns of the table of trainings. curves: panels of the learning figure.
+        scores: panels of the figure of scores.
+        transfer: measures of a transfer to an arm, which adapters are compared by, episode by episode.
+        diagnostics: columns of a transfer's second table.
+        corner: heading of the row labels. description: what a policy does, in one sentence.
+        error: name, unit and scale of `Episodes.distance`. error_levels: lines in its figure, in that unit.
+        reward: name of `Episodes.reward`.
+
+    Empty lists take `selection`; `rows` and `diagnostics` take all measures and COMMON.
+    """
+
+    measures: tuple[Measure, ...]
+    selection: tuple[str, ...]
+    rows: tuple[str, ...] = ()
+    comparison: tuple[str, ...] = ()
+    curves: tuple[str, ...] = ()
+    scores: tuple[str, ...] = ()
+    transfer: tuple[str, ...] = ()
+    diagnostics: tuple[str, ...] = ()
+    corner: str = ""
+    description: str = ""
+    error: Measure = Measure("distance", "distance", "distance to the goal", "cm", 100.0, lower_is_better=True)
+    error_levels: tuple[float, ...] = (5.0, 2.0, 1.0)
+    reward: str = "reward"
+
+    def __post_init__(self) -> None:
+        if not self.selection:
+            raise UserError("measure_table.selection: expected at least one key, got none")
+        own = tuple(m.key for m in self.measures)
+        defaults = {"rows": own, "diagnostics": tuple(m.key for m in COMMON)}
+        for name in ("selection", "rows", "comparison", "curves", "scores", "transfer", "diagnostics"):
+            keys = getattr(self, name) or defaults.get(name, self.selection)
+            object.__setattr__(self, name, keys)
+            for key in keys:
+                if key not in self.known:
+                    raise UserError(
+                        f"measure_table.{name}: no measure '{key}'; allowed: {choices(self.known)}"
+                        f"{nearest(key, self.known)}"
+                    )
+
+    @property
+    def known(self) -> dict[str, Measure]:
+        """{key: Measure}, COMMON included."""
+        return {m.key: m for m in (*COMMON, *self.measures)}
+
+    def __getitem__(self, key: str) -> Measure:
+        return self.known[key]
+
+    def in_words(self, row: Mapping[str, Any]) -> list[str]:
+        """Return the measures of selection that a row has: ["success at 1 cm 98 %", ...]."""
+        return [self[key].in_words(float(row[key])) for key in self.selection if row.get(key) not in (None, "")]
+
+
+def write_measures(folder: Path, table: MeasureTable) -> None:
+    """Write measures.json into a run folder."""
+    with atomic_write(folder / FILE) as part:
+        part.write_text(json.dumps(asdict(table), indent=1) + "\n")
+
+
+def read_measures(folder: Path) -> MeasureTable | None:
+    """Return the table in measures.json of a run folder, None if there is no such file.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    try:
+        saved: dict[str, Any] = json.loads(path.read_text())
+        fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in saved.items()}
+        fields["measures"] = tuple(Measure(**m) for m in saved["measures"])
+        fields["error"] = Measure(**saved["error"])
+        return MeasureTable(**fields)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UserError(f"{path} is damaged: {error}") from None

@@ -1,0 +1,222 @@
+"""The one rollout of a policy, for simulators and arms, and the measures of reaching."""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from r2s.physics.collision import CollisionCheck
+from r2s.physics.robot import Robot
+from r2s.tasks.task import Episodes, State, Task, observe
+
+HOLD_S = 0.5  # s at the end of an episode in which the end effector has to stay within a distance (design: success)
+REST = 0.05  # rad/s, below which a joint is at rest
+
+
+class PolicyLike(Protocol):
+    """A policy, or the model-based controllers of r2s/learning/model_based.py."""
+
+    def action(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return actions (B, a) in [-1, 1] for observations (B, d)."""
+        ...
+
+
+class Arms(Protocol):
+    """Arms that run episodes, one control period at a time: a batch, one arm in an engine, or a real arm.
+
+    Attributes:
+        robot: of each arm. width: number of episodes that run at once.
+        speeds: (width, T, n) rad/s after each control step of the finished episodes, with the measurement noise
+            smoothed out; None if speeds have no noise.
+    """
+
+    @property
+    def robot(self) -> Robot: ...  # noqa: D102 (see the class)
+    @property
+    def width(self) -> int: ...  # noqa: D102
+    @property
+    def speeds(self) -> np.ndarray | None: ...  # noqa: D102
+
+    def place(self, starts: np.ndarray, first: int) -> State:
+        """Begin the episodes first, first + 1, ... at rest at starts (width, n) rad."""
+        ...
+
+    def step(self, command: np.ndarray) -> State:
+        """Run one control period with the commands (width, c) of the controller; a stopped arm stays stopped."""
+        ...
+
+    def end(self) -> np.ndarray:
+        """End the episodes; return (width,), which of them had stopped before."""
+        ...
+
+
+@torch.no_grad()
+def rollout(
+    policy: PolicyLike,
+    arms: Arms,
+    task: Task,
+    starts: np.ndarray,
+    goals: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Episodes:
+    """Run one episode per goal.
+
+    A stop ends an episode, and so does a contact of the arm with itself or the table (r2s/physics/collision.py),
+    except `task.may_touch`. Contacts are checked after every control step. The episode keeps its last state,
+    and its last distance is infinite.
+
+    Args:
+        policy: observation -> action. arms: simulated or real. task: with its controller.
+        starts: (E, n) rad. goals: (E, ...), see `Task.goals`; E a multiple of the arms' width.
+        progress: callback with the number of finished episodes and their total.
+    """
+    robot, count, shape = arms.robot, len(goals), (len(goals), task.steps)
+    torque, controller = task.torque_limit(robot), task.control(robot)
+
+    def act(state: State, goals: np.ndarray) -> np.ndarray:
+        observation = torch.from_numpy(observe(task, controller, state, goals, torque))
+        action = policy.action(observation).numpy().astype(np.float64)
+        return controller.command(action, task, state.t, goals)
+
+    # compile and load everything once before an arm moves
+    home = State.at_home(robot)
+    act(home, goals[:1])
+    task.judge(home, home.dq, goals[:1], task.distance_scale(home, goals[:1]))
+    q, dq, tau = (np.zeros((*shape, robot.n)) for _ in range(3))
+    distance, reward, reward_smooth = (np.zeros(shape) for _ in range(3))
+    out = Episodes(
+        t=(1 + np.arange(task.steps)) / task.ctrl_hz, q=q, dq=dq, ee=np.zeros((*shape, 3)), tau=tau,
+        goal=task.goal_positions(goals), distance=distance, reward=reward, reward_smooth=reward_smooth,
+        q_left=np.zeros(count), limited=np.zeros(count), collision=np.full(count, "", dtype=object),
+    )  # fmt: skip
+    contacts = CollisionCheck(robot, table=None, may_touch=task.may_touch)
+    for first in range(0, count, arms.width):
+        now = slice(first, first + arms.width)
+        _run(act, arms, task, arms.place(starts[now], first), goals[now], now, contacts, out)
+        progress(min(first + arms.width, count), count)
+    q_left = np.minimum(q - robot.q_min, robot.q_max - q).min((1, 2))
+    return replace(out, q_left=q_left, collision=np.array(out.collision.tolist()))
+
+
+def _run(
+    act: Callable[[State, np.ndarray], np.ndarray],
+    arms: Arms,
+    task: Task,
+    state: State,
+    goals: np.ndarray,
+    now: slice,
+    contacts: CollisionCheck,
+    out: Episodes,
+) -> None:
+    """Run the episodes `now` from their first state, and write them into `out`."""
+    weights, scale, before = task.paper_weights, task.distance_scale(state, goals), state.dq.copy()
+    over = np.zeros(arms.width, dtype=bool)  # ended by a contact
+    for k in range(task.steps):
+        if not (state.stopped | over).all():
+            state = arms.step(act(state, goals))
+        if over.any():
+            state = _kept(state, over, *(x[now, k - 1] for x in (out.q, out.dq, out.ee, out.tau)))
+        ddq = (state.dq - before) * task.ctrl_hz
+        out.distance[now, k], terms = task.judge(state, ddq, goals, scale)
+        out.reward[now, k] = terms @ weights
+        out.limited[now] += state.limited / task.steps
+        out.q[now, k], out.dq[now, k], out.ee[now, k], out.tau[now, k] = state.q, state.dq, state.ee, state.tau
+        before = out.dq[now, k]
+        hit = np.where(over | state.stopped, -1, contacts.first_contact(state.q))
+        for i in np.flatnonzero(hit >= 0):
+            out.collision[now.start + i] = f"{(1 + k) / task.ctrl_hz:.2f} s: {contacts.names[hit[i]]}"
+        over |= hit >= 0
+    stopped = arms.end() | over
+    out.reward_smooth[now] = out.reward[now]
+    if arms.speeds is not None:
+        rate = np.diff(arms.speeds, axis=1, prepend=0.0) * task.ctrl_hz
+        for k in range(task.steps):
+            t, q, ee, tau = (
+                np.full(arms.width, (k + 1) / task.ctrl_hz),
+                *(x[now, k] for x in (out.q, out.ee, out.tau)),
+            )
+            then = replace(state, t=t, q=q, dq=arms.speeds[:, k], ee=ee, tau=tau)
+            out.reward_smooth[now, k] = task.judge(then, rate[:, k], goals, scale)[1] @ weights
+    out.distance[now, -1][stopped] = np.inf  # success requires an arm that still runs
+
+
+def _kept(state: State, over: np.ndarray, *last: np.ndarray) -> State:
+    """Return the state with the last q, dq, ee and tau of those arms whose episode is `over` (m,)."""
+    names, here = ("q", "dq", "ee", "tau"), over[:, None]
+    kept = {name: np.where(here, then, getattr(state, name)) for name, then in zip(names, last, strict=True)}
+    return replace(state, limited=np.where(over, 0.0, state.limited), **kept)
+
+
+def measures(episodes: Episodes) -> dict[str, float]:
+    """Return one row of evaluations.csv.
+
+    success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
+    of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: without the noise of measured
+    speeds, which eq. (2) takes for accelerations. time_to_reach_s: median time after which the
+    hand stays within 2 cm, of the episodes that got there. overshoot_m: how far out of 2 cm it came again after it
+    had first been within, mean of those that had. rest: share of episodes in which every joint is slower than REST
+    for the whole last 0.5 s: a hand can lie on a joint's axis. q_left_rad: how close joints come to position limits,
+    the 5 % quantile over episodes. limited: share of the cycles in which the driver's law changed what was asked for.
+    collision: share of episodes that ended because the arm touched itself or the table.
+    """
+    step = episodes.t[1] - episodes.t[0]
+    hold = round(HOLD_S / step)
+    last = episodes.distance[:, -hold:]
+    away = episodes.distance > 0.02
+    steps = episodes.distance.shape[1]
+    since = np.where(away.any(1), steps - np.argmax(away[:, ::-1], axis=1), 0)
+    there = since < steps
+    first = np.argmin(away, axis=1)
+    later = [
+        max(0.0, row[k:-1].max(initial=0.0) - 0.02)
+        for row, k, out in zip(episodes.distance, first, away, strict=True)
+        if not out.all()
+    ]
+    return {
+        "success_5cm": float((last.max(1) < 0.05).mean()),
+        "success_2cm": float((last.max(1) < 0.02).mean()),
+        "success_1cm": float((last.max(1) < 0.01).mean()),
+        "success_5mm": float((last.max(1) < 0.005).mean()),
+        "distance_median_m": float(np.median(last.mean(1))),
+        "return_paper": float(episodes.reward.sum(1).mean()),
+        "return_smooth": float(episodes.reward_smooth.sum(1).mean()),
+        "time_to_reach_s": float(np.median(since[there]) * step) if there.any() else float("nan"),
+        "overshoot_m": float(np.mean(later)) if later else float("nan"),
+        "rest": float((np.abs(episodes.dq[:, -hold:]).max((1, 2)) < REST).mean()),
+        "q_left_rad": float(np.quantile(episodes.q_left, 0.05)),
+        "limited": float(episodes.limited.mean()),
+        "collision": float((episodes.collision != "").mean()),
+    }
+
+
+def gap(one: Episodes, other: Episodes) -> dict[str, float]:
+    """Return how far apart one policy came out on the same goals: RMSE of the hand's path, mm, and of torques, Nm."""
+    path = np.linalg.norm(one.ee - other.ee, axis=-1)
+    return {
+        "ee_path_rmse_mm": float(1e3 * np.sqrt((path**2).mean())),
+        "tau_rmse_Nm": float(np.sqrt(((one.tau - other.tau) ** 2).mean())),
+    }
+
+
+def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
+    """Return the episodes at these indices."""
+    return replace(episodes, **{f.name: getattr(episodes, f.name)[which] for f in fields(episodes) if f.name != "t"})
+
+
+def episode_measures(task: Task, episodes: Episodes, predicted: Episodes | None = None) -> list[dict[str, float]]:
+    """Return a row per episode: its measures, `gap` to the same episode of `predicted`, and whether it was stopped.
+
+    A stopped episode has no gap (nan).
+    """
+    rows = []
+    for k in range(len(episodes.goal)):
+        one = select_episodes(episodes, slice(k, k + 1))
+        stopped = not np.isfinite(one.distance).all()
+        row = task.measures(one) | {"arm_stopped": float(stopped)}
+        if predicted is not None:
+            apart = gap(one, select_episodes(predicted, slice(k, k + 1)))
+            row |= dict.fromkeys(apart, np.nan) if stopped else apart
+        rows.append(row)
+    return rows
