@@ -57,7 +57,7 @@ def test_a_world_without_the_arm_is_said(panda, dynamics, monkeypatch):
     monkeypatch.setattr(
         gazebo_standin.TestFixture, "on_pre_update", lambda self, call: setattr(self, "before", print)
     )
-    with pytest.raises(UserError, match="not loaded the arm"):
+    with pytest.raises(UserError, match="did not load the arm"):
         GazeboEngine(panda, dynamics, gazebo_standin)
 
 
