@@ -12,14 +12,14 @@ hostile ones.
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from r2s.arm.interface import ArmState
 from r2s.compiled import njit
 from r2s.physics.actuation import condition, low_pass_factor
-from r2s.physics.control_laws import BUILT_IN, chain, control_law, law_number, registered, torque_law
+from r2s.physics.control_laws import BUILT_IN, ControlLaw, chain, control_law, law_number, registered, torque_law
 from r2s.physics.newton_euler import WORK as DESK
 from r2s.physics.newton_euler import equations, links_of
 from r2s.physics.robot import SIM_DT, Robot
@@ -42,19 +42,6 @@ DQ_INSIDE = 0.95  # share of the velocity limits, where the arm is stopped
 STILL = 0.02  # rad/s, below which a joint is at rest
 ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE = range(5)  # values of `Memory.why`
-
-
-class ControlLaw(Protocol):
-    """A control law with its parameters; see r2s/control/controller.py."""
-
-    @property
-    def law(self) -> Callable: ...  # noqa: D102 (see the class)
-    @property
-    def parameters(self) -> np.ndarray: ...  # noqa: D102
-    @property
-    def command_size(self) -> int: ...  # noqa: D102
-    @property
-    def memory_size(self) -> int: ...  # noqa: D102
 
 
 class Memory(NamedTuple):

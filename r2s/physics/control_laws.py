@@ -17,11 +17,29 @@ parameters. The laws live here because numba keeps compiled code per room, and M
 
 from collections.abc import Callable
 from functools import cache
+from typing import Protocol
 
 import numpy as np
 from numba.extending import is_jitted
 
 from r2s.compiled import njit
+
+
+class ControlLaw(Protocol):
+    """A control law with its parameters; r2s/control/controller.py has it.
+
+    Attributes:
+        law: compiled. parameters: (p,). command_size, memory_size: numbers in a command and in the law's memory.
+    """
+
+    @property
+    def law(self) -> Callable: ...  # noqa: D102 (see the class)
+    @property
+    def parameters(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def command_size(self) -> int: ...  # noqa: D102
+    @property
+    def memory_size(self) -> int: ...  # noqa: D102
 
 
 @njit(cache=True, error_model="numpy")

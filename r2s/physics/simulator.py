@@ -6,7 +6,6 @@ of its own (r2s/physics/friction.py).
 """
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import mujoco
 import mujoco.batch
@@ -15,27 +14,10 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics import mujoco_callback as native
 from r2s.physics.actuation import low_pass_factor, steps_late
-from r2s.physics.control_laws import law_number
+from r2s.physics.control_laws import ControlLaw, law_number
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import principal_axes, set_links
 from r2s.physics.robot import SIM_DT, Robot
-
-
-class ControlLaw(Protocol):
-    """A control law with its parameters; see r2s/physics/control_laws.py.
-
-    Attributes:
-        law: compiled. parameters: (p,). command_size, memory_size: numbers in a command and in the law's memory.
-    """
-
-    @property
-    def law(self): ...  # noqa: D102 (see the class)
-    @property
-    def parameters(self) -> np.ndarray: ...  # noqa: D102
-    @property
-    def command_size(self) -> int: ...  # noqa: D102
-    @property
-    def memory_size(self) -> int: ...  # noqa: D102
 
 
 class Simulator:
