@@ -187,7 +187,7 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
 
 
 def renamed(override: str) -> str | None:
-    """Return one line with the current name of an override that uses an old one; None if its name is current."""
+    """Return a message with the new name for an override with an old name; None if the name is not old."""
     word = override.lstrip("+~")
     if word in RENAMED:
         return f"{word} is now {RENAMED[word]}"

@@ -175,10 +175,10 @@ def test_the_twin_lets_go_where_its_friction_does(panda, poses, seed):
     p = arm._hidden
     error = np.empty(len(ramps.joint))
     for k, (j, sign, pose) in enumerate(zip(ramps.joint, ramps.sign, poses[ramps.pose], strict=True)):
-        believed, true = arm._nominal.gravity_torque(pose), arm._engine.gravity_torque(pose)
+        nominal, true = arm._nominal.gravity_torque(pose), arm._engine.gravity_torque(pose)
         coulomb = p[lj.C_POS if sign > 0 else lj.C_NEG, j]
-        level = p[lj.BREAK, j] * coulomb + p[lj.MU, j] * abs(believed[j])
-        left = believed[j] - true[j] + p[lj.OFFSET, j] + lj.cable_drag(p, pose, j)
+        level = p[lj.BREAK, j] * coulomb + p[lj.MU, j] * abs(nominal[j])
+        left = nominal[j] - true[j] + p[lj.OFFSET, j] + lj.cable_drag(p, pose, j)
         error[k] = (sign * (found.value[k] + left) - level) / level
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert np.mean(np.abs(error) < 0.15) > 0.8
@@ -258,9 +258,9 @@ def test_friction_that_falls_slowly_is_let_go_of_in_time_once_the_slide_is_known
     ramps, known = falling()
     alone = estimate_breakaway(ramps)
     known = replace(known, misfit=alone.misfit)
-    told = estimate_breakaway(ramps, slide=known)
+    known_slide = estimate_breakaway(ramps, slide=known)
     assert -alone.value[0] > 0.9 + 2e-3
-    assert -told.value[0] == pytest.approx(0.9, abs=5e-4)
+    assert -known_slide.value[0] == pytest.approx(0.9, abs=5e-4)
     for other in (replace(known, level=known.level + 0.29), replace(known, kappa=np.array([np.nan]))):
         assert estimate_breakaway(ramps, slide=other).value[0] == alone.value[0]
 

@@ -99,7 +99,7 @@ def _solve(C, d, prior, A, b):
 
 @njit(cache=True, error_model="numpy")
 def apply_jump(filter, noise):
-    """Add the likeliest jump to the estimate, and discard all onsets."""
+    """Add the likeliest payload jump to the estimate, and discard all candidate times."""
     k, N = int(filter.log_odds[ONSET]), len(filter.x)
     A, b = np.empty((JUMP, JUMP)), np.empty(JUMP)
     _solve(filter.information[k], filter.vector[k], noise.prior, A, b)

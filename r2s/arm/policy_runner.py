@@ -31,7 +31,7 @@ class Timing:
     """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
 
     Attributes:
-        policy: from a state to the policy's command, once per control step. driver: computation of one command.
+        policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
         adapter: one update of the adapter, if there is one. period: from one command to the next.
     """
 

@@ -139,7 +139,7 @@ def _from_columns(table: Table, columns: dict[str, Spec], n_joints: int | None, 
 
 
 def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Return (T,) of values per row or per ramp; `ramp` (T,) is the ramp index of each row."""
+    """Return (T,) values, one per row, from values per row or per ramp; `ramp` (T,) is the ramp index of each row."""
     count = ramp[-1] + 1 if len(ramp) else 0
     if values.dtype.kind not in "iuf":
         raise UserError(f"column '{field}': expected numbers, got type {values.dtype}")

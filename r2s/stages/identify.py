@@ -32,7 +32,7 @@ def reads(cfg):
 
 
 def make_settings(cfg, torque):
-    """Return the `Settings` of an identification from this level of torque."""
+    """Return the `Settings` of an identification with this kind of torque."""
     from r2s.identification.settings import Settings
 
     settings: dict[str, Any] = plain(cfg.identify)

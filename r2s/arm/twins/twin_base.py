@@ -120,7 +120,7 @@ class TwinBase:
 
     @property
     def _last_command(self) -> np.ndarray:
-        """(n,) Nm: with an extra delay the last one sent, otherwise the one that the arm executes."""
+        """(n,) Nm, the last command sent; without an extra delay it is the one that the arm executes."""
         return self._sent if self._extra_delay else self._tau_J_d
 
     def _delayed(self, tau: np.ndarray) -> np.ndarray:
