@@ -20,7 +20,7 @@ from r2s.errors import UserError
 from r2s.export.card import card
 from r2s.export.contract import make_contract
 from r2s.export.header import header
-from r2s.export.runtime import BundleError, agree, load, seal_of
+from r2s.export.runtime import BundleError, agree, seal_of
 from r2s.learning.networks import Policy
 from r2s.physics.control_laws import BUILT_IN
 from r2s.physics.description import write_description
@@ -86,12 +86,26 @@ def write_bundle(
         contract["trained"] = {"run": source.name} | {k: meta.get(k) for k in ("start", "seed", "git", "packages")}
         contract["seal"] = seal_of(contract)
         (part / "contract.json").write_text(json.dumps(contract, indent=1, allow_nan=False) + "\n")
-        load(part)
+        check_with_own_runtime(part)
         os.rename(part, to)
     except BundleError as error:
         raise UserError(f"export: {error}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def check_with_own_runtime(folder: Path) -> None:
+    """Raise BundleError if the bundle's own r2s_runtime.py, which has its control law, refuses its contract.
+
+    It is not imported: an import would leave a __pycache__ in the bundle.
+    """
+    path = folder / "r2s_runtime.py"
+    runtime: dict[str, Any] = {"__name__": path.stem}
+    exec(compile(path.read_text(), str(path), "exec"), runtime)
+    try:
+        runtime["load"](folder)
+    except runtime["BundleError"] as error:
+        raise BundleError(str(error)) from None
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
