@@ -12,7 +12,7 @@ class Adapter(Protocol):
     """
 
     def begin(self) -> None:
-        """Begin a motion from rest, with the knowledge of the identification alone."""
+        """Begin a motion from rest, with the identified model alone."""
         ...
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:

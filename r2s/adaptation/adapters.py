@@ -1,4 +1,4 @@
-"""Adapters of conf/adapt, made from what an identification knows of the arm.
+"""Adapters of conf/adapt, made from the result of an identification.
 
 To add one, write a function of `AdapterContext` and its settings, or a class, and name it in a yaml of conf/adapt.
 """
@@ -42,7 +42,7 @@ class AdapterContext:
 
     @cached_property
     def corrected(self) -> tuple[ArmModel, Noise]:
-        """The arm with the model correction of its recordings, and the noise that remains."""
+        """The arm with the correction fitted to its recordings, and the remaining noise."""
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 

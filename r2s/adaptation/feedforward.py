@@ -1,6 +1,6 @@
 """Feedforward of the estimated payload, friction and offsets.
 
-Of a payload it takes mass and centre, within the limits of `plausible_payload`. For joint j the estimate x gives
+It uses the mass and centre of the payload, within the limits of `plausible_payload`. For joint j the estimate x gives
 c = h x Nm. h holds the payload's ten columns (gravity, Coriolis, acceleration), the model's friction for the relative
 friction error, and 1 for the offset; the variance is s^2 = h P h^T. The feedforward is w c. Let c be an unbiased
 estimate of c*. Then E (w c - c*)^2 is least at w = c*^2 / (c*^2 + s^2), and c^2 - s^2 is an unbiased estimate of
@@ -11,8 +11,8 @@ c*^2, which gives
 the positive part of the James-Stein shrinkage of 1961 for one number: a torque that may as well be zero is not added.
 
 The feedforward follows the motion at once, but a new estimate enters through a low-pass over one span. A torque step
-twists elastic gears and lets motors run ahead of their links; the momentum residual takes that for a disturbance and
-hence for another payload. On a development twin (elastic variant) steps of 30 Nm sustained themselves at 25 Hz.
+twists elastic gears and lets motors run ahead of their links; the filter interprets this as another payload. On a
+development twin (elastic variant) steps of 30 Nm sustained themselves at 25 Hz.
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ class Feedforward:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest, with the knowledge of the identification alone."""
+        """Begin a motion from rest, with the identified model alone."""
         n = self._n
         self.estimator = Estimator(self._arm, self._noise)
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))

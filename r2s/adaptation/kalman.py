@@ -7,8 +7,8 @@ State of n joints, N = 10 + 4 n:
 - per joint the model error in Nm, an Ornstein-Uhlenbeck process that also changes with the friction;
 - per joint the relative error of the momentum rate, an Ornstein-Uhlenbeck process.
 
-Measurements are momentum residuals, one joint after the other. They have outliers: a joint that breaks away or a
-vibrating gear is far off for a span or two. An innovation beyond HUBER standard deviations weighs less, by Huber's
+Measurements are momentum residuals, one joint after the other. They have outliers: a breakaway or a vibrating gear
+gives large residuals for a span or two. An innovation beyond HUBER standard deviations weighs less, by Huber's
 function (Robust Statistics, 1981); a payload change persists and still counts.
 """
 

@@ -1,13 +1,13 @@
 """Correction of the identified model by its recordings without a payload.
 
-An identification searches the terms that its recording demands: a term that improves little is left out, as it trades
-with others. A payload estimate needs smaller torques: 0.1 Nm at 0.5 m are 20 g. So every joint gets all terms named
-below, every link a mass and first moments, and every gear a compliance. Each parameter has a zero-mean prior of a
+An identification keeps only the terms that its recording demands: a term that improves little is left out. A payload
+estimate needs smaller torques: 0.1 Nm at 0.5 m are 20 g. So every joint gets all terms named below, every link a mass
+and first moments, and every gear a compliance. Each parameter has a zero-mean prior of a
 typical size: ridge regression, the posterior mean of a linear model (Bishop 2006, 3.3). Measurements are momentum
 residuals (momentum_residual.py), which need no accelerations.
 
-With a compliant gear the link follows the motor less torque / K. A residual that takes the link for the motor then
-has an error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
+Behind a compliant gear, the link's angle is the motor's minus torque / K. A residual that equates the two has an
+error of M d2(torque)/dt2 / K: 0.7 Nm at 15 kNm/rad on a Panda whose torque varies by 4 Nm at 7 Hz.
 """
 
 from typing import NamedTuple

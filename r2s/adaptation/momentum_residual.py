@@ -1,7 +1,7 @@
-"""Momentum residual over a span of a few milliseconds: torque that commands, friction and links leave; compiled.
+"""Momentum residual over a few milliseconds: torque that commands, friction and links do not explain; compiled.
 
 The change of momentum equals the integral of all torques, so nothing is differentiated. A residual compares two means
-that lie one span of T s apart: y = (mean of the integrated model torque minus momentum, now minus before) / T, in Nm.
+one span of T s apart: y = (mean of the integrated model torque minus momentum, now minus before) / T, in Nm.
 It is linear in the unknown parameters: y = H x + noise.
 
 Each mean weighs two spans by a triangle, so a torque acts on y through a quadratic spline over three spans. Elastic

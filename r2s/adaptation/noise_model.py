@@ -73,11 +73,11 @@ def fit_noise(
 ) -> tuple[ModelCorrection, Noise]:
     """Return the model correction from two motions without a payload, and the noise of the corrected model.
 
-    The noise comes from `other`, which should be another motion, with the correction of `train` alone. Per joint, the
-    model error comes from covariances at lags of 60 to 300 ms; white noise and its growth with the momentum rate come
-    from the remaining variance. Then each joint's noise is scaled until the filter's innovations have their predicted
-    variance, and the noise of all joints until no odds of a payload exceed the number of spans. The initial friction
-    and offsets, and the correction itself, come from both motions.
+    The noise comes from `other`, which should be another motion, after a correction fitted to `train` alone. Per
+    joint, the model error comes from covariances at lags of 60 to 300 ms; white noise and its growth with the
+    momentum rate come from the remaining variance. Then each joint's noise is scaled until the filter's innovations
+    have their predicted variance, and the noise of all joints until no odds of a payload change exceed the number of
+    spans. The initial friction and offsets, and the correction itself, come from both motions.
     """
     first = fit_model_correction(robot, arm, train)
     start = default_noise(arm, prior)._replace(adaptation=0.0)

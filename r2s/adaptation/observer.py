@@ -6,7 +6,7 @@ Here d is the mean over three spans (momentum_residual.py), and the estimate d^ 
 Commands pass the identified delay and lag first.
 
 Stiction may carry any torque within breakaway while a joint does not slide all the time. d then lies between two
-bounds, and d^ changes as little as they allow: stiction holds the arm, as it did in the policy's training.
+bounds, and d^ changes as little as these allow: stiction holds the arm, as in the policy's training.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ class Observer:
 
 @njit(cache=True, error_model="numpy")
 def _observe(arm, state, residual, q, dq, tau, share, disturbance):
-    """Process a cycle into disturbance (2, n) Nm: of the last span, and low-passed by `share` of the difference."""
+    """Process a cycle; write disturbance (2, n) Nm: of the last span, and low-passed with the gain `share`."""
     measured, filtered = disturbance[0], disturbance[1]
     if update_residual(arm, state, q, dq, tau, residual):
         for j in range(len(q)):

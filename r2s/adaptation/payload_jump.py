@@ -4,7 +4,7 @@ A generalised likelihood ratio test (Willsky and Jones, IEEE TAC 21(1), 1976). F
 keeps the filter's signature of a payload jump that began there, and computes the odds of that jump under a prior.
 Without a jump the mean odds have expectation 1, so odds above x have probability 1 / x at most (Markov's inequality):
 a threshold equal to the number of tests in ten hours allows one false alarm in that time. Model errors have heavier
-tails than the filter's noise; hence ten hours for a target of one alarm per hour.
+tails than the filter's noise, so a threshold for ten hours aims at one alarm per hour.
 """
 
 import numpy as np

@@ -19,9 +19,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT, Robot
 
-LATENCY = (
-    0.007  # s, of torque and measurement assumed for the feedback: delay, lag and a filter (docs/explanation/arms.md)
-)
+LATENCY = 0.007  # s, assumed latency of the feedback: delay, lag and a velocity filter (docs/explanation/arms.md)
 # rad: bandwidth times latency of the loop. It leaves a phase margin of 56 deg; pi / 2 oscillates without end.
 BANDWIDTH_LATENCY = 0.6
 
@@ -31,8 +29,8 @@ class ComputedTorque(Controller):
     """Computed torque about a task's trajectory; see `Controller`.
 
     Attributes:
-        model: the identified arm, None only before it is set. ahead_s: s, how far ahead the feedforward looks: half a
-            control period, the low-pass, and the identified delay and lag.
+        model: the identified arm. ahead_s: s, look-ahead of the feedforward: half a control period, the low-pass, and
+            the identified delay and lag.
     """
 
     model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
@@ -46,7 +44,7 @@ class ComputedTorque(Controller):
 
     @property
     def observes_torque(self) -> bool:
-        """The policy observes the torque that its action is added to."""
+        """Whether the policy observes the torque to which its action is added."""
         return True
 
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
@@ -69,10 +67,10 @@ def computed_torque(
     """Return the controller of a task that has a trajectory.
 
     Args:
-        robot, task: the arm, and what it does. dynamics: of the identified arm.
+        robot, task: the arm and its task. dynamics: the identified arm.
         residual: share of the task's torque limit that an action of 1 adds.
         bandwidth: rad/s of the critically damped feedback; None: BANDWIDTH_LATENCY over twice the loop's latency. The
-            loop is late by a control period, the low-pass and LATENCY, and the damping 2 w is its rate.
+            loop's latency is a control period, the low-pass and LATENCY; its rate is the damping 2 w.
         feedback_hz: rate at which the feedback is updated, at most 1000; None: the policy's.
 
     Raises:

@@ -11,7 +11,7 @@ from r2s.physics.robot import Robot
 
 
 class ControlledTask(Protocol):
-    """What a controller may ask of a task.
+    """The part of a task that a controller uses.
 
     Attributes:
         ctrl_hz: policy rate. cutoff_hz: low-pass on the torque.
@@ -39,7 +39,7 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True)
 class Controller:
-    """One action space and one control law, for all arms of a robot; `control=` names what makes one.
+    """An action space and a control law, for all arms of one robot; `control=` selects the function that makes it.
 
     A policy's action lies in [-1, 1]. In SI units it is action_offset + action_scale action. A command is the action
     in SI units, then the setpoint that the controller derives from the task.
@@ -47,7 +47,7 @@ class Controller:
     Attributes:
         name: of the controller.
         law: compiled; see r2s/physics/control_laws.py.
-        action_scale, action_offset: (a,) in `unit`. action: what the policy commands, for tables and contracts.
+        action_scale, action_offset: (a,) in `unit`. action: name of the commanded quantity, for tables and contracts.
         parameters: (p,) of the law. memory_size: numbers that the law keeps from cycle to cycle.
         cpp: body of the same law in C++17, for contract.hpp; "": a bundle has no header.
     """
@@ -90,7 +90,7 @@ class Controller:
         """Return the commands (m, c) of the control period that begins at t (m,) s.
 
         Args:
-            action: (m, a) in [-1, 1]. task, goals: what the episodes ask for.
+            action: (m, a) in [-1, 1]. task, goals: of the episodes.
         """
         scaled = action * self.action_scale
         if self.action_offset.any():

@@ -1,4 +1,4 @@
-"""Episodes in another engine than the policy was trained in: the same goals, starts and drawn arms, one by one."""
+"""Episodes in another engine than the training's, one by one, with the same goals, starts and drawn arms."""
 
 from collections.abc import Callable
 
@@ -20,11 +20,11 @@ NONE = np.zeros(1, dtype=bool)  # has stopped
 class EngineArms:
     """The arms of `count` episodes, one after the other; the `Arms` of `r2s.tasks.rollout.rollout`.
 
-    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`, and a stream of its sensors' noise.
+    Arm e has the e-th draw, as in `r2s.learning.evaluate.make_evaluation`, and its own stream of sensor noise.
 
     Args:
         make: the engine of an arm with given dynamics.
-        robot, task, draw: as trained.
+        robot, task, draw: those of the training.
         count: episodes.
     """
 
@@ -75,7 +75,7 @@ class EngineArms:
         return self._read()
 
     def end(self) -> np.ndarray:
-        """Return (1,), whether the arm was stopped: nothing stops it here."""
+        """Return (1,) False: nothing stops an arm in an engine."""
         return NONE
 
     def _read(self) -> State:

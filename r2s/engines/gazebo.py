@@ -1,6 +1,6 @@
 """Gazebo (gz-sim) in this process and in lock-step, through its Python bindings: Harmonic, Ionic and Jetty.
 
-One blocking `server.run` per millisecond. The world contains physics only, from the same description as in the other
+A millisecond is one blocking `server.run`. The world contains physics only, from the same description as in the other
 engines (r2s/physics/description.py). Gazebo is not on PyPI; OSRF's packages and conda-forge contain the bindings.
 """
 

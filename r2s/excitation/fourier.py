@@ -1,9 +1,9 @@
-"""Excitation by a finite Fourier series whose clock runs through a ladder of speeds.
+"""Excitation by a finite Fourier series that is run at a ladder of speeds.
 
-The finite Fourier series is Swevers et al., IEEE T-RA 13(5), 1997, as is its choice by the determinant of the
-information matrix (D-optimality); here a prior keeps quantities that a short motion cannot identify from dominating
-the determinant. Friction curves and delay need several speeds: the clock leads the series from 10 % to full speed,
-reverses on the slow rungs, so that every joint reverses at low speed, and stops between the rungs.
+The series, and its choice by the determinant of the information matrix (D-optimality), follow Swevers et al., IEEE
+T-RA 13(5), 1997; a prior keeps quantities that a short motion cannot identify from dominating the determinant.
+Friction curves and delay need several speeds. So the series runs at 10 % to 100 % of its speed, runs back on slow
+rungs, so that every joint reverses at low speed, and rests between rungs.
 """
 
 from collections.abc import Callable
@@ -122,7 +122,7 @@ def fourier(
 
 
 def information(robot: Robot, motion: Motion, *, gravity: bool = False) -> float:
-    """Return the information of a recording of this motion in nats: half the log det of posterior to prior precision.
+    """Return the information in nats of a recording of this motion: half the log det of posterior over prior.
 
     The unknowns have independent normal priors. Per joint: offset, Coulomb friction as a tanh, its width and shift,
     viscous friction, and angle-dependent drag. Per link: mass and centre of mass (their errors appear in gravity even
@@ -261,7 +261,7 @@ class _Candidates:
         return q[::FINE], dq[::FINE], ddq[::FINE]
 
     def _safety(self, offset: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        """Return (T,) the smallest margin: of distances in clearances, of torques in tenths; negative: unsafe."""
+        """Return (T,) the smallest margin, negative if unsafe: distances in clearances, torques in tenths."""
         q = self.center + offset
         torque = (TORQUE_SHARE - torque_share(self.robot, q, dq, ddq)).min(1)
         return np.minimum((self.space.gaps(q) / self.space.clearance).min(1), 10 * torque)

@@ -132,7 +132,7 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 
 
 def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
-    """Raise UserError if a link comes too near to the table or to another link; `paths` checks the approach."""
+    """Raise UserError if a link comes too near to the table or to another link; paths.py checks the approach."""
     space = Space(robot, table=table, z_min=z_min)
     rows = _every(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
@@ -170,8 +170,8 @@ class Space:
     """Distances of an arm's links from the table and from each other; see `collision` for the geoms that count.
 
     Attributes:
-        clearance: (K,) m, minimum of each distance: height of the end effector above z_min (a margin of the search
-            only, `gaps` does not subtract it), of the links above the table, and between the pairs.
+        clearance: (K,) m, required distances: end effector above z_min (for the search only: `gaps` does not subtract
+            it), links above the table, and between pairs of links.
         reach: m, upper bound of the distance between a point of the arm and a joint.
     """
 
@@ -221,7 +221,7 @@ class Space:
             raise UserError(f"excitation: {self.explain(int(which), gaps[row, which], when(row))}")
 
     def explain(self, which: int, gap: float, when: str) -> str:
-        """Return the sentence for column `which` of `gaps` with value `gap` m."""
+        """Return the error for column `which` of `gaps` with value `gap` m."""
         if which == 0:
             seen = gap + self.floor
             return f"the end effector is {seen:.3f} m above the base plane {when}, allowed {self.floor:g} m or more"

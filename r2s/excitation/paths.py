@@ -27,7 +27,7 @@ def check_path(
 ) -> None:
     """Raise UserError if a path leaves the limits or comes too near to the table or to the arm itself.
 
-    The first posture is the arm's own and need not satisfy the clearances; smaller distances must not decrease.
+    The first posture is the arm's present one and may violate clearances, but those distances must not decrease.
 
     Args:
         robot: limits and links.

@@ -17,7 +17,7 @@ LEAST_S = 1.0  # s of motion
 
 
 def check_recording(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if a user's recording does not fit the arm (`check_motion`), is damaged or has other units."""
+    """Raise UserError if a user's recording does not fit the arm (`check_motion`), is damaged or has wrong units."""
     check_motion(robot, recording)
     _check_spikes(robot, recording, NONSENSE)
     check_units(robot, recording)
@@ -36,7 +36,7 @@ def check_motion(robot: Robot, recording: Recording) -> None:
 
 
 def _check_spikes(robot: Robot, recording: Recording, most: float) -> None:
-    """Raise UserError for a row beyond `most` times the limits of the arm, as in a damaged file."""
+    """Raise UserError if a row exceeds `most` times the limits of the arm, as in a damaged file."""
     r = recording
     speed = most * robot.dq_max
     jumps = np.zeros_like(r.q)

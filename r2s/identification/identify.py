@@ -75,14 +75,14 @@ class State:
     """State of an identification between two steps.
 
     Attributes:
-        robot to ramps: arguments of `identify`; `select_family` sets the family of `nominal`.
+        robot to ramps: the arguments of `identify`; `select_family` changes the friction family of `nominal`.
         prior: standard deviations in SI units. terms: estimated beside friction.
         families: error of held-out torque by family; empty if the family was given.
         space: parameters and nominal values, with breakaway and stiction once they are estimated.
         problem, u: least-squares problem and its solution (P,) on the unit cube.
         edges, static_friction: breakaway commands from ramps, and friction at the onset of sliding (Stribeck
             families).
-        refused: whether replays were discarded. dynamics: the arm with its breakaway torques.
+        refused: whether r2s discarded replays. dynamics: the arm with its breakaway torques.
     """
 
     robot: Robot
@@ -110,7 +110,7 @@ class State:
 
     @property
     def slowest(self) -> float:
-        """rad/s, velocity from which torque rows count."""
+        """rad/s, velocity above which torque rows count."""
         return STANDSTILL if self.commanded else 0.0
 
     @property
@@ -166,7 +166,7 @@ def identify(
 
 
 def select_family(s: State) -> State:
-    """Set the friction family: the given one, or for family=auto that with the least error of held-out torque."""
+    """Set the friction family: the given one, or with family=auto the one with the least error of held-out torque."""
     family, families = s.settings.family, {}
     if family == "auto":
         found = s.history.step("family", lambda: compare_families(s.cross_validation, s.terms, s.slowest))
@@ -219,7 +219,7 @@ def formulate(s: State) -> State:
 
 
 def fit(s: State) -> State:
-    """Run the searches in turn; refuse replays that disagree with the torque of moving joints."""
+    """Run the searches in turn; discard replays that disagree with the torque of moving joints."""
     problem, u = s.problem, s.u
     for k, search in enumerate(s.searches):
         v, problem = _run(s, f"search {k + 1}", search, problem, u)
@@ -324,8 +324,8 @@ def _run(
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Return whether v (P,) explains torque clearly worse than u (P,), the fit to torque.
 
-    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. Its unit
-    is as accurate as the number of independent rows: ALIKE.
+    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. The
+    relative error of that sum is ALIKE, that of the number of independent rows.
     """
     fitted = (problem.torque_residual(u[None])[0] ** 2).sum()
     rise = (problem.torque_residual(v[None])[0] ** 2).sum() - fitted
@@ -335,9 +335,9 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
     """Return u (P,) of a local search without a lag, or with one if the data clearly need it.
 
-    For slow torques a short lag acts like a delay, and the two trade. The data need a lag if the cost falls by more
-    than the logarithm of the rows (Schwarz, Annals of Statistics 6(2), 1978), apart from the block of half a second
-    that favours it most, because rows of a block are correlated.
+    With slow torques a short lag acts like a delay. The data need a lag if it lowers the cost by more than the
+    logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The half-second block that favours a
+    lag most does not count, because rows of a block are correlated.
     """
     lag = problem.space.where("lag")
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(lag)

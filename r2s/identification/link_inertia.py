@@ -17,8 +17,8 @@ PAYLOAD = ("payload_mass", "payload_x", "payload_y", "payload_z")
 def pseudo_inertia(mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> np.ndarray:
     """Return (..., 4, 4) [[Sigma, h], [h^T, m]] about the link's origin (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-    Sigma is the second moment of mass. It is positive definite exactly if the tensor has positive principal moments
-    that satisfy the triangle inequality. Other tensors become the nearest flat one with a little thickness.
+    Sigma is the second moment of mass. It is positive definite if and only if the tensor's principal moments are
+    positive and satisfy the triangle inequality. Other tensors become the nearest flat one with a little thickness.
     """
     second = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - inertia
     moments, axes = np.linalg.eigh(second)

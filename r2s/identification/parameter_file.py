@@ -69,7 +69,7 @@ def save_parameters(
     rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
     document["links"] = dict(zip(("mass_kg", "com_m", "inertia_about_com_kg_m2"), rounded, strict=True))
     document |= dict(note or {})
-    with atomic_write(path.with_name("posterior.npz")) as part:  # first: where parameters.yaml exists, both exist
+    with atomic_write(path.with_name("posterior.npz")) as part:  # first: parameters.yaml must not exist alone
         np.savez_compressed(part, names=np.array(space.names), samples=found.samples)
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
@@ -100,7 +100,7 @@ def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, n
 
 
 def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
-    """Return what `load_parameters` does; a malformed document raises KeyError, ValueError and the like."""
+    """Parse the document for `load_parameters`; a malformed one raises KeyError, ValueError and the like."""
     found, fixed = document["parameters"], document["fixed"]
 
     def numbers(name: str, value: Any, count: int) -> np.ndarray:

@@ -54,10 +54,10 @@ class ParameterSpace:
         blocks: names in order; each has n values, or one for the whole arm.
         n: number of joints.
         lower, upper: (P,) bounds in SI units.
-        nominal: start of a search, and the values of all other parameters.
+        nominal: start values of a search, and values of all parameters that are not in x.
         robot: the arm; inertia blocks are relative to its links.
         breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. The breakaway torques
-            then follow the offset (torque = command + offset). NaN, and None for all, keeps the nominal torque.
+            then follow the offset (torque = command + offset). NaN keeps one nominal torque, None all.
     """
 
     blocks: tuple[str, ...]
@@ -101,7 +101,7 @@ class ParameterSpace:
         return np.arange(at, at + self.size(name))
 
     def expand(self, values: Mapping[str, Any], default: Any) -> np.ndarray:
-        """Return (P,) with each block's value, or values per joint (n,); `default` for the other blocks."""
+        """Return (P,) with the given value of each block, one or per joint (n,); other blocks get `default`."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
     @property

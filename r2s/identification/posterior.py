@@ -22,13 +22,13 @@ class Posterior(NamedTuple):
 def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
     """Return draws of the joint distribution about the fit u (P,), normal with a cluster-robust covariance.
 
-    Errors within a block are correlated, so what scatters is the score of a block, its part of the gradient: the
-    covariance is H^-1 (sum of s s^T + prior) H^-1 (White, Econometrica 48(4), 1980; clusters: Liang and Zeger,
-    Biometrika 73(1), 1986). A fit follows each of few blocks, so the residual of a block is smaller than its error,
-    by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). The mean of all
-    scores is removed: at a bound it is not 0. Few blocks underestimate the covariance where single ones decide, so in
-    no direction does it fall below that of the residual's variance. A bootstrap over blocks would draw some H with
-    hardly any information on a value that few blocks determine, and those tails are no estimate of an arm.
+    Errors within a block are correlated, so the scatter of block scores s, a block's part of the gradient, sets the
+    covariance H^-1 (sum of s s^T + prior) H^-1 (White, Econometrica 48(4), 1980; clusters: Liang and Zeger,
+    Biometrika 73(1), 1986). With few blocks the fit follows each one, so a block's residual is smaller than its
+    error, by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). The mean
+    score, which is not 0 at a bound, is removed. Few blocks underestimate the covariance where single blocks decide,
+    so it never falls below the one for independent rows, in any direction. A bootstrap over blocks would sometimes
+    draw an H with hardly any information on a value that few blocks determine; such tails describe no arm.
     """
     rng = np.random.default_rng(seed)
     residual, jacobian = problem.linearize(u)
@@ -60,18 +60,18 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
     """Return root (P, P) of the covariance root root^T, raised where it is less than least least^T.
 
-    By direction instead of parameter: the sum of two that trade is known far better than either.
+    The comparison is by direction, not by parameter: of two that trade, the sum is known far better than either.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return steps (S, P) that end in the cube: values that would leave it stop there and the others compensate.
+    """Return steps (S, P) that end in the cube: values that would leave it stop at its side, and others compensate.
 
     h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry at its bound,
-    stopping one of them alone would change their sum. Values stop one at a time, the farthest first: of two that
-    trade and are both outside, the other one returns by itself.
+    stopping one of them alone would change their sum. Values stop one at a time, the farthest first: stopping one of
+    two that trade often brings the other back.
     """
     steps = steps.copy()
     for step in steps:

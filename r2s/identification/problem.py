@@ -39,7 +39,7 @@ class Problem:
         data: the residual to minimize.
         torque_data: the torque residual, for a fast start; may be `data` itself.
         sigma: (P,) prior standard deviation about the nominal value (of the logarithm for logarithmic coordinates).
-        extra: further rows.
+        extra: further residuals.
     """
 
     data: ReplayResidual | TorqueResidual
@@ -178,9 +178,9 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
 def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGNIFICANT) -> bool:
     """Return whether a simulator with implicit friction made the recording, at u (P,), a fit to its torque.
 
-    Implicit integration solves for friction at the velocity half a step ahead; an arm in continuous time does not.
-    The effect must have about the expected size and be `significant` standard deviations. A missing rotor looks alike
-    but is a hundred times larger.
+    Implicit integration evaluates friction at the velocity half a step ahead; a continuous-time arm does not. The
+    effect must have about the expected size and be `significant` standard deviations. A missing rotor has a similar
+    effect, a hundred times larger.
     """
     r, j = problem.torque_residual(u[None])[0], problem.torque_jacobian(u)
     ahead = problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT))

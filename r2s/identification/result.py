@@ -69,7 +69,7 @@ class IdentificationResult:
         """Space and estimate for parameters.yaml, with breakaway torques from ramps as blocks of their own.
 
         Their interval is Student's (friction/repeatability.py) plus the uncertainty of the offset. Without a release
-        the torque lies between the command that the joint held against and the bound; it is not identifiable and all
+        the torque lies between the largest command without motion and the bound; it is not identifiable, and all
         draws have the same value.
         """
         if self.edges is None:
@@ -110,8 +110,8 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     Args:
         problem: the solved problem.
         space: its parameters, with the breakaway and stiction found since.
-        sure: u, steps and information of the `Posterior`.
-        story: history, families, edges and refused of `IdentificationResult`.
+        sure: fit, draws and information.
+        story: the fields history, families, edges and refused of `IdentificationResult`.
     """
     u = np.array(sure["u"], dtype=float)
     steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
@@ -132,10 +132,10 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
 
 
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return u (P,) with unseen values at `start`, as many as cost nothing, and which (P,) bool those are.
+    """Return u (P,) with unseen values set back to `start` where this costs nothing, and (P,) bool, which those are.
 
-    A value may be unseen by itself and seen together with others, like the masses of two links in a row. So a value
-    goes back only if the others, refitted, explain data and prior as well: the sum of squares may rise by 1 in all.
+    The data may determine values together but not one by one, like the masses of two consecutive links. So a value
+    goes back only if the others, refitted, explain data and prior as well: the sum of squares may rise by 1 in total.
 
     Args:
         u, start: (P,) result and nominal, on the unit cube. h: (P, P), half the Hessian of the sum of squares at u.

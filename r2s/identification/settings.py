@@ -13,7 +13,7 @@ from r2s.physics.friction import family as friction_family
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of `identify`: those of conf/identify, with the terms and prior of one torque level.
+    """Settings of `identify`: those of conf/identify, with terms and prior for one kind of torque.
 
     Attributes:
         bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; an end is a number or (n,).

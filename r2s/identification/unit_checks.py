@@ -2,8 +2,8 @@
 
 dq is compared with the slope of q, and torque with that of the nominal arm for the same motion. The judgement is
 coarse on purpose: a nominal arm that is wrong by a factor of 3, an undeclared payload, any friction and sensor
-offsets pass; a factor of 1000, of 57.3 or of -1, or another joint order do not. A recording is refused only if it
-leaves more than half of the square unexplained, and one such correction at most a quarter of that.
+offsets pass; a factor of 1000, of 57.3 or of -1, or another joint order do not. r2s refuses a recording only if more
+than half of its square is unexplained, and one such correction leaves at most a quarter of that.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class Moments(NamedTuple):
 
 
 def check_units(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if dq or tau have other units, signs or joint order, unless too few rows tell."""
+    """Raise UserError if dq or tau have other units, signs or joint order; too few rows are not judged."""
     moved = np.ptp(recording.q, axis=0) > STILL
     dead = np.flatnonzero(moved & (np.ptp(recording.tau, axis=0) == 0))
     if recording.torque != "commanded" and len(dead):

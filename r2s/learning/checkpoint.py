@@ -1,7 +1,7 @@
 """Checkpoints of a training: its state in one file, and the transitions of the replay buffer in chunks beside it.
 
-Each transition is written once. The state names the chunks that belong to it, so a stop between two checkpoints
-leaves a consistent one. Files hold tensors, numbers and names only, which torch.load(weights_only=True) reads.
+Each transition is written once. The state names the chunks that belong to it, so an interrupted write leaves the
+previous checkpoint intact. Files hold tensors, numbers and names only, which torch.load(weights_only=True) reads.
 """
 
 import errno
@@ -35,7 +35,7 @@ class Checkpoint:
         """Write the state and the transitions since the last call.
 
         Args:
-            state: of the training. replay: buffer of `size` transitions, after `seen` transitions in total.
+            state: of the training. replay: buffer with the last `size` of `seen` transitions.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         chunk = f"replay_{seen:012d}.pt"

@@ -27,7 +27,7 @@ class Learner(nn.Module, ABC):
         hidden: units per hidden layer of actor and critics.
         gamma: discount. tau: Polyak step of the target networks. lr: learning rate of Adam.
         action_l2: weight of the mean squared action in the actor's loss (Andrychowicz et al. 2017, HER). Where the
-            critics hardly distinguish actions, the policy then prefers small ones to full torque in alternation.
+            critics hardly distinguish actions, the policy then prefers small actions to alternating full torque.
 
     Raises:
         UserError: a setting has the wrong type or is out of range.
@@ -98,7 +98,7 @@ class Learner(nn.Module, ABC):
         """Compile the losses and their gradients for this batch size, before the first update.
 
         This takes 5 to 20 s, less if the machine has cached it. On a GPU it captures a graph. If compilation fails,
-        for example without a C++ compiler, one warning appears and the learner stays eager.
+        for example without a C++ compiler, one warning appears and the losses stay uncompiled.
 
         Returns:
             Whether the losses are compiled.

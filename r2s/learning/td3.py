@@ -57,7 +57,7 @@ class TD3(DeterministicLearner):
         return {"loss_critic": self._critic_loss(batch, noise), "loss_actor": self._actor_loss(batch)}
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Do one gradient step; return the losses, of a delayed actor the last one."""
+        """Do one gradient step; return the losses: between actor updates, the last actor loss."""
         batch = self.normalized(batch)
         loss = critic = self._critic_loss(batch, torch.randn_like(batch["action"]))
         due = self.updates % self.policy_delay == 0  # also in the first update, so that every logged row has a loss

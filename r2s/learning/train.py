@@ -65,9 +65,9 @@ class Loop:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
         learning_starts: environment steps with uniform random actions.
         replay_size: capacity of the replay buffer.
-        lr_decay, lr_end: from this share of the budget, the learning rate falls linearly to the share lr_end.
+        lr_decay, lr_end: from this share of the budget on, the learning rate falls linearly to the share lr_end.
         eval_env_steps: environment steps between two evaluations; the last evaluation is at the end.
-        compile: compile the losses first; this time counts.
+        compile: compile the losses first; the budget includes this time.
         matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
             factors to bfloat16 if the processor multiplies those faster.
 
@@ -108,8 +108,8 @@ class Callbacks:
     """Functions that a training calls.
 
     Attributes:
-        log: with a row of metrics.csv. evaluated: with a row of evaluations.csv.
-        progress: with the share of the budget and the numbers to show, after every step.
+        log: gets each row of metrics.csv. evaluated: each row of evaluations.csv.
+        progress: after every step, the share of the budget and the numbers to show.
     """
 
     log: Callable[[dict], None] = lambda row: None
@@ -136,7 +136,7 @@ def train(
         evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
         loop, budget: settings.
         checkpoint: written after every evaluation; if it exists, the training continues from it.
-        dump: file for the cause of a value that is not finite, for `replay_dump`.
+        dump: file that stores the cause of a non-finite value, for `replay_dump`.
         callbacks: for logs and progress.
 
     Raises:
@@ -283,7 +283,7 @@ class Training:
 
 
 def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
-    """Repeat the step, update or evaluation that gave a value that is not finite.
+    """Repeat the step, update or evaluation that gave a non-finite value.
 
     Args:
         path: the dump. env, algo, evaluate: made as for the training.
@@ -313,7 +313,7 @@ def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Pol
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed memory: it returns large blocks at once, and every update would fault them in again."""
+    """Let glibc keep freed memory: otherwise it returns large blocks, and every update page-faults them in again."""
     try:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD

@@ -20,7 +20,7 @@ class VectorArms:
     delay and lag -> physics. Kinematics follow at its end. States hold true speeds and, separately, sensor noise.
 
     Attributes:
-        speeds: None: true speeds need no smoothing.
+        speeds: None, because true speeds need no smoothing.
 
     Args:
         robot, task: the arm, and the task with its controller.

@@ -1,8 +1,8 @@
 """The torque path, one millisecond at a time: soft start, low-pass, clip and rate limit, and the delay of the motors.
 
-Training, evaluation and hardware share it, so that a policy has the same latency on the arm as in simulation. The
-safety filter (safety_filter.py) acts between the two: in training inside the physics step (mujoco_callback.py), on an
-arm in r2s/arm/driver.py.
+Training, evaluation and hardware share this code, so a policy has the same latency on the arm as in simulation. The
+safety filter (safety_filter.py) acts between rate limit and delay: in training inside the physics step
+(mujoco_callback.py), on an arm in r2s/arm/driver.py.
 """
 
 import math
@@ -14,7 +14,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 
 def low_pass_factor(cutoff_hz: float, dt: float = SIM_DT) -> float:
-    """Return the factor of a first-order low-pass per step of dt s (libfranka's `lowpassFilter`)."""
+    """Return the gain of a first-order low-pass for time steps of dt s (libfranka's `lowpassFilter`)."""
     return dt / (dt + 1.0 / (2.0 * math.pi * cutoff_hz))
 
 
@@ -23,8 +23,8 @@ def condition_joint(target, filtered, effort, cycle, factor, fade, tau_max, step
     """Return one joint's low-pass state and effort, Nm, after one cycle: soft start, low-pass, clip, rate limit.
 
     Args:
-        target: Nm, of this cycle. filtered, effort: Nm, of the cycle before. cycle: of the motion, from 1.
-        factor: of the low-pass. fade: cycles of the soft start.
+        target: Nm, in this cycle. filtered, effort: Nm, in the cycle before. cycle: its number, from 1.
+        factor: gain of the low-pass. fade: duration of the soft start, cycles.
         tau_max: Nm. step_max: Nm per cycle.
     """
     faded = target
@@ -42,7 +42,7 @@ def condition(target, state, settings, nstep, out):
 
     Args:
         target: (m, n) Nm. state: low-pass state (m, n) Nm, effort (m, n) Nm and cycle count (m,), updated here.
-        settings: factor of the low-pass, cycles of the soft start, tau_max (n,) Nm, step_max (n,) Nm per cycle.
+        settings: factor, fade, tau_max (n,) Nm and step_max (n,) Nm per cycle of `condition_joint`.
     """
     filtered, effort, cycle = state
     factor, fade, tau_max, step_max = settings
@@ -60,11 +60,11 @@ class Actuation:
     """Soft start, low-pass, clip and rate limit of the target torques of m arms.
 
     Attributes:
-        last: (m, n) Nm, the effort: the target after all of them. filtered: (m, n) Nm, of the low-pass.
+        last: (m, n) Nm, the effort, after all four. filtered: (m, n) Nm, after the low-pass.
 
     Args:
-        robot: its torque range and rate. m: arms. cutoff_hz: of the low-pass.
-        soft_start_s: s over which the torque of a motion fades in; 0: not at all.
+        robot: gives torque and rate limits. m: number of arms. cutoff_hz: cutoff of the low-pass.
+        soft_start_s: s, time over which the torque of a motion fades in; 0: no fade.
     """
 
     def __init__(self, robot: Robot, m: int, *, cutoff_hz: float, soft_start_s: float = 0.0):
@@ -100,12 +100,12 @@ SLOTS = int(MAX_DELAY / SIM_DT) + 3  # commands in the delay line
 def motor_torque(line, motor, cycle, delay, lag, out):
     """Advance the motors of one arm by a step; write the mean torque (n,) Nm of the step into `out`.
 
-    A command that arrives within a step acts for the rest of it. With a lag m' = (u - m) / lag the mean over a
-    time s from m is u + (m - u) (1 - exp(-s / lag)) lag / s.
+    A command that arrives within a step acts for the rest of that step. The lag is m' = (u - m) / lag; from the state
+    m, its mean over a time s is u + (m - u) (1 - exp(-s / lag)) lag / s.
 
     Args:
         line: (SLOTS, n) Nm, the command of cycle k in row k % SLOTS. motor: (n,) Nm, state of the lag.
-        cycle: of the newest command, from SLOTS on. delay, lag: steps.
+        cycle: number of the newest command, at least SLOTS. delay, lag: steps.
     """
     whole = int(delay)
     late = delay - whole
@@ -131,7 +131,7 @@ def delayed(tau, delay, lag, steps, line, motor, cycle, out):
 
 
 def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Return delay and lag, s, in steps for `motor_torque`: at most MAX_DELAY, plus EARLY."""
+    """Convert delay and lag from s to steps for `motor_torque`; the delay is at most MAX_DELAY, plus EARLY."""
     steps = np.clip(np.asarray(delay) / SIM_DT, 0.0, MAX_DELAY / SIM_DT) + EARLY
     return steps, np.asarray(lag) / SIM_DT
 
@@ -139,8 +139,8 @@ def steps_late(delay: np.ndarray | float, lag: np.ndarray | float) -> tuple[np.n
 class Motors:
     """Delay and lag between the commands and the joint torques of m simulated arms.
 
-    A pure delay, then a first-order lag, as on an arm in continuous time. The simulated step is half a step early
-    (EARLY), which is compensated here.
+    A pure delay, then a first-order lag, as on an arm in continuous time. The simulation responds half a step early
+    (EARLY); this class compensates for it.
     """
 
     def __init__(self, m: int, n: int, delay: np.ndarray | float = 0.0, lag: np.ndarray | float = 0.0):
@@ -150,7 +150,7 @@ class Motors:
         self.set(delay, lag)
 
     def set(self, delay: np.ndarray | float, lag: np.ndarray | float, ids: np.ndarray | None = None) -> None:
-        """Give the arms `ids` (all by default) delay and lag, s, one for all of them or (m,)."""
+        """Set delay and lag, s, of the arms `ids` (all by default): one for all, or (m,)."""
         at = slice(None) if ids is None else ids
         self._delay[at], self._lag[at] = steps_late(delay, lag)
 

@@ -1,4 +1,4 @@
-"""Compiled control laws: what turns a command into joint torques once a millisecond.
+"""Compiled control laws, which turn a command into joint torques once a millisecond.
 
 A control law is a compiled function
 
@@ -11,8 +11,8 @@ A control law is a compiled function
     out         (n,) Nm, the target torque, without gravity
 
 The same function runs in MuJoCo's callback during training (mujoco_callback.py), in the driver of every arm
-(r2s/arm/driver.py) and in an exported bundle. Room control/ says which law a controller uses, and with which
-parameters. The laws live here because numba keeps compiled code per room, and MuJoCo's callback contains them.
+(r2s/arm/driver.py) and in an exported bundle. The room control/ chooses law and parameters. The laws are in this room
+because MuJoCo's callback contains them and numba caches compiled code per room.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class ControlLaw(Protocol):
     """A control law with its parameters; r2s/control/controller.py has it.
 
     Attributes:
-        law: compiled. parameters: (p,). command_size, memory_size: numbers in a command and in the law's memory.
+        law: the compiled function. parameters: (p,). command_size, memory_size: lengths of command and memory.
     """
 
     @property

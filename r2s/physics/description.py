@@ -1,8 +1,8 @@
 """Robot descriptions in three formats: MJCF, URDF and SDF with the same links, limits and friction.
 
-The robot's file is the source; identified masses, centres, tensors and rotors replace its values. The frame of a
-link in URDF and SDF is that of its joint at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo
-Fortress misreads a rotated inertial frame).
+All values come from the robot's file, except identified masses, centres, tensors and rotors. The frame of a link in
+URDF and SDF is that of its joint at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo Fortress
+misreads a rotated inertial frame).
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Link:
 
 
 def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[list[Link], np.ndarray]:
-    """Return the arm's links from the base, and the pose (4, 4) of the end effector in the last link.
+    """Return the arm's links, from the base outwards, and the pose (4, 4) of the end effector in the last link.
 
     Args:
         robot: the arm. dynamics: masses, centres, tensors, rotors, friction.
@@ -175,11 +175,11 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
     """Write the arm as SDF 1.9, fixed to the world, with a frame `ee` at the end effector.
 
     With `world` the file contains the world of r2s/engines/gazebo.py: physics in 1 ms steps without a real-time
-    limit, no gravity (libfranka's convention), no velocity or torque limits (the driver's task), and no friction (it
-    is applied as a torque). A rotor becomes a damping of armature over 1 ms; gazebo.py compensates that torque.
+    limit, no gravity (libfranka's convention), no limits of velocity or torque (the driver has them), and no friction
+    (r2s applies it as a torque). A rotor becomes damping, armature / 1 ms; gazebo.py compensates that torque.
 
     Raises:
-        UserError: the joints have armature, which SDF cannot represent; not with `world`.
+        UserError: without `world`, the joints have armature, which SDF cannot represent.
     """
     links, tip = chain(robot, dynamics, friction=not world)
     if not world and any(link.armature for link in links):
@@ -257,7 +257,7 @@ class Bodies:
         return body, pose
 
     def lumped(self, body: int) -> Inertia:
-        """Return mass, centre and tensor about it of `body` and all bodies welded to it."""
+        """Return mass, centre and tensor about the centre of `body` with all bodies welded to it."""
         parts = [(self.mass[body], self.com[body], self.inertia[body])]
         for other in range(1, self.model.nbody):
             anchor, pose = self.moving_parent(other)

@@ -32,11 +32,11 @@ class Dynamics:
             the recording, not of the arm's motion.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: of the friction.
-        stiction_model: the torque that the edges apply to. "command" is eq. (6) of the paper: command and offset have
-            no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the coupling to
-            other joints, lies within the edges (r2s/physics/stick_slip.py).
-        delay, lag: (...) s, pure delay and first-order lag of the actuation; `Simulator` applies them only behind the
-            safety filter, otherwise `Motors` (r2s/physics/actuation.py) does.
+        stiction_model: the torque that the breakaway edges limit. "command" is eq. (6) of the paper: command and
+            offset have no effect within the edges. "net": a joint sticks while the sum of all torques on it, with the
+            coupling to other joints, lies within the edges (r2s/physics/stick_slip.py).
+        delay, lag: (...) s, pure delay and first-order lag of the actuation. `Simulator` applies them only if it runs
+            the safety filter; otherwise `Motors` (r2s/physics/actuation.py) does.
         declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
             declared to gravity compensation (r2s/physics/payload.py); the real payload is part of the last link.
     """
@@ -68,7 +68,7 @@ class Dynamics:
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":
-        """Return the nominal links and rotors with friction phi (..., n, K) of a family, all else zero."""
+        """Return dynamics of nominal links and rotors with friction phi (..., n, K) of a family; all else is zero."""
         n = robot.n
         return Dynamics(
             phi=phi,
@@ -123,8 +123,7 @@ def nominal_dynamics(
 ) -> Dynamics:
     """Return the dynamics of `conf/friction` and `conf/inertia`; a value per joint, or one for all.
 
-    Another family than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" is the sigmoid before the family
-    selection.
+    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid.
 
     Raises:
         UserError: a list of the wrong length, or a value out of its physical range.

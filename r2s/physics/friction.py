@@ -24,11 +24,11 @@ class Family:
     """A friction law of one joint with K parameters; 0 at rest and positive for positive velocity.
 
     Attributes:
-        name: in tables.
+        name: shown in tables.
         names, units: of the K parameters.
         logarithmic: names of positive parameters that span decades; their search space is logarithmic.
-        bounds: (low, high) of each parameter, used if `identify.bounds` has none, as for the four families below.
-        optional: the last of the names; they are 0 and not searched unless `identify.terms` contains them.
+        bounds: (low, high) of each parameter, for those that `identify.bounds` does not list.
+        optional: the last parameters; each is 0 and not estimated unless `identify.terms` names it.
         formula: the law in one line.
         law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign have shape
             (..., n); p is a list of K arrays (..., n). `sign` is tanh(dq / 0.01), or the bristle deflection of a
@@ -73,7 +73,7 @@ class Family:
 
     @property
     def has_memory(self) -> bool:
-        """Whether the law has a memory and so its own stiction."""
+        """Whether the law has a memory, and therefore stiction of its own."""
         return self.held is not None
 
     def at_rest(self, phi: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ class Family:
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
-        """Return parameters (..., n, K) with the level at 1 rad/s of phi (..., n, K') of another family."""
+        """Return parameters (..., n, K) with the friction at 1 rad/s of phi (..., n, K') of another family."""
         if other == self:
             return phi
         return np.stack(self.start(other.level(phi, np.ones(phi.shape[:-1]))), -1)
@@ -262,7 +262,7 @@ STRIBECK = Family(
 
 @njit(cache=True)
 def _bristle_native(p, v, h, memory):
-    """Dahl 1968; LuGre without its own damping term: dz/dt = (v - |v| z) / presliding in place of the sign."""
+    """Dahl 1968, or LuGre without damping: z with dz/dt = (v - |v| z) / presliding replaces the sign of v."""
     s = 1.0 if v > 0 else -1.0
     z = s + (memory[0] - s) * np.exp(-abs(v) * h / p[5])  # deflection after the last step
     memory[0] = z
@@ -350,7 +350,7 @@ def family_path(one: Family) -> str:
 def presliding(dq: np.ndarray, dt: float, distance: np.ndarray | float) -> np.ndarray:
     """Return the bristle deflection z (T, n) in [-1, 1] for dq (T, n) rad/s, dt s and a distance in rad, one or (n,).
 
-    It replaces the sign of friction: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly from z = 0.
+    z replaces the sign of the velocity: dz/dt = (v - |v| z) / distance (Dahl 1968), integrated exactly from z = 0.
     """
     return _presliding(dq, dt, np.broadcast_to(np.asarray(distance, dtype=float), dq.shape[1:]).copy())
 

@@ -47,7 +47,7 @@ class InverseDynamics:
         return out
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, sliding: np.ndarray) -> np.ndarray:
-        """Return the command (m, n) Nm, without gravity; `sliding` (m, n) rad/s are the speeds for friction."""
+        """Return the command (m, n) Nm, without gravity; `sliding` (m, n) rad/s: speeds that set friction."""
         d = self.dynamics
         out = self.rigid(q, dq, ddq) + d.friction(sliding) - d.offset
         if d.drag.any():

@@ -34,8 +34,8 @@ class HandKinematics:
     def follow(self, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Return postures (T, n) rad with the end effector at points (T, 3) m, and the largest position error, m.
 
-        Each solution starts from the one before, the first from `start` (n,). Free joint motion goes towards home.
-        Position limits are not considered.
+        The solver starts each posture from the one before, the first from `start` (n,). In the null space it moves
+        towards home. It ignores position limits.
         """
         out = np.empty((len(points), len(start)))
         return out, _follow(self.links, self._tip, self._home, start, np.ascontiguousarray(points), out)

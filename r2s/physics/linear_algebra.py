@@ -1,9 +1,9 @@
 """Cholesky factorization and solution of small symmetric positive definite systems, for compiled code.
 
 For the 7 joints of an arm these loops are faster than a LAPACK call. A root is the lower triangle L of A = L L^T with
-1 / L[i, i] on the diagonal, so that a solution multiplies instead of divides (Golub and Van Loan, Matrix
-Computations, 4th ed. 2013, section 4.2). A packed matrix is its lower triangle row by row, (n (n + 1) / 2,), as
-MuJoCo stores the mass matrix of a serial arm.
+1 / L[i, i] on the diagonal: `solve` then multiplies instead of divides (Golub and Van Loan, Matrix Computations, 4th
+ed. 2013, section 4.2). A packed matrix holds its lower triangle row by row, (n (n + 1) / 2,), as MuJoCo stores the
+mass matrix of a serial arm.
 """
 
 import numpy as np

@@ -1,14 +1,14 @@
 """Friction, control law, safety filter and motors inside MuJoCo's physics step: one compiled callback.
 
-`install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` then gives each simulation
-its own arm at full speed. The callback contains the friction laws (friction.py), and with `Simulator.drive` also the
-control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the motors (actuation.py), which
-need feedback every millisecond. It is the control callback, the last one before accelerations, because stiction
-(stick_slip.py) depends on all other forces.
+`install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` can then simulate a
+different arm in each row at full speed. The callback contains the friction laws (friction.py), and with
+`Simulator.drive` also the control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the
+motors (actuation.py), which need feedback every millisecond. Stiction (stick_slip.py) depends on all other forces, so
+this is the control callback, which MuJoCo calls last before it computes accelerations.
 
-The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity it adds D v - tau_f to
-qfrc_passive and D to dof_damping, so the implicit integrators solve with M + h D. This is exact to first order, and
-stable where the explicit form chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
+The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity, the callback adds D v -
+tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. This is exact to first order,
+and stable where an explicit force chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
 """
 
 import ctypes
@@ -160,7 +160,7 @@ def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) ->
 def _force_at(at: dict[str, int]) -> Callable:
     """Return the force to compile; `at`: byte offsets of the fields of mjModel and mjData.
 
-    The offsets are integers in its closure: numba's cache takes them into account.
+    The offsets are integers in the function's closure, so numba's cache distinguishes them.
     """
     nv_at, nbody_at, nuser_at = (at[k] // 8 for k in ("nv", "nbody", "nuser_jnt"))
     user_at, damping_at = (at[k] // 8 for k in ("jnt_user", "dof_damping"))
@@ -200,7 +200,7 @@ def _friction(sizes, user, q, dq, forces, places):
     """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
 
     Args:
-        sizes: joints and bodies. user: (n, WIDTH), of jnt_user. The others are addresses of MuJoCo's arrays.
+        sizes: numbers of joints and bodies. user: (n, WIDTH), jnt_user. forces and places: addresses in MuJoCo.
         forces: damping, applied, passive, bias, M, userdata. places: xpos, xmat, xanchor, xaxis.
     """
     n, nbody = sizes
@@ -253,12 +253,12 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(error_model="numpy", forceinline=True)
 def _drive(n, user, fields):
-    """Replace the applied torques by what the joints get: control law, conditioning, safety filter, motors.
+    """Replace the applied torques by those behind control law, conditioning, safety filter and motors.
 
-    Called with a constant n, it is compiled for that n: loops unroll, and the filter costs half (benchmarks/law.py).
+    numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
 
     Args:
-        n: joints. user, fields: addresses of MuJoCo's arrays.
+        n: number of joints. user, fields: addresses of MuJoCo's arrays.
     """
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
@@ -294,8 +294,8 @@ def _hold(forces, dq, user, joint, work):
     """Change the passive force of a step so that it ends with the velocities of stick_slip.py.
 
     Args:
-        forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), of
-            `_friction`. work: (n + 4, n), anything.
+        forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of
+            `_friction`. work: (n + 4, n), any content.
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]

@@ -35,7 +35,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
     """Write the mass matrix (n, n) kg m^2 and the bias torque (n,) Nm of: mass ddq + bias = joint torque.
 
     Args:
-        links: of `links_of`. gravity: (3,) m/s^2 in the base frame.
+        links: output of `links_of`. gravity: (3,) m/s^2 in the base frame.
         q, dq: (n,) rad, rad/s.
         mass, bias: outputs. work: (n, WORK), any content.
     """

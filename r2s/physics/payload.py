@@ -1,8 +1,8 @@
 """Payload of an arm: a rigid body fixed to the last link, with times of attachment and removal.
 
-A changed mass, centre and tensor of the last link represents a payload exactly, in every engine; an external force
-would need the acceleration that it causes. The payload's frame is that of `robot.ee_site`; on a Panda this is the
-flange, the frame of libfranka's setLoad.
+A payload changes mass, centre and tensor of the last link, which is exact in every engine. An external force could
+not represent it, because that force would depend on the resulting acceleration. The payload's frame is that of
+`robot.ee_site`; on a Panda this is the flange, the frame of libfranka's setLoad.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ class Payload:
 
 
 def payload_of(value: Any, name: str = "arm.payload") -> Payload | None:
-    """Return the payload of a setting: a number of kg, or a mapping; None for 0 kg.
+    """Return the payload that a setting describes, a number of kg or a mapping; None for 0 kg.
 
     A number is a point mass at the end effector. A mapping has `mass`, and optionally `centre` (3,) m, `inertia` (3
     principal moments, or xx, yy, zz, xy, xz, yz, in kg m^2 about the centre; default: a sphere of water), `on_s`,

@@ -110,9 +110,9 @@ def joint_kinematics(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def rigid_body(
     robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rest (T, n) Nm, regressor (T, n, n, 10)); the torque is their sum over the links' parameters.
+    """Return (rest (T, n) Nm, regressor (T, n, n, 10)): torque = rest + regressor @ standard parameters.
 
-    The rest is the torque of the MJCF's armature, damping and welded bodies. For the arguments see `regressor`.
+    `rest` is the torque of the file's armature, damping and welded bodies. For the arguments see `regressor`.
     """
     model = robot.model(gravity=gravity is not None)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)

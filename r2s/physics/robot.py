@@ -37,8 +37,8 @@ class Robot:
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
-        velocity_envelope: position-based velocity limits of an FR3: deceleration (n,) rad/s^2 and offset (n,) rad/s
-            in sqrt(2 deceleration distance + offset^2) - offset, with the distance from a position limit; None: none.
+        velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
+            deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
     """
 
     name: str
@@ -103,10 +103,10 @@ class Robot:
 
 
 def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
-    """Return (n,) floats from a value per joint or one for all; `joints`, as "the 7 joints of panda", is for errors.
+    """Return (n,) floats from a value per joint or one for all; errors name `joints`, as "the 7 joints of panda".
 
     Raises:
-        UserError: another number of values, or no numbers.
+        UserError: a wrong number of values, or values that are no numbers.
     """
     try:
         array = np.array(value, dtype=float)
@@ -151,7 +151,7 @@ def load_robot(
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
     The file gives position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
-    its motor), and in URDF velocity limits. Neither format has limits of acceleration or torque rate.
+    its motor); a URDF also gives velocity limits. Neither format has limits of acceleration or torque rate.
 
     Args:
         mjcf: the file; `r2s:models/panda.xml` is one of the package; None: the Panda.

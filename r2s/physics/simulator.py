@@ -57,7 +57,7 @@ class Simulator:
         self._inertia = self.batch.expand("body_inertia")
         self._iquat = self.batch.expand("body_iquat")
         self._mass, self._com = self.batch.expand("body_mass"), self.batch.expand("body_ipos")
-        self._offset = np.zeros((nsim, robot.n))  # as the dynamics have it, without what `push` adds
+        self._offset = np.zeros((nsim, robot.n))  # of the dynamics, without the torques of `push`
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
@@ -67,9 +67,9 @@ class Simulator:
         self.set_dynamics(dynamics)
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray | None = None, repeat: int = 1) -> None:
-        """Give the arms `ids` (all by default) new dynamics, broadcast over the arms where it has no batch shape.
+        """Set the dynamics of the arms `ids` (all by default); a field without a batch shape applies to all of them.
 
-        With repeat > 1 each of the given dynamics goes to that many consecutive arms.
+        With repeat > 1, each of the given dynamics applies to that many consecutive arms.
         """
         arms = np.arange(self.nsim) if ids is None else np.asarray(ids)
         moments, axes = principal_axes(dynamics.inertia)
@@ -97,7 +97,7 @@ class Simulator:
     ) -> None:
         """Put control law, conditioning, safety filter, delay and lag between `rollout` and the joints.
 
-        Without a control law the torques of `rollout` are efforts: they go to the safety filter as they are.
+        Without a control law the torques of `rollout` are efforts: they enter the safety filter directly.
 
         Args:
             limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
@@ -114,7 +114,7 @@ class Simulator:
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
         """Set the commands (nsim, c) of the control law until the next call.
 
-        speed_noise (nsim, n) rad/s is what the sensors add to the speeds that the law sees; None: nothing.
+        speed_noise: (nsim, n) rad/s, sensor noise on the speeds that the law receives; None: no noise.
         """
         n = self.robot.n
         self._memory[:, self._kept : self._kept + self._sizes[0]] = command
@@ -122,15 +122,15 @@ class Simulator:
             self._memory[:, native.NOISE * n : (native.NOISE + 1) * n] = speed_noise
 
     def push(self, tau: np.ndarray) -> None:
-        """Let something else push the joints with tau (nsim, n) Nm from now on, beside the arms' own offsets."""
+        """Apply external joint torques tau (nsim, n) Nm until the next call, in addition to the arms' offsets."""
         self._user[:, :, native.OFFSET] = self._offset + tau
 
     def reset(
         self, q: np.ndarray, dq: np.ndarray, ids: np.ndarray | None = None, bristle: np.ndarray | float = 0.0
     ) -> None:
-        """Put the arms `ids` (all by default) at q, dq (m, n) rad, rad/s, with current kinematics.
+        """Set q, dq (m, n) rad, rad/s of the arms `ids` (all by default), and update their kinematics.
 
-        bristle (m, n) in [-1, 1] is what friction with a memory remembers: how far its bristles are bent.
+        bristle: (m, n) in [-1, 1], bristle deflection of friction with a memory.
         """
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         at = slice(None) if ids is None else ids
@@ -144,11 +144,11 @@ class Simulator:
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return copies of everything that makes the arms what they are, for `set_state`."""
+        """Return a copy of the complete state of the arms, for `set_state`."""
         return {name: array.copy() for name, array in self._arrays().items()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go back to what `state` returned; what the arms do next is the same, bit for bit."""
+        """Restore what `state` returned; the same torques then give the same motion, bit for bit."""
         for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()
@@ -167,12 +167,12 @@ class Simulator:
         return self.batch.rollout(tau.shape[1], tau, control_spec=spec, record=record, ids=ids)
 
     def kinematics(self) -> None:
-        """Make `ee` and `jacobian` current after a rollout."""
+        """Update `ee` and `jacobian` after a rollout."""
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS)
 
     @property
     def tau(self) -> np.ndarray:
-        """(nsim, n) Nm, what the driver's law sent last."""
+        """(nsim, n) Nm, the last command of the safety filter."""
         n = self.robot.n
         return self._memory[:, native.SENT * n : (native.SENT + 1) * n]
 
@@ -184,7 +184,7 @@ class Simulator:
 
     @property
     def limited(self) -> np.ndarray:
-        """(nsim,), in how many cycles since `reset` the driver's law changed what was asked for."""
+        """(nsim,), number of cycles since `reset` in which the safety filter changed the effort."""
         return self._memory[:, native.LIMITED * self.robot.n]
 
     @property
@@ -219,10 +219,10 @@ def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
 
 
 def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray:
-    """Return the columns of `jnt_user` that say what the arm is, (..., n, LIMITS)."""
+    """Return the columns of `jnt_user` that describe the arm, (..., n, LIMITS)."""
     f = native
     moment, nominal = d.mass[..., None] * d.com, robot.mass[:, None] * robot.com
-    # what gravity compensation lacks: it believes the nominal links, and whatever load it was told of
+    # error of gravity compensation, which uses the nominal links and the declared payload
     last = np.arange(robot.n) == robot.n - 1
     errors = (
         d.mass - robot.mass - last * d.declared_payload[..., :1],
@@ -235,7 +235,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.P1 : f.P1 + d.phi.shape[-1]] = d.phi
     rows[..., f.OFFSET] = d.offset
     rows[..., f.BREAK_NEG : f.BREAK_POS + 1] = d.breakaway
-    if not d.family.has_memory:  # which holds by itself: no dead zone
+    if not d.family.has_memory:  # a law with memory has its own stiction: no dead zone
         rows[..., f.DQ_MIN], rows[..., f.NET] = d.dq_min, d.stiction_model == "net"
         rows[..., f.REST_NEG : f.REST_POS + 1] = d.family.at_rest(d.phi)
     rows[..., f.DAMPING] = model.dof_damping
@@ -247,7 +247,7 @@ def _law_columns(robot: Robot, model: mujoco.MjModel, d: Dynamics) -> np.ndarray
     rows[..., f.MASS], rows[..., f.MOMENT : f.MOMENT + 3] = robot.mass, nominal
     rows[..., f.GRAVITY : f.GRAVITY + 3] = robot.gravity
     rows[..., f.DELAY], rows[..., f.LAG], rows[..., f.LEVEL] = delay, lag, d.level
-    # an arm in which links differ from nominal, or load counts, sums them up at every step; others are spared that
+    # only arms with changed links or load-dependent friction sum up masses in every step
     differs = (d.load != 0) | (errors[0] != 0) | (errors[1] != 0).any(-1)
     rows[..., f.LINK] = differs.any(-1, keepdims=True)
     return rows

@@ -4,8 +4,8 @@ A joint at rest sticks while the net torque on it lies within its breakaway edge
 coupling to other joints, but not the joint's own friction. Beyond the edges it slides against the friction of its
 direction. Torques are constant for a step, so accelerations are constant between events, and each event is located
 exactly (event-driven integration: Pfeiffer and Glocker, Multibody Dynamics with Unilateral Contacts, 1996). Time
-stepping would use the friction at the end of a step for all of it, an error of up to h times that friction at each
-reversal.
+stepping would apply the friction at the end of a step to the whole step: at each reversal, an error of up to h times
+that friction.
 
 Joint limits are MuJoCo's own: their force adds to the result of this module.
 """

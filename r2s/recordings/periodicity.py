@@ -1,7 +1,7 @@
 """Detection of repeated motion, so that a train/validation split does not leak.
 
-The comparison of two pieces of motion covers every lag at once (correlation by FFT). Their squared distance is
-|a|^2 + |b|^2 - 2 a b, summed over the rows that both have.
+Two pieces of motion are compared at every lag at once (correlation by FFT). Their squared distance is |a|^2 + |b|^2 -
+2 a b, summed over the rows that both contain.
 """
 
 from collections.abc import Sequence
@@ -54,8 +54,7 @@ def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
     """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
 
     With these shifts, the same motion has the same phase in all tracks. The period is None without a repetition. If
-    a motion repeats in another track but not within one, the period covers all tracks: no phase then occurs twice
-    within a track.
+    motion repeats between tracks only, the period spans all aligned tracks: no phase then occurs twice within one.
     """
     shift, found, period = np.zeros(len(tracks)), False, None
     for k, b in enumerate(tracks):

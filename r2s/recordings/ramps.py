@@ -23,8 +23,8 @@ class Ramps:
     """K recorded ramps, one per trajectory of the recording.
 
     Attributes:
-        recording: of the commanded torque; identification uses t, and q and tau of the ramped joint.
-        joint: (K,) or one for all, from 0. sign: (K,) or one, 1 or -1. pose: (K,) or one, posture index from 0.
+        recording: with commanded torque; identification uses t, and q and tau of the ramped joint.
+        joint: the ramped joint, from 0. sign: direction, 1 or -1. pose: posture, from 0. Each (K,) or one.
 
     Raises:
         UserError: the torque is not the command, or the numbers do not fit the recording.
@@ -149,7 +149,7 @@ def _per_row(field: str, values: np.ndarray, ramp: np.ndarray) -> np.ndarray:
 
 
 def _check_commands(ramps: Ramps) -> None:
-    """Raise UserError if the command of another joint changes more, or in the other direction."""
+    """Raise UserError if another joint's command changes more, or the ramped one's against its sign."""
     r = ramps.recording
     for k, (rows, j, sign) in enumerate(zip(r.stretches, ramps.joint, ramps.sign, strict=True)):
         moved = np.abs(r.q[rows, j] - r.q[rows.start, j]) > BREAKAWAY

@@ -50,11 +50,11 @@ def libfranka_table(table: Table) -> Table:
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
-    """Return the command (T, n) Nm sent in the cycle of each row, from the logged one.
+    """Return the command (T, n) Nm that was sent in the cycle of each row, from the logged commands.
 
     A Franka state at t (T,) s holds the command of the cycle before; in a recording (`r2s.arm.recorder`) the command
-    follows the state. So this is tau_J_d one cycle later, interpolated in a log slower than the arm; the last row is
-    unchanged.
+    follows the state. So the result is tau_J_d one cycle later, interpolated if the log is slower than the arm; the
+    last row is kept.
     """
     return np.stack([np.interp(t + CYCLE, t, column) for column in tau_J_d.T], axis=1)
 
@@ -111,7 +111,7 @@ def choose_joints(
 ) -> list[str]:
     """Return the robot's joints among the names in a log, in the robot's order.
 
-    A message may have another order: some ROS 2 drivers sort the names, others do not. The rules, in this order:
+    Messages may order joints differently: some ROS 2 drivers sort the names, others do not. The rules, in turn:
     `joints` as given; `model_joints`, if each occurs once (also behind a prefix: panda_joint1); n names that differ
     in one number, sorted by it; the first n names, but only without `model_joints`.
 

@@ -19,8 +19,8 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     """Return the standard deviation of the velocity noise (n,) rad/s; 0 if the sampling is too coarse.
 
     The reference velocity is the slope of a cubic through the positions (Savitzky and Golay, Analytical Chemistry
-    36(8), 1964). At low acceleration it is accurate, and a delay of the velocity filter has no effect. So the result
-    is the median over the calmest tenth of all 50 ms pieces. The positions choose these pieces, not dq itself.
+    36(8), 1964). At low acceleration that slope is accurate, and a delay of the velocity filter has no effect. So the
+    result is the median over the calmest tenth of all 50 ms pieces, selected by the positions instead of dq.
 
     Raises:
         UserError: a joint has more than MAX_NOISE, so dq is not the velocity of q.

@@ -46,7 +46,7 @@ def transfer(
     """Save all episodes and the second before each stop; show four episodes; write the report.
 
     Args:
-        run, robot: of the transfer. episodes, rows: per simulator and arm: trajectories, and their measures.
+        run, robot: of the transfer. episodes, rows: {simulator or arm: episodes, or their measures}.
         torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycle, None without an arm.
         stops: of the arm. halted: why the arm did not run all episodes, or None.
     """

@@ -33,7 +33,7 @@ def trials_table(study: Any, folder: Path) -> pd.DataFrame:
 def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray, sign: float) -> np.ndarray:
     """Return the best value (K,) after each compute `at` (K,) s of trials that run one after another.
 
-    A trial counts from its end; nan (pruned, failed) only takes compute. sign: 1 if larger is better, else -1.
+    A trial counts from its end; a nan trial (pruned, failed) only uses compute. sign: 1 if larger is better, else -1.
     """
     ends = np.cumsum(np.asarray(spent, dtype=float))
     best = np.fmax.accumulate(np.where(np.isnan(values), -np.inf, sign * np.asarray(values, dtype=float)))

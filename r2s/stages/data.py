@@ -17,9 +17,9 @@ class ArmData:
     """Motion to record on an arm: data=arm.
 
     Attributes:
-        torque: level of the recorded torque, commanded or measured.
-        seconds: of each of the two motions.
-        excitation_seed: of the first motion, and 1 more of the second.
+        torque: kind of the recorded torque, commanded or measured.
+        seconds: duration of each of the two motions.
+        excitation_seed: seed of the first motion; the second has the next one.
         excitation: file of the first motion; None: it is optimized.
         ramp_poses: postures at which every joint is ramped both ways; 0: no ramps.
 
@@ -50,7 +50,7 @@ class SimulatedData(ArmData):
 
     Attributes:
         truth: its dynamics (`make_truth`). delay, lag: s, of its actuation.
-        position_noise, velocity_noise: standard deviations of its sensors, rad and rad/s.
+        position_noise, velocity_noise: standard deviations of sensor noise, rad and rad/s.
     """
 
     truth: str
@@ -111,7 +111,7 @@ def read_motion(robot, file, share):
     """Return training and validation motion of a `FileData`; they must not have motion in common.
 
     Args:
-        share: of the recording that is held out without a validation file.
+        share: part of the recording that is held out if there is no validation file.
     """
     import numpy as np
 

@@ -64,7 +64,7 @@ def make_parts(cfg):
     """Return the inputs of an identification; a real arm is not touched.
 
     Raises:
-        UserError: the config asks for something impossible.
+        UserError: the config contradicts itself, or a file is missing or wrong.
     """
     from r2s.excitation.motion import load
 

@@ -19,7 +19,7 @@ STEPS = (
 )
 STOPPED = 3  # exit status of a step that a stopped arm ended, see r2s/cli.py
 MODELS = ("identified", "nominal")
-# with adapt=, the arm also runs computed torque with the identified model, and the identified policy with the adapter
+# with adapt=: also computed torque with the identified model, and the identified policy with the adapter
 COMPUTED, ADAPTED = "computed", "adapted"
 ROWS = {COMPUTED: "computed torque", ADAPTED: "identified model + adapter"}
 CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # of the arm at work
@@ -133,10 +133,10 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return {label: words of a command} for each step: identify, train, transfer.
 
     Both trainings have the same settings, time and machine, so that on the arm only the model differs. With an
-    adapter, the arm is identified without payload and changes: they appear unannounced in the transfer.
+    adapter, the arm is identified without payload and other changes; the transfer adds them unannounced.
 
     Args:
-        cfg: of the pipeline. name: of the pipeline, which the names of the steps begin with.
+        cfg: config of the pipeline. name: of the pipeline; the names of its steps begin with it.
         overrides: typed by the user; each step gets those that it reads.
     """
     root, choice = Path(cfg.root), chosen(overrides, cfg)

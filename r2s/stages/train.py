@@ -49,7 +49,7 @@ def reads(cfg):
 class Parts:
     """The parts of a training, made before its run folder, so that a config error leaves no folder.
 
-    An algo without training has only the first five, with `algo` as its controller.
+    An algo without training has only the first five; `algo` is then the controller.
     """
 
     robot: Any
@@ -96,7 +96,7 @@ def make_parts(cfg):
 
 
 class Selection:
-    """The best and the last of a training's evaluations; of equal scores the later is better."""
+    """The best and the last of a training's evaluations; of two equal scores the later counts as better."""
 
     def __init__(self, task):
         self._task, self.best, self.last = task, {}, {}
@@ -189,7 +189,7 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config with `calibration=` of a resumed training in its own folder: the original may be gone."""
+    """Return the config of a training; if resumed, `calibration=` is its own copy, as the original may be gone."""
     if not (cfg.calibration and cfg.resume and (Path(cfg.resume) / CALIBRATION[0]).is_file()):
         return cfg
     model = cfg.copy()

@@ -132,7 +132,7 @@ class TrialRun:
     A training that a killed tune left running may still write its folder; then there is no process to start.
 
     Args:
-        trial: of Optuna. folder: run folder. words: command of the training. log: file for its stderr.
+        trial: Optuna's trial. folder: run folder. words: command of the training. log: file for its stderr.
     """
 
     def __init__(self, trial: Any, folder: Path, words: Sequence[str], log: Path):
@@ -165,7 +165,7 @@ class TrialRun:
         return "left" if is_locked(self.folder) else read_meta(self.folder)["status"]
 
     def report(self, measure: str) -> list[float]:
-        """Report new evaluations to Optuna; return the measure of all."""
+        """Report new evaluations to Optuna; return the measure of every evaluation."""
         path = self.folder / "evaluations.csv"
         text = path.read_text() if path.is_file() else ""
         complete = text[: text.rfind("\n") + 1]  # the training may be writing the last row

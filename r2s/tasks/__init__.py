@@ -1,1 +1,1 @@
-"""What is asked of an arm, its reward, and how an episode is judged."""
+"""Tasks: goals, observations, rewards, the rollout of an episode, and its measures."""

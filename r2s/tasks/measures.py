@@ -81,11 +81,11 @@ class MeasureTable:
 
     Attributes:
         measures: the task's own; COMMON are known besides.
-        selection: what trainings are compared by. The first must exist in a row, the last ranks groups.
+        selection: measures that compare trainings. The first must exist in a row, the last ranks groups.
         rows: columns of the table with a row per simulator and arm.
         comparison: columns of the table of trainings. curves: panels of the learning figure.
         scores: panels of the figure of scores.
-        transfer: measures of a transfer to an arm, which adapters are compared by, episode by episode.
+        transfer: measures of a transfer to an arm that compare adapters, episode by episode.
         diagnostics: columns of a transfer's second table.
         corner: heading of the row labels. description: what a policy does, in one sentence.
         error: name, unit and scale of `Episodes.distance`. error_levels: lines in its figure, in that unit.

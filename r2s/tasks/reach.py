@@ -69,8 +69,8 @@ class ReachTask(BaseTask):
             quantiles MIDDLE of random postures.
         height: lowest goal, m. azimuth: goals lie within +- this angle of straight ahead, rad.
         speed_noise: rad/s, see `Task`; None: SPEED_NOISE if the model has measurement noise, as identified arms do,
-            else 0. A policy trained with noise does not answer it with torque, so it does not excite oscillations of
-            elastic gears, which no rigid model has (benchmarks/results/transfer.md).
+            else 0. A policy trained with noise does not react to it, so it does not excite oscillations of elastic
+            gears, which no rigid model has (benchmarks/results/transfer.md).
     """
 
     ctrl_hz: int = 50

@@ -1,7 +1,8 @@
 """The paper's reward, eq. (2), and the curriculum that leads to it.
 
 A reward is a weighted sum of named terms. The replay buffer stores the terms, and each update weights them with the
-present weights. So a curriculum can move its weights without making stored transitions stale. Three terms are not in
+present weights. So a curriculum can change its weights without making stored transitions stale. Three terms are not
+in
 the paper: a bonus for precision, a penalty for motion close to the goal, and a penalty for commands that the safety
 filter changes.
 """
@@ -65,9 +66,8 @@ MAX_FACTOR = 4.0  # largest penalty factor
 
 
 class Reward:
-    """A weighted sum of named terms; `reward._target_` names a subclass, made with the other keys of its yaml.
-
-    This one has the task's own terms and weights: `reward=task`.
+    """A weighted sum of named terms; `reward._target_` names a subclass, made with the other keys of its yaml. This
+    base class has the task's own terms and weights: `reward=task`.
     """
 
     def terms(self, task: Any) -> tuple[str, ...]:
@@ -89,7 +89,7 @@ class Reward:
         return task.paper_weights
 
     def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
-        """Return the factor after env_steps more of a training, whose mean terms were `seen` (k,); 1 at its start."""
+        """Return the factor after env_steps further steps with mean terms `seen` (k,); a training starts with 1."""
         return factor
 
 
@@ -106,9 +106,9 @@ class Curriculum(Reward):
         anneal: fractions of the budget where the change starts and ends.
         max_filter_rate: largest share of the cycles, exploration included, in which the safety filter may change the
             command; None: any. From the first of `anneal` on, a higher share raises the filter penalty, and a lower
-            one reduces it, down to the curriculum's weight. One fixed weight does not hold a share: policies that
-            differ in their seed alone are limited in 1 to 6 % of the cycles (benchmarks/results/minutes.md). This is
-            integral control of a Lagrange multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
+            one reduces it, down to the curriculum's weight. No fixed weight holds a share: with it, the filter acts
+            in 1 to 6 % of the cycles, depending on the seed (benchmarks/results/minutes.md). This is integral control
+            of a Lagrange multiplier's logarithm (Stooke, Achiam and Abbeel, ICML 2020).
 
     Raises:
         UserError: no pair of numbers, or a number outside its range.

@@ -1,4 +1,4 @@
-"""The one rollout of a policy, for simulators and arms, and the measures of reaching."""
+"""The rollout of a policy, the same for simulators and arms, and the measures of reaching."""
 
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -27,7 +27,7 @@ class Arms(Protocol):
     """Arms that run episodes, one control period at a time: a batch, one arm in an engine, or a real arm.
 
     Attributes:
-        robot: of each arm. width: number of episodes that run at once.
+        robot: model of each arm. width: number of episodes that run at once.
         speeds: (width, T, n) rad/s after each control step of the finished episodes, with the measurement noise
             smoothed out; None if speeds have no noise.
     """
@@ -48,7 +48,7 @@ class Arms(Protocol):
         ...
 
     def end(self) -> np.ndarray:
-        """End the episodes; return (width,), which of them had stopped before."""
+        """End the episodes; return (width,) bool: whether each arm had stopped before."""
         ...
 
 
@@ -154,12 +154,12 @@ def measures(episodes: Episodes) -> dict[str, float]:
 
     success_x: share of episodes within x of the goal for the whole last 0.5 s. distance_median_m: median over goals
     of the mean distance in that time. return_paper: mean sum of eq. (2); return_smooth: without the noise of measured
-    speeds, which eq. (2) takes for accelerations. time_to_reach_s: median time after which the
-    hand stays within 2 cm, of the episodes that got there. overshoot_m: how far out of 2 cm it came again after it
-    had first been within, mean of those that had. rest: share of episodes in which every joint is slower than REST
-    for the whole last 0.5 s: a hand can lie on a joint's axis. q_left_rad: how close joints come to position limits,
-    the 5 % quantile over episodes. limited: share of the cycles in which the driver's law changed what was asked for.
-    collision: share of episodes that ended because the arm touched itself or the table.
+    speeds, which eq. (2) takes for accelerations. time_to_reach_s: median time until the end effector stays within 2
+    cm, over the episodes that succeed. overshoot_m: largest distance outside the 2 cm after the first entry, mean
+    over episodes. rest: share of episodes with every joint slower than REST for the whole last 0.5 s (the end
+    effector alone can lie on a joint's axis). q_left_rad: distance to the position limits, 5 % quantile over
+    episodes. limited: share of the cycles in which the safety filter changed the torque. collision: share of episodes
+    ended by a contact.
     """
     step = episodes.t[1] - episodes.t[0]
     hold = round(HOLD_S / step)
@@ -192,7 +192,7 @@ def measures(episodes: Episodes) -> dict[str, float]:
 
 
 def gap(one: Episodes, other: Episodes) -> dict[str, float]:
-    """Return how far apart one policy came out on the same goals: RMSE of the hand's path, mm, and of torques, Nm."""
+    """Return the gap of two sets of episodes with equal goals: RMSE of end-effector path, mm, and of torques, Nm."""
     path = np.linalg.norm(one.ee - other.ee, axis=-1)
     return {
         "ee_path_rmse_mm": float(1e3 * np.sqrt((path**2).mean())),

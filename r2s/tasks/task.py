@@ -18,7 +18,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rewards import TERMS
 
-# share of the cycles that the safety filter may change before it costs score: below it, policies are no better for it
+# filter rate above which the score falls; lower rates do not make policies better
 MAX_FILTER_RATE = 0.04
 TORQUE_STD = 0.3  # of the torque limit, to normalise an observed controller torque by
 
@@ -71,7 +71,7 @@ class Episodes:
         reward_smooth: (E, T), the same without the noise of measured speeds.
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
-        collision: (E,) words: when the episode ended by which contact; "" without contact.
+        collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
     """
 
     t: np.ndarray
@@ -213,7 +213,7 @@ def observe(task: Task, controller: Controller, state: State, goals: np.ndarray,
     """Return the policy's observations (m, d) float32: the task's terms, then the controller's.
 
     Args:
-        task, goals: see `Task.observe`. controller: of the task. state: the true state, whose noise is added here.
+        task, goals: see `Task.observe`. controller: of the task. state: the true state; this function adds its noise.
         torque: (n,) Nm, `Task.torque_limit`.
     """
     state = state.measured()
@@ -278,8 +278,8 @@ class BaseTask:
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.
 
-        1 % more success within 1 cm, or at rest, is worth 1 of the return. Above MAX_FILTER_RATE, 1 % more cycles
-        that the safety filter changes cost 10.
+        One percentage point of success within 1 cm, or of episodes at rest, counts like 1 of the return. Each point
+        of the filter rate above MAX_FILTER_RATE costs 10.
         """
         price = 1e3 * max(row["limited"] - MAX_FILTER_RATE, 0.0)
         return 100 * (row["success_1cm"] + row["rest"]) + row["return_paper"] - price

@@ -197,7 +197,7 @@ class TrackTask(BaseTask):
     def plan(self, robot: Robot, start: Sequence[float], shape: Curve, pace: float) -> np.ndarray:
         """Return the plan (steps + 1 + preview, 6 + 3 n) of a custom curve.
 
-        Contacts are not checked, nor whether the curve belongs to the training's family.
+        This checks neither contacts nor whether trainings contain such curves.
 
         Args:
             robot: the arm. start: (3,) m of the end effector. shape: offset from there, (T, 3) m, at arc length u
@@ -280,9 +280,9 @@ class TrackTask(BaseTask):
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv.
 
-        path_rmse_mm: of the distance between end effector and reference, over all steps of all paths that were not
-        stopped. path_max_mm: mean over paths of their largest error. within_x: share of the steps; steps of stopped
-        paths count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: over joints
+        path_rmse_mm: RMS distance of end effector and reference, over all steps of all paths that were not stopped.
+        path_max_mm: mean over paths of their largest error. within_x: share of the steps; steps of stopped paths
+        count as outside. return_track: mean sum of the reward under `paper_weights`. torque_rms_Nm: over joints
         and time. jerk: m/s^3, RMS of the end effector, from a cubic over JERK_S. stopped: share of the paths.
         q_left_rad, limited: as for reaching.
         """

@@ -1,9 +1,9 @@
 """End-effector trajectories: curves, the postures that follow them, and the fastest feasible timing.
 
-A curve is x(u) m, with u in metres at the fastest point. Inverse kinematics on a grid and a cubic spline give
-postures q(u). The clock u(t) starts and stops with minimum-jerk speed and runs at a pace of v m/s in between. So
-position, velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed
-and the acceleration bounds of the safety filter leave a margin.
+A curve is x(u) m; where it is fastest, u is arc length. Inverse kinematics on a grid and a cubic spline give postures
+q(u). The clock u(t) starts and stops with minimum-jerk speed and runs at a pace of v m/s in between. So position,
+velocity and acceleration of end effector and joints are continuous. The pace is reduced until torque, speed and the
+acceleration bounds of the safety filter leave a margin.
 """
 
 from collections.abc import Callable
@@ -167,7 +167,7 @@ class Paths:
     def plan(self, start: np.ndarray, shape: Curve, pace: float, t: np.ndarray) -> np.ndarray | None:
         """Return the plan (T, 6 + 3 n) at t (T,) s, slower than `pace` m/s if `strain` exceeds 1; None: not feasible.
 
-        Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may exceed the path.
+        Columns: position and velocity of the end effector, m, m/s; q, dq, ddq of the joints. t may be longer.
         """
         found = self.postures(start, shape, pace)
         if found is None:

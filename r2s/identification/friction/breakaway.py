@@ -1,21 +1,21 @@
 """Breakaway torque of each joint from recorded ramps: the paper's Table II.
 
-A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has been
-accelerating for 10 to 150 ms while the command rose on, and before release a real joint creeps: its bristles bend,
-ever faster, by millirads. Neither a threshold nor a parabola through the first motion separates creep from release.
-So the motion of a joint that does both is fitted to the positions, with the release command U as a parameter:
+A ramp raises the command of one joint until the joint has clearly moved (r2s/arm/ramp.py). By then the joint has
+accelerated for 10 to 150 ms while the command kept rising. A real joint also creeps before release: its bristles bend
+by millirads, ever faster. Neither a threshold nor a parabola through the first motion separates creep from release.
+So r2s fits a motion with creep and release to the positions; the release command U is a parameter:
 
     d2x/dt2 = kappa (u - U + (U - u0) exp(-x / z)) + [u > U] jump - lambda dx/dt,    x = 0 and u = u0 at first
 
 u is the command at the joint in the ramp's direction and kappa the inverse inertia. Stiction balances u up to U while
-it is stretched over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). Friction
-after release is less than U (Stribeck; eq. 6 of the paper drops it altogether and has z = 0): `jump` is the
-difference as an acceleration. This needs no model of the arm.
+its bristles stretch over the creep length z (loading curve of Dahl, J. Dyn. Sys. Meas. Control 98(4), 1976). After
+release friction is less than U (in eq. 6 of the paper it is 0, and z = 0): `jump` is the difference as an
+acceleration. This fit needs no model of the arm.
 
-If friction falls over a range of velocities (Stribeck), motion begins so slowly that the sudden `jump` detects
-release late: by 4 to 22 mNm on an arm of known truth. With the sliding motion of an identified arm (`Slide`), which
-has jump (1 - exp(-(v / fall)^2)) instead, only U is fitted: within 0.2 mNm on that arm. That fit counts if it
-explains the motion as well as the free fit.
+If friction falls over a range of velocities (Stribeck), motion begins slowly, and a fit with a sudden `jump` finds
+release late: by 4 to 22 mNm on an arm of known truth. `Slide`, the sliding motion of an identified arm, has jump (1 -
+exp(-(v / fall)^2)) instead. With it only U is fitted, within 0.2 mNm on that arm. r2s uses this fit if it explains
+the motion as well as the free one.
 """
 
 from collections.abc import Iterator
@@ -55,11 +55,11 @@ class Breakaway:
             offset is the breakaway torque: ramps alone determine the width of the dead zone, not its centre.
         spread: (n, 2) Nm, standard deviation over ramps; NaN for fewer than two.
         count: (n, 2) ramps with a release. ramped: (n, 2) ramps in all.
-        held: (n, 2) Nm, without a release the largest command that the joint held against; 0 without a ramp.
-        resolution: (n, 2) Nm, accuracy of the fit of one ramp: `RELEASE_S` times its rate.
+        held: (n, 2) Nm, if no ramp released the joint, the largest command without motion; 0 without a ramp.
+        resolution: (n, 2) Nm, accuracy of the fit of one ramp: `RELEASE_S` times the ramp's rate.
         value: (K,) Nm, of each ramp; NaN without a release.
-        misfit: (K,) rad RMS between positions and fit. Well above the encoder noise (or 5e-5 for real stick-slip) the
-            motion was of another kind.
+        misfit: (K,) rad RMS between positions and fit. A value well above the encoder noise (or 5e-5 for real
+            stick-slip) means another kind of motion.
         joint, sign, pose: (K,), see `Ramps`.
     """
 
@@ -77,7 +77,7 @@ class Breakaway:
 
     @property
     def unknown(self) -> dict[str, str]:
-        """Reasons for unknown directions: {"joint 3, positive": "not reached: held against 2.4 Nm"}."""
+        """Directions without a breakaway, and why: {"joint 3, positive": "not reached: held against 2.4 Nm"}."""
         reasons = {}
         for j, side in np.argwhere(self.count == 0):
             held = abs(self.held[j, side])
@@ -92,7 +92,7 @@ class Slide:
 
     Attributes:
         kappa: (K,) rad/s^2 per Nm, inverse inertia with the other joints at rest.
-        level: (K,) Nm, command that balances slow sliding above `fall`: the Coulomb level without other torques.
+        level: (K,) Nm, command that sustains slow sliding above `fall`: Coulomb friction minus other torques.
         viscous: (K,) Nm s/rad.
         fall: (K,) rad/s, over which friction falls from breakaway to `level` as exp(-(v / fall)^2).
         misfit: (K,) rad RMS of the free fit.
@@ -113,10 +113,10 @@ def estimate_breakaway(
     A ramp that does not reach `moved` in its own direction, or whose joint moved before the command rose, gives NaN.
 
     Args:
-        ramps: commands that rise (fall for sign -1) from rest, at any rate. Expect an error of the rate times 0.5 to
-            3 ms for an encoder of 2e-5 rad, the most for the largest inertia.
-        delay, lag: s, of the command; both shift the result.
-        moved: rad from the first position, well beyond creep; later rows do not matter.
+        ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
+            for an encoder of 2e-5 rad, largest for the largest inertia.
+        delay, lag: s, of the command; each shifts the result.
+        moved: rad from the first position, well beyond creep; rows after that are not used.
         slide: sliding motion by an identified model.
 
     Raises:
@@ -146,7 +146,7 @@ def estimate_breakaway(
 
 
 def _in_direction(ramps: Ramps) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, in its direction, time and angle from the first row."""
+    """Yield t (T,) s, x (T,) rad and u (T,) Nm of each ramp, in its direction; t and x count from the first row."""
     r = ramps.recording
     for rows, j, sign in zip(r.stretches, ramps.joint, ramps.sign, strict=True):
         yield r.t[rows] - r.t[rows.start], sign * (r.q[rows, j] - r.q[rows.start, j]), sign * r.tau[rows, j]

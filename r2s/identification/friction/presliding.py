@@ -1,7 +1,7 @@
 """Presliding distance, over which friction with memory reverses: the softness of its bristles.
 
-Torque rows wait until bristles are bent, so they do not see them bend. Replays of short windows see it at every
-reversal. With all other parameters from the torque fit, replays determine this one.
+Torque rows begin where bristles are already bent, so they contain nothing about bending. Replays of short windows
+show it at every reversal. The torque fit gives all other parameters, and replays give this one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ def estimate_presliding(
 
 
 class Presliding:
-    """The estimate of `estimate_presliding` as rows of a fit: its logarithm in standard deviations."""
+    """Residual rows that hold log presliding at the result of `estimate_presliding`, in standard deviations."""
 
     def __init__(self, presliding: np.ndarray, sigma: np.ndarray):
         self._value, self._sigma = np.log(presliding), np.maximum(sigma, MIN_SIGMA)

@@ -56,7 +56,7 @@ class StaticFriction:
         return Slide(kappa, level, viscous, fall, self._misfit)
 
     def breakaway(self, d: Dynamics) -> np.ndarray:
-        """Return (n, 2) Nm: net torques at release, the mean over ramps; those of d without a ramp."""
+        """Return (n, 2) Nm: net torques at release, mean over ramps; without a ramp, the breakaway torques of d."""
         net, out = self.net_torque(d), d.breakaway.copy()
         for j, side in set(zip(self.joint.tolist(), self.side.tolist(), strict=True)):
             out[j, side] = net[(self.joint == j) & (self.side == side)].mean()

@@ -1,6 +1,6 @@
 """Stiction model of joints at rest, and their breakaway torques if no ramps were recorded.
 
-Both are scanned: the error has no gradient with respect to them.
+r2s scans both, because the error has no gradient with respect to them.
 """
 
 from dataclasses import replace
@@ -63,11 +63,11 @@ def scan_breakaway(
     nthread: int,
     report: Report,
 ) -> np.ndarray:
-    """Return the breakaway torques (n, 2) Nm that replay the recording best, all else as in `dynamics`.
+    """Return the breakaway torques (n, 2) Nm that replay the recording best; all else is that of `dynamics`.
 
-    The error jumps when a joint is released one step sooner, so each torque is scanned over [0, largest], all at once
-    and each judged by its own joint, then about the best value, ever finer. The coarse scan runs twice, because wrong
-    torques of other joints disturb the first one.
+    The error jumps when a joint is released one step sooner. So all torques are scanned at once, each judged by its
+    own joint: first over [0, largest], then ever finer about the best value. The coarse scan runs twice, because
+    wrong torques of other joints disturb the first pass.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}

@@ -1,9 +1,9 @@
 """A recording as weighted means over short windows in which a joint slides in one direction.
 
 Friction at standstill and at a reversal is not a function of velocity, and a low-pass spreads such moments over a
-tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or turns
-(modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command have the same weights.
-Between two reversals the windows are shorter and the rows noisier; the encoder noise tells by how much.
+tenth of a second. So each row of a joint is a weighted mean over a window that ends before the joint stops or
+reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torque, friction and command have the same
+weights. Close reversals make windows shorter and rows noisier; the encoder noise gives the amount.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ NORMAL = 0.6745  # median magnitude of a normal variable, in standard deviations
 SHORTEST, LONGEST = 0.024, 0.1  # s, half a window
 GUARD = 8e-3  # s, over which the low-pass spreads a stop
 STEADY = 0.2  # relative change of velocity allowed over PRESLIDING, for a friction law with memory
-STEADY_ROWS = 101  # rows of the polynomial that judges it; over five rows noise passes for acceleration
+STEADY_ROWS = 101  # rows of the polynomial that tests this; over five rows noise looks like acceleration
 MAX_LATENCY = 0.04  # s, of a command
 HOLD_STEPS = (np.arange(8) + 0.5) / 8  # midpoints of the step for which a command is held
 LAG_POINTS, LAG_WEIGHTS = np.polynomial.laguerre.laggauss(16)  # quadrature of a first-order lag, over exp(-x)
@@ -64,9 +64,9 @@ class SlidingMotion:
     ) -> "SlidingMotion":
         """Find windows about moments at `rate_hz` in which a joint is faster than `slowest` rad/s.
 
-        With `slid`, rad, for a friction law with memory, a window starts once the joint has slid that far since its
-        reversal, because bristles bend first, over `presliding_rad`, one distance or (n,). Rows then also need a
-        velocity that is steady over PRESLIDING, because bristles remember the friction of the velocity before.
+        For a friction law with memory, a window starts once the joint has slid `slid` rad since its reversal, because
+        bristles bend first, over `presliding_rad`, one distance or (n,). Its velocity must also be steady over
+        PRESLIDING, because bristles remember the friction of earlier velocities.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -128,7 +128,7 @@ class SlidingMotion:
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return (T, n) Nm: the mean command at the joints, held for a step, `delay` s late, behind a lag.
 
-        It is u(t - delay - hold - x), averaged over hold, uniform within a step, and x, exponential with mean lag.
+        It is the mean of u(t - delay - hold - x) over hold, uniform within a step, and x, exponential with mean lag.
         """
         late = (delay + HOLD_STEPS[:, None] * SIM_DT + lag * LAG_POINTS) / SIM_DT + 1.0
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)

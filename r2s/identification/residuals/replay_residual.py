@@ -158,10 +158,9 @@ def _random_effects(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviations of b (K,) and e (n,) of error (W, R') = z b + e, by maximum evidence.
 
-    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b), from
-    `sigma` and `noise` on. The mean of b over all windows is a wrong parameter, an offset above all, rather than
-    noise: as noise it would keep the next fit from correcting it. No d falls below `min_sigma` (K,), for start angle
-    and velocity the encoder's.
+    The fixed point of MacKay, Neural Computation 4(3), 1992: d = sum(mean^2) / (number of well-determined b),
+    starting at `sigma` and `noise`. The mean of b over all windows comes from a wrong parameter, mostly an offset. It
+    does not count as noise, so that the next fit can correct it. No d falls below `min_sigma` (K,), the encoder's.
     """
     _, rows, k = z.shape
     n = len(noise)

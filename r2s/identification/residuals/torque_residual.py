@@ -1,7 +1,7 @@
 """Torque residual (equation error): torque predicted at the measured motion minus recorded torque.
 
 Link-side and motor torque include gravity and have no command to replay, so this is their only residual. For
-commanded torque it is the fast regression start. Rows are in units of their own standard deviation, see `reweighted`.
+commanded torque it is the fast start of a fit. Rows are in units of their own standard deviation, see `reweighted`.
 """
 
 from copy import copy
@@ -34,7 +34,7 @@ class TorqueResidual:
         space, recording: the parameters, and the data.
         cutoff_hz, rate_hz: of the zero-phase filter, and of the rows.
         presliding_rad: distance over which bristles bend, one or (n,).
-        slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not turn
+        slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not reverse
             (modulating_functions.py), weighted by their encoder noise.
     """
 
@@ -123,7 +123,7 @@ class TorqueResidual:
         return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(m.ddq)
 
     def error(self, dynamics: Dynamics) -> np.ndarray:
-        """Return (T, n) Nm, predicted minus recorded torque; a command is taken as late as it acts on the joints."""
+        """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
         if not self.commanded:
             return self.predict(dynamics) - self.motion.tau
         return self.predict(dynamics) - self.motion.command(float(dynamics.delay), float(dynamics.lag))
@@ -148,7 +148,7 @@ class TorqueResidual:
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
         """Return (R, P): the change of the residual at x (P,) as each value in turn goes to `stepped` (P,).
 
-        A dozen evaluations replace P: friction acts on its own joint, and torque is linear in standard parameters.
+        A dozen evaluations suffice: friction acts on its own joint, and torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
         d = space.dynamics(x)
@@ -203,7 +203,7 @@ def _standard(d: Dynamics) -> np.ndarray:
 
 
 def _constant_sigma(r: np.ndarray, noise: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return (n,) Nm: the deviation that together with noise (T, n) gives the residual r (T, n) an RMS of 1."""
+    """Return (n,) Nm: the constant deviation that with noise (T, n) scales the residual r (T, n) to an RMS of 1."""
     count = np.maximum(seen.sum(0), 1)
     high = np.maximum((r**2).sum(0) / count, MIN_SIGMA**2)
     low = np.full_like(high, MIN_SIGMA**2)

@@ -21,7 +21,7 @@ from r2s.recordings.recording import Recording
 
 STATE_SAMPLES = 31  # ms, of the local fit that gives a window's start state
 HALF = STATE_SAMPLES // 2
-SHORTEST = 0.25  # of the window length: a shorter window costs more than it tells
+SHORTEST = 0.25  # of the window length: a shorter window costs more than it contributes
 MOVED = 0.02  # rad, range of a joint that moves
 SCATTER = 0.1  # Nm, scatter of breakaway commands between postures
 MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
@@ -67,10 +67,10 @@ def cut_windows(
     Args:
         limit: keep that many windows, evenly spread.
         slowest: rad/s. A window ends where a joint gets slower, and the next starts when all are faster again. At
-            rest the smallest change of a parameter shifts the release of a joint by a step, which disturbs every
-            other one. Joints that never move are ignored.
-        edges: (n, 2) Nm, commands at which resting joints break away. A slow joint counts only while its command lies
-            between them.
+            rest the smallest change of a parameter shifts the release of a joint by a step, which disturbs all
+            joints. Joints that never move are ignored.
+        edges: (n, 2) Nm, commands at which resting joints break away. A joint counts as slow only while its command
+            lies between them.
 
     Raises:
         UserError: no trajectory is as long as a window, or all joints hardly ever move at once.
@@ -141,8 +141,7 @@ class StartState:
     of the angles gives the latency of each joint.
 
     Attributes:
-        noise: (n,) rad, of the angles, robust. kernel: (n, 2, 2 STATE_SAMPLES) from angles and velocities to q and
-            dq.
+        noise: (n,) rad, of the angles, robust. kernel: (n, 2, 2 STATE_SAMPLES), maps angles and velocities to q, dq.
         sigma: (2, n) rad, rad/s, standard deviation of the state.
     """
 

@@ -1,4 +1,4 @@
-"""A recording low-pass filtered without phase lag, for differentiation, and friction filtered like its torque."""
+"""A recording low-pass filtered without phase lag, for differentiation; friction passes the same filter."""
 
 from dataclasses import dataclass
 
@@ -82,7 +82,7 @@ class SmoothMotion:
         return self.low_pass @ x
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """Return (T, n, ...), a function of q, dq, ddq at the moments; those are low-passed already."""
+        """Return (T, n, ...), a function of q, dq, ddq at the moments; its arguments are already filtered."""
         return x
 
     def command(self, delay: float, lag: float) -> np.ndarray:

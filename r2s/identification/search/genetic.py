@@ -24,8 +24,8 @@ class Genetic:
     Attributes:
         population: individuals, all simulated at once.
         generations: G_max. minutes: time limit.
-        spread: standard deviation of the first population about the nominal model, of the unit cube.
-        patience, tolerance: it has converged if the best cost improved by less than `tolerance` (relative) over
+        spread: standard deviation of the first population about the nominal model, on the unit cube.
+        patience, tolerance: the search ends if the best cost improved by less than `tolerance` (relative) over
             `patience` generations.
         seed: of every draw.
     """

@@ -15,7 +15,7 @@ class LeastSquares:
     """The search.
 
     Attributes:
-        max_evaluations: largest number of Jacobians. ftol: relative gain of a step that ends it. minutes: time limit.
+        max_evaluations: largest number of Jacobians. ftol: least relative gain of a step. minutes: time limit.
         level: "residual" for the problem's data, or "torque" for its torque residual, a regression in seconds.
     """
 

@@ -1,7 +1,7 @@
 """Backward elimination: remove terms without which held-out torque is predicted as well.
 
-Gravity acts on links and payload alike, and fewer parameters generalize better: an arm whose published links are
-right needs a payload alone, an arm without payload needs its links.
+Gravity hardly distinguishes links from a payload, and fewer parameters generalize better: an arm with correct
+published links needs only a payload term, an arm without payload only link terms.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from r2s.identification.terms import blocks_of
 def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequence[str]) -> dict[str, list[bool]]:
     """Return {"needed": whether held-out motion needs each of the `terms`}; only `prunable` ones are tried.
 
-    The term with the most parameters is tried first. It is removed if the others predict not clearly worse than the
-    best model so far.
+    The term with the most parameters is tried first. It is removed unless the model without it predicts clearly worse
+    than the best one so far.
     """
     base = cv.space(terms)
     folds = list(cv.split(base))

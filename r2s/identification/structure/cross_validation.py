@@ -21,7 +21,7 @@ GUARD_S = 0.1  # s, distance of the fitted rows from a held-out block: the low-p
 
 
 def held_out(recording: Recording, folds: int, blocks: int = 1) -> list[tuple[Recording, Recording]]:
-    """Return (rest, held out) for each fold, of `blocks` blocks; the rest keeps GUARD_S away from them."""
+    """Return (rest, held-out rows) of each fold, which holds out `blocks` blocks; the rest keeps GUARD_S away."""
     period = recording.period or np.inf
     clock = recording.t % period if recording.period else recording.t
     edges = list(pairwise(np.quantile(clock, np.linspace(0, 1, folds * blocks + 1))))
@@ -44,7 +44,7 @@ class Fold(NamedTuple):
     test: TorqueResidual
 
     def score(self, space: ParameterSpace, prior: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Return (blocks, n) Nm^2: mean square error of held-out torque over blocks of half a second, after a fit."""
+        """Fit, and return (blocks, n) Nm^2: mean square error of held-out torque over blocks of half a second."""
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
@@ -90,7 +90,7 @@ class CrossValidation:
 
 
 def clearly_worse(more: np.ndarray) -> bool:
-    """Return whether an error rises, `more` (blocks,) of it, by over one standard error of the mean.
+    """Return whether the mean of an error increase, `more` (blocks,), exceeds its standard error.
 
     The one-standard-error rule: Breiman et al., Classification and Regression Trees, 1984.
     """

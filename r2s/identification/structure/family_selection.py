@@ -15,10 +15,10 @@ CLOSE = 1.05  # error over the least one; Stribeck arms show ratios of 1.2 and m
 def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float = 0.0) -> dict[str, Any]:
     """Return {"error": (F,) relative to the least, "best": index}: error of held-out torque by friction family.
 
-    A family with more parameters has to predict clearly better. Slow sliding distinguishes friction that falls with
-    velocity, but a filter spreads stops and reversals over those rows, whose errors no family explains. So with
-    `slowest`, rad/s, a richer family that is CLOSE gets a second comparison on rows that slide faster than that
-    (modulating_functions.py), and "error" is theirs. Families with memory have other rows and are not compared again.
+    A family with more parameters has to predict clearly better. Slow sliding shows whether friction falls with
+    velocity, but a filter spreads stops and reversals over slow rows, and no family explains those. So with
+    `slowest`, rad/s, a richer family that is CLOSE is compared again on windows of faster sliding
+    (modulating_functions.py), which give "error". Families with memory need other windows: no second comparison.
     """
     error, best = _compare(cv, FAMILIES, terms, 0.0)  # FAMILIES are in order of their number of parameters
     richer = [k for k in range(best + 1, len(FAMILIES)) if error[k] <= CLOSE and not FAMILIES[k].has_memory]

@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
-Terms trade with each other (an offset with cable drag, a mass with a centre of mass), and a fit gives an absent term
-a value at the cost of its neighbours. So a term must improve the prediction to enter.
+Terms trade with each other (an offset with cable drag, a mass with a centre of mass): a fit gives a value even to a
+term that the arm lacks, at the cost of others. So a term must improve the prediction to enter.
 """
 
 from collections.abc import Sequence

@@ -27,14 +27,14 @@ class AdapterComparison:
     """Scores of adapters.
 
     Attributes:
-        measures: {key: Measure}, the compared ones. headline: the one that a row is summed up by.
+        measures: {key: Measure}, the compared ones. headline: the measure that sums up a row.
         scores: a row per measure, condition and row: mean and 95 % interval low, high; difference to the row
-            `reference` (None without one), and the interval of how much worse, worse_low to worse_high; number of
-            stopped, asked and averaged episodes, and of arms.
+            `reference` (None without one), its interval worse_low to worse_high; numbers of stopped, requested and
+            averaged episodes, and of arms.
         losses: a row per condition and row: mean of the headline measure, `value`, and `nominal`, its mean over the
             same arms and episodes in the nominal condition.
         costs: a row per row: us per cycle.
-        runs: {row: its transfers}. key: lines that explain the names. left_out: lines about what is not averaged.
+        runs: {row: its transfers}. key: lines that explain the names. left_out: lines about left-out episodes.
     """
 
     measures: Mapping[str, Measure]
@@ -107,8 +107,8 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
     """Return a row per row of one condition, with the columns of `AdapterComparison.scores`.
 
-    An episode without a value in one row (a stopped episode has no RMSE and no gap) is left out of all rows, except
-    for a row that never has a value. A single episode has no interval.
+    If an episode has no value in one row (a stopped episode has no RMSE and no gap), all rows omit it; rows without
+    any value do not count. A single episode has no interval.
 
     Args:
         shared: of `in_common`. measure: key and direction. reference: {row: row to compare with}. seed: of the
@@ -144,8 +144,8 @@ def _interval(draws: np.ndarray, count: int) -> tuple[float, float]:
 def rows_of(found: Sequence[Transferred]) -> tuple[dict[str, list[Transferred]], list[str]]:
     """Return the transfers by row, with the shortest distinct names, and lines that explain the names.
 
-    A row is an adapter. If an arm met several policies, it is an adapter and a policy; if each arm has its own
-    policy, the policies count as one.
+    A row is an adapter; if an arm ran several policies, an adapter with a policy. If each arm has its own policy, the
+    policies count as one.
     """
     of_arm: dict[str, set[str]] = {}
     for r in found:

@@ -55,7 +55,7 @@ def _square(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def lines(found: AdapterComparison) -> list[str]:
-    """Return the lines below the tables: a verdict per row, names, and what is not averaged."""
+    """Return the lines below the tables: a verdict per row, names, and the episodes that are not averaged."""
     s = found.scores
     out = [verdict(found, row) for row in found.runs]
     if len(s) and not s["stopped"].any():
@@ -76,7 +76,7 @@ def write(
     """Write adapter_comparison.csv, costs.csv, report.md, a figure and recording.rrd; return the tables of strings.
 
     Args:
-        run, robot: of the comparison. found: its scores. apart: {run: why it is not comparable}.
+        run: run folder of the comparison. robot: the arm. found: scores. apart: {run: why it is not comparable}.
         others: {folder: why it is no finished transfer}.
     """
     shown = tables(found)

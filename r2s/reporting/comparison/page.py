@@ -40,7 +40,7 @@ def comparison_page(
     """Write tables as CSV, figures, report.md and recording.rrd.
 
     Args:
-        run, robot: of the comparison. grouped: compared trainings. apart: {run: why it is not comparable}.
+        run: run folder of the comparison. robot: the arm. grouped: trainings. apart: {run: why not comparable}.
         others: {folder: why it is no finished training}.
 
     Returns:

@@ -52,7 +52,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
     """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
 
     best, median and worst are over settings, each the interquartile mean of its seeds. spread is best minus median,
-    with a 95 % interval that draws seeds within each setting: a small spread means little tuning.
+    with a 95 % interval that draws seeds within each setting: a small spread means little need for tuning.
 
     Args:
         grouped: trainings. measure: key; None: the last of `MeasureTable.selection`.
@@ -78,7 +78,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
-    """Return one measure of an `improvement_table` as strings: rows are better than columns, both numbered."""
+    """Return one measure of an `improvement_table` as strings: the probability that row beats column, numbered."""
     rows = table[table["measure"] == measure]
     labels = list(dict.fromkeys(rows["better"]))
     number = {label: str(i + 1) for i, label in enumerate(labels)}

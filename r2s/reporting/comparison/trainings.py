@@ -29,13 +29,13 @@ class Trained:
 
     Attributes:
         folder, seed, algo: of the run.
-        settings: what it read: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
-        alike: what comparable runs share: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
+        settings: values that it used: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
+        alike: values that comparable runs share: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
         typed: overrides of its settings: {"dr": "paper", "algo.lr": "5e-4"}.
-        toy: it ran with +experiment=toy, which is too short to learn.
+        toy: whether it ran with +experiment=toy, which is too short to learn.
         minutes: its budget, None if the budget is in env_steps.
         measures: of its task. curve: evaluations.csv, on the goals that selected its best policy.
-        last: measures of its last policy on goals without selection, from summary.json.
+        last: measures of its last policy, from summary.json, on goals not used for selection.
     """
 
     folder: Path
@@ -159,8 +159,8 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
     """Return the largest set of comparable runs, and {name: reason} of the others.
 
-    Runs are comparable if robot, task and evaluation agree and no budget exceeds another `MOST_BUDGETS` times. Of two
-    sets of equal size the one without toys wins, then the one with more env steps.
+    Runs are comparable if robot, task and evaluation agree and budgets differ by at most the factor `MOST_BUDGETS`.
+    Of two sets of equal size the one without toys wins, then the one with more env steps.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 

@@ -32,7 +32,7 @@ class Transferred:
         folder: of the run. start: its start time, from meta.json. policy: absolute path of the policy's run folder.
         adapter: name in conf/adapt. settings: of the adapter: {"filter_s": 0.087}.
         arm: "twin, rigid, seed 0". condition: settings of the arm (`condition`). robot: its config in the training.
-        measures: of the task. length: of an episode, with the policy's rate: "4 s at 100 Hz". goals: how many.
+        measures: of the task. length: of an episode, with the policy's rate: "4 s at 100 Hz". goals: their number.
         us: median time of the adapter per cycle, microseconds; 0 without an adapter, nan if not measured.
         episodes: a row per episode, indexed by goal: `MeasureTable.transfer`, the gap, and arm_stopped (0 or 1).
     """

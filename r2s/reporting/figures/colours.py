@@ -13,8 +13,8 @@ OTHERS = (
 def colours(labels: Iterable[str]) -> dict[str, str]:
     """Return {label: "#rrggbb"}, legible on white and on black.
 
-    A label with "measured", "nominal" or "identified" in it ("twin, nominal") has the colour of that word, the others
-    take theirs in order; twelve differ.
+    A label with "measured", "nominal" or "identified" in it ("twin, nominal") has the colour of that word. The others
+    take twelve different colours in turn.
     """
     found: dict[str, str] = {}
     others = 0

@@ -137,7 +137,7 @@ def _band(
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
     """Draw the cost of each search over seconds, relative to its start; steps without such a cost are shaded.
 
-    Costs compare within one search only: the residuals are reweighed between searches.
+    Costs are comparable within one search only, because residuals are reweighted between searches.
     """
     history = history.assign(seconds=_running(history["seconds"].to_numpy(float)))
     name = history["search"].astype(str)

@@ -1,6 +1,6 @@
 """The page of an identification: Tables I to IV of the paper for this arm, identifiability, and figures.
 
-"Old" is the nominal model, "new" the identified one; intervals are 95 %, from the joint posterior.
+"Old" is the nominal model, "new" the identified one. Intervals are 95 %, from the joint posterior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -81,7 +81,7 @@ def identification_page(
     """Write figures, report.md, report.html and recording.rrd on the validation motion.
 
     Args:
-        run, robot: of the identification. nominal, found: model before, and result. validation: held-out motion.
+        run, robot: of the identification. nominal: model before. found: result. validation: held-out motion.
         summary: summary.json. window_s: of replays. cutoff_hz: of the low-pass.
     """
     torque = TorqueResidual(parameter_space(robot, nominal, {"offset": [-1.0, 1.0]}), validation, cutoff_hz=cutoff_hz)

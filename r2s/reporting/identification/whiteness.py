@@ -1,4 +1,4 @@
-"""Whether the torque residual of an identification is white, compared with white noise after the same filter."""
+"""Whiteness test of the torque residual: comparison with white noise that passed the same filter."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -73,7 +73,7 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, and its 1.96 sigma (L,).
 
-    The filter is that of `Recording.smooth`. Sigma follows Bartlett (J. R. Stat. Soc. Suppl. 8(1), 1946), far lags.
+    The filter is that of `Recording.smooth`. Sigma is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """
     step = float(np.median(np.diff(t)))
     edges = np.array([0, *without_pauses(t)[1], len(t)])

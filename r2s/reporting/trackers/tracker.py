@@ -64,7 +64,7 @@ class Tracked:
 
 
 class Tracker(Protocol):
-    """Shows a run elsewhere. Hydra constructs it before the run folder exists; one thread makes all calls in order.
+    """Show a run in another tool. Hydra makes it before the run folder exists; one thread makes all calls in order.
 
     An exception ends the tracker with one warning; the run continues.
     """
@@ -83,7 +83,7 @@ class Tracker(Protocol):
 
 
 class LoggerTracker:
-    """The rows and the summary of a tracker on a logger of TorchRL, which its `start` sets as `_logger`."""
+    """A tracker that logs rows and summary with a logger of TorchRL; `start` sets this as `_logger`."""
 
     _logger: Any
 
