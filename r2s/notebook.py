@@ -17,7 +17,7 @@ def r2s(*words: str) -> Path:
     """Run `r2s WORDS`, print its table, and return its run folder.
 
     Raises:
-        UserError: the command fails; with its error.
+        UserError: the command fails; the message is its error.
     """
     command = [sys.executable, "-m", "r2s", *words]
     env = os.environ | {

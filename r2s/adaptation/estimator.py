@@ -64,7 +64,7 @@ class Estimator:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a motion from rest; the estimate stays."""
+        """Begin a motion from rest, and keep the estimate."""
         self._state, self._residual = ResidualState.fresh(self._n), MomentumResidual.empty(self._n)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:

@@ -75,7 +75,7 @@ class MomentumResidual(NamedTuple):
 
     @staticmethod
     def empty(n: int) -> "MomentumResidual":
-        """Return arrays to write to."""
+        """Return zeros for `update_residual` to overwrite."""
         arrays = {name: np.zeros(n) for name in MomentumResidual._fields}
         arrays |= {"payload": np.zeros((n, BODY)), "sliding": np.ones(n), "gear": np.zeros((n, n))}
         return MomentumResidual(**arrays)

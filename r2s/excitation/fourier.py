@@ -219,7 +219,7 @@ class _Candidates:
         return x, a
 
     def finish(self, x: np.ndarray, a: np.ndarray) -> Excitation | None:
-        """Return the motion at 1 kHz, scaled down if the dense samples require it; None if that is too much."""
+        """Return the motion at 1 kHz, scaled down if the dense samples require it; None if it becomes too small."""
         blocks = [[b @ x for b in self._basis(slice(k, k + BLOCK))] for k in range(0, len(self.clock[0]), BLOCK)]
         series = tuple(np.concatenate(part) for part in zip(*blocks, strict=True))
         every = round(1 / (GEOMETRY_HZ * SIM_DT))

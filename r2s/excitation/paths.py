@@ -62,7 +62,7 @@ def approach(
         table, z_min: m, see `check_motion`. space: built from them before, to save time.
 
     Raises:
-        UserError: no candidate is free; the message explains the straight line.
+        UserError: no candidate is free; the message describes the violation on the straight line.
     """
     space = space or Space(robot, table=table, z_min=z_min)
     first = ""

@@ -70,7 +70,7 @@ def add_point_mass(
     A point suffices: the tensor of a gripper about its own centre is small against m r^2.
 
     Args:
-        mass, com, inertia: of the links without it.
+        mass, com, inertia: of the links without the point mass.
         payload: (...) kg, at least 0. place: (..., 3) m, its position in the last link's frame.
     """
     lead = np.broadcast_shapes(mass.shape[:-1], np.shape(payload))

@@ -57,7 +57,7 @@ class ParameterSpace:
         nominal: start values of a search, and values of all parameters that are not in x.
         robot: the arm; inertia blocks are relative to its links.
         breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. The breakaway torques
-            then follow the offset (torque = command + offset). NaN keeps one nominal torque, None all.
+            then follow the offset (torque = command + offset). NaN keeps the nominal torque; None: all.
     """
 
     blocks: tuple[str, ...]
@@ -121,7 +121,7 @@ class ParameterSpace:
 
     @property
     def width(self) -> np.ndarray:
-        """(P,) width of the bounds: of the logarithm for logarithmic coordinates, else in SI units."""
+        """(P,) width of the bounds in SI units, or of their logarithm for logarithmic coordinates."""
         return self._warp(self.upper) - self._warp(self.lower)
 
     def _warp(self, x: np.ndarray) -> np.ndarray:

@@ -60,7 +60,7 @@ def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
     """Return root (P, P) of the covariance root root^T, raised where it is less than least least^T.
 
-    The comparison is by direction, not by parameter: of two that trade, the sum is known far better than either.
+    The comparison is by direction: the sum of two correlated parameters is known far better than each of them.
     """
     axes, seen, _ = np.linalg.svd(np.linalg.solve(least, root))
     return least @ (axes * np.maximum(seen, 1.0))
@@ -69,9 +69,9 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
     """Return steps (S, P) that end in the cube: values that would leave it stop at its side, and others compensate.
 
-    h (P, P) is half the Hessian of the sum of squares. Where an offset trades with an asymmetry at its bound,
-    stopping one of them alone would change their sum. Values stop one at a time, the farthest first: stopping one of
-    two that trade often brings the other back.
+    h (P, P) is half the Hessian of the sum of squares. If an offset is correlated with an asymmetry at its bound,
+    stopping the asymmetry alone would change their sum. Values stop one at a time, the farthest first: of two
+    correlated values, this often brings the other back.
     """
     steps = steps.copy()
     for step in steps:

@@ -111,7 +111,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the joints that another column explains, and those columns, by unexplained shares (S, S), or None."""
+    """Return the joints that another column explains, and these columns, or None; shares (S, S): unexplained."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():
@@ -192,7 +192,7 @@ def _other_orders(robot: Robot, m: Moments, gravity: bool) -> list[tuple[float, 
 
 
 class _Unexplained:
-    """Share of a torque's square that its own joint's motion leaves unexplained; `seen` are the judged joints."""
+    """Share of a torque's square that the motion of its joint does not explain; `seen`: the judged joints."""
 
     def __init__(self, robot: Robot, m: Moments, gravity: bool):
         self.robot, self.m = robot, m
@@ -221,11 +221,11 @@ class _Unexplained:
         return np.array(shares) if shares else None
 
     def each(self, tau: np.ndarray) -> np.ndarray:
-        """Return (S,) of tau (T, n), each joint by its own motion."""
+        """Return (S,): the unexplained share of tau (T, n) of each joint, given its own motion."""
         return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
 
     def pairs(self) -> np.ndarray:
-        """Return (S, S): column k of tau by the motion of joint j."""
+        """Return (S, S): the unexplained share of column k of tau, given the motion of joint j."""
         return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
 
     def _share(self, j: int, tau: np.ndarray) -> float:

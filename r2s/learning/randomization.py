@@ -111,7 +111,7 @@ class ForceRandomization:
 
     Attributes:
         robot: the arm. center: its dynamics, without a batch dimension.
-        share: of `Dynamics.level`.
+        share: relative to `Dynamics.level`.
 
     Raises:
         UserError: a negative share.

@@ -1,7 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
 The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). Two parts are
-written differently so that two cores suffice: the critics are one batched network instead of a vmap, and the quantile
+written differently, for speed on two cores: the critics are one batched network instead of a vmap, and the quantile
 loss uses prefix sums over the sorted targets instead of all pairs.
 """
 

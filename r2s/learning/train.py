@@ -171,7 +171,7 @@ class Training:
 
     Attributes:
         env_steps, updates: counters. next_eval: environment steps of the next evaluation.
-        factor: of `Reward.adapt`. evaluation: the last row of evaluations.csv.
+        factor: result of `Reward.adapt`. evaluation: the last row of evaluations.csv.
     """
 
     def __init__(

@@ -77,7 +77,7 @@ _laws: list[Callable] = [*BUILT_IN]
 
 
 def law_number(law: Callable) -> int:
-    """Return the number of a compiled law in `chain`; a new one is registered."""
+    """Return the number of a compiled law in `chain`; a new law is registered first."""
     law = law if is_jitted(law) else njit(law)
     if law not in _laws:
         _laws.append(law)

@@ -291,7 +291,7 @@ def _drive(n, user, fields):
 
 @njit(cache=True, error_model="numpy")
 def _hold(forces, dq, user, joint, work):
-    """Change the passive force of a step so that it ends with the velocities of stick_slip.py.
+    """Change the passive force of a step so that the step ends with the velocities of stick_slip.py.
 
     Args:
         forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of

@@ -157,7 +157,7 @@ def load_robot(
         mjcf: the file; `r2s:models/panda.xml` is one of the package; None: the Panda.
         ee: site, body or link of the end effector; None: the only site, or the last link of a URDF.
         q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
-        gravity: (3,) m/s^2 in the base frame; None: the file's (in a URDF that of an upright base).
+        gravity: (3,) m/s^2 in the base frame; None: the file's; for a URDF, that of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's.
 
     Raises:

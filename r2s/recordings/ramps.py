@@ -67,7 +67,7 @@ def read_ramps(
 ) -> Ramps:
     """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
 
-    A log has the columns of a recording of the command (t s, q rad, dq rad/s or none, tau_J_d or tau Nm), and `joint`
+    A log has the columns of a commanded recording (t s, q rad, dq rad/s or none, tau_J_d or tau Nm), and `joint`
     (from 1) and `sign` (1 or -1) per row or per ramp. A new ramp begins where one of these or a column trajectory or
     segment changes, where t restarts, and after a gap.
 

@@ -69,8 +69,9 @@ def read(
         path: .csv, .npz, .parquet, .h5, or a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag).
         torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
         columns: names in the file of t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
-            DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau is a (T, n) array, or stands for q1 q2 ...,
-            q_1 q_2 ... or q[1] q[2] ... (or from 0). `{j}` (from 1) or `{i}` (from 0) in a name is the joint number;
+            DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau denotes a (T, n) array, or numbered columns
+            q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. `{j}` (from 1) or `{i}` (from 0) in a name is the
+            joint number;
             a list names the joints one by one. In HDF5 a name is a path: robot/q.
         n_joints: expected number of joints.
         max_gap_s: a longer pause in time begins a new trajectory; None: no splitting.
@@ -310,7 +311,7 @@ def files_of(path: str | os.PathLike) -> list[Path]:
 
 
 def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
-    """Return all columns of the file; errors name it. `bag` holds the arguments of `bag_table`."""
+    """Return all columns of the file; errors name the file. `bag` holds the arguments of `bag_table`."""
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")

@@ -47,8 +47,8 @@ def transfer(
 
     Args:
         run, robot: of the transfer. episodes, rows: {simulator or arm: episodes, or their measures}.
-        torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycle, None without an arm.
-        stops: of the arm. halted: why the arm did not run all episodes, or None.
+        torque: (n,) Nm, the policy's torque limits. timing: of the arm's cycles, None without an arm.
+        stops: reasons of the arm's stops. halted: why the arm did not run all episodes, or None.
     """
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}

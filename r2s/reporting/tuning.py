@@ -47,7 +47,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     The grid's value is the mean over `ORDERS` random orders of its jobs, because its order is arbitrary.
 
     Args:
-        trials: of `trials_table`. measure: of the last evaluation. against: glob of trainings, or None.
+        trials: output of `trials_table`. measure: key in evaluations. against: glob of trainings, or None.
         larger: whether larger is better.
     """
     if not against:

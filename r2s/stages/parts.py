@@ -12,7 +12,7 @@ def part(node: Any, group: str, *given: Any, beside: Iterable[str] = ()) -> Any:
     """Return what a config node's `_target_` makes.
 
     Args:
-        node: of the config; its keys are arguments of the target.
+        node: node of the config; its keys are arguments of the target.
         group: path of the node in the config, for errors.
         given: positional arguments from code.
         beside: keys of the node that are no arguments.

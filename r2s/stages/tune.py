@@ -36,7 +36,7 @@ class Tune:
     Attributes:
         trials: total number. workers: parallel trainings of one thread each; None: as threads=.
         startup: random trials before TPE and the pruner start.
-        measure: of the last evaluation, a measure of the task.
+        measure: key of a measure of the task; the last evaluation counts.
         space: {option: [values], or a range that `parse_range` reads}.
         against: glob of trainings to compare with, for example of a grid.
 
@@ -71,7 +71,7 @@ def parse_range(key: str, axis: Any) -> tuple[float, float, bool]:
     """Return (low, high, logarithmic) of an axis "log(2e-4, 1e-3)" or "interval(0.95, 0.98)".
 
     Raises:
-        UserError: it is neither.
+        UserError: the text has neither form.
     """
     found = re.fullmatch(r"(log|interval)\(([^,]+),([^,]+)\)", str(axis).replace(" ", ""))
     try:

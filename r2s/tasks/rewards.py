@@ -84,7 +84,7 @@ class Reward:
         """Return the (k,) weights.
 
         Args:
-            task: in training. progress: fraction of the training budget that is spent. factor: of `adapt`.
+            task: the trained one. progress: fraction of the budget that is spent. factor: result of `adapt`.
         """
         return task.paper_weights
 
@@ -95,7 +95,7 @@ class Reward:
 
 @dataclass(frozen=True)
 class Curriculum(Reward):
-    """Weights that move over a training.
+    """A reward whose weights change during a training.
 
     Eq. (2) alone is an exploration problem: its acceleration terms make stopping early attractive. So training starts
     with light smoothness and a bonus for precision. Then the weights move linearly towards eq. (2) between the two

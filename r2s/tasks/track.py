@@ -60,15 +60,16 @@ class TrackTask(BaseTask):
     A goal is a plan (steps + 1 + preview, 6 + 3 n) of r2s/tasks/trajectory.py, a row for each control step.
 
     Attributes:
-        ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: of its beginning and of its end.
+        ctrl_hz: policy rate, 50 to 200. episode_s: length of a path, s. ramp_s: duration of its acceleration, and of
+            its deceleration.
         torque_fraction, boost: the largest target is boost x torque_fraction of tau_max.
         cutoff_hz: low-pass on the torque.
         preview: samples of the path ahead in an observation.
         speed: (low, high) m/s, drawn peak speed; lower where the arm's limits require it.
-        size: (low, high) m, of paths about their middle. kinds: of KINDS, with equal probability.
+        size: (low, high) m, of paths about their middle. kinds: subset of KINDS, drawn with equal probability.
         reach, height, azimuth: region of paths, see `ReachTask`.
         pool: number of paths that a training draws from.
-        model: of the identified arm, for the default controller; see `with_model`.
+        model: the identified arm, for the default controller; see `with_model`.
     """
 
     ctrl_hz: int = 100

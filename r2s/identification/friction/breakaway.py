@@ -251,7 +251,7 @@ def _parts(x: np.ndarray) -> tuple[int, slice]:
 
 @njit(cache=True)
 def _slide(t, u, U, kappa, z, damping, jump, fall):
-    """Return x (T,) of the motion in this module's docstring; u is linear between samples, fall = 0 a sudden jump.
+    """Return x (T,) of the motion in this module's docstring; u is linear between samples, and fall = 0 means a jump.
 
     Steps are implicit in velocity, so that creep lengths far below the encoder noise stay stable.
     """

@@ -40,7 +40,7 @@ def estimate_presliding(
 
     Args:
         dynamics: values of all other parameters. torque_data: their torque residual.
-        bounds, prior: of all parameters.
+        bounds, prior: as for all parameters.
         seed: of the posterior's draws.
     """
     robot = torque_data.space.robot

@@ -176,7 +176,7 @@ class TorqueResidual:
         """Return this residual in units of the standard deviation of an independent row at x (P,).
 
         Per joint this is the RMS at a `fitted` x, else half of it, times the square root of the correlation length.
-        With known encoder noise the RMS is split into that noise, larger for short windows, and a constant.
+        If the encoder noise is known, the RMS is that noise, larger for short windows, plus a constant.
         """
         return self._with(_weights=self._weights_at(x, fitted))
 

@@ -62,7 +62,7 @@ class CrossValidation:
         recording: training motion.
         bounds, prior: see `search_space` and `Problem.of`.
         folds: number of folds.
-        cutoff_hz: of the zero-phase filter.
+        cutoff_hz: cutoff of the zero-phase filter.
         report: called with a row of progress.
     """
 

@@ -1,7 +1,7 @@
 """Forward selection: add terms that clearly improve the prediction of held-out torque.
 
-Terms trade with each other (an offset with cable drag, a mass with a centre of mass): a fit gives a value even to a
-term that the arm lacks, at the cost of others. So a term must improve the prediction to enter.
+Terms are correlated (an offset with cable drag, a mass with a centre of mass), so a fit gives a value even to a term
+that the arm lacks, and changes the others. So a term must improve the prediction to enter.
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ def select_terms(
 ) -> dict[str, list[bool]]:
     """Return {"entered": whether each of the `candidates` improves a model with `terms`}.
 
-    The candidate that helps most enters if the error falls by more than CLEARLY standard errors over blocks of half a
-    second; then the next. Torque is linear in most parameters, so each fold is fitted once without candidates and
-    each selection is one Gauss-Newton step from there.
+    The best candidate enters if it lowers the error by more than CLEARLY standard errors over half-second blocks;
+    this repeats with the rest. Torque is linear in most parameters, so each fold is fitted once without candidates
+    and each selection is one Gauss-Newton step from there.
     """
     space, folds = cv.space(terms), []
     for k, fold in enumerate(cv.split(space, blocks=BLOCKS, slowest=slowest)):

@@ -111,7 +111,7 @@ def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | 
     any value do not count. A single episode has no interval.
 
     Args:
-        shared: of `in_common`. measure: key and direction. reference: {row: row to compare with}. seed: of the
+        shared: output of `in_common`. measure: key and direction. reference: {row: row to compare with}. seed: of the
             bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]

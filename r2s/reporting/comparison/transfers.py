@@ -142,8 +142,8 @@ def _names(goals: np.ndarray) -> Iterator[str]:
 def comparable(found: Sequence[Transferred]) -> tuple[list[Transferred], dict[str, str]]:
     """Return the largest set of comparable transfers, and {name: reason} of the others.
 
-    Transfers are comparable if robot, task and goals agree. Of equal policy, adapter, arm and condition the last run
-    counts.
+    Transfers are comparable if robot, task and goals agree. Of several runs with equal policy, adapter, arm and
+    condition, the last counts.
     """
     first = max(found, key=lambda run: sum(not _difference(other, run) for other in found))
     apart = {r.folder.name: why for r in found if (why := _difference(r, first))}

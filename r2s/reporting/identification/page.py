@@ -57,7 +57,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, speeds of the validation motion.
-        whiteness: `whiteness_table` of its torque residual. window_s, cutoff_hz: of replays and low-pass.
+        whiteness: `whiteness_table` of its torque residual. window_s: s, of replays. cutoff_hz: of the low-pass.
     """
 
     pictures: Mapping[str, Path]

@@ -22,7 +22,7 @@ BATCH = 100  # parameters per call: MLflow's limit
 
 
 class Logger(MLFlowLogger):
-    """TorchRL's logger, but with arguments for mlflow.start_run; the original always begins a new run."""
+    """TorchRL's logger with arguments for mlflow.start_run, because the original always begins a new run."""
 
     def __init__(self, *args: Any, start: dict[str, Any], **kwargs: Any):
         self._start = start

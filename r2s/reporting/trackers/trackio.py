@@ -10,11 +10,11 @@ from r2s.reporting.trackers.tracker import Tracked, needs
 
 
 class Trackio:
-    """A run of a project.
+    """A run in a Trackio project.
 
     Args:
         folder: of the databases, one per project; the environment variable TRACKIO_DIR overrides it.
-        project: of the run.
+        project: name of the project.
     """
 
     def __init__(self, folder: str, project: str = "r2s"):

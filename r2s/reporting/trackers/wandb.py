@@ -11,10 +11,10 @@ from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
 
 
 class Wandb(LoggerTracker):
-    """A run of a project.
+    """A run in a W&B project.
 
     Args:
-        project, entity: of the run; None is your own entity. offline: store the run on this computer only.
+        project, entity: names in W&B; None is your own entity. offline: store the run on this computer only.
     """
 
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):
