@@ -434,7 +434,7 @@ def test_the_stage_estimates_from_a_recording(tmp_path, capsys):
 
     with pytest.raises(UserError, match=r"data\.torque: expected commanded for stage=estimate, got measured"):
         estimate(config("data.torque=measured"), [])
-    with pytest.raises(UserError, match=r"no such file: .*wrk.npz; did you mean 'work.npz'"):
+    with pytest.raises(UserError, match=r"no file .*wrk.npz; did you mean 'work.npz'"):
         estimate(config("data.torque=commanded", f"data.path={tmp_path / 'wrk.npz'}"), [])
     assert not (tmp_path / "estimate").exists()
     estimate(config("data.torque=commanded"), [])

@@ -12,14 +12,14 @@ from test_comparison import write_run
 
 from r2s.reporting.comparison.adapter_comparison import compare_adapters, verdict
 from r2s.reporting.comparison.adapter_comparison_page import lines, tables
-from r2s.reporting.comparison.arm_conditions import condition, current, in_words, order
+from r2s.reporting.comparison.arm_conditions import condition, in_words, order
 from r2s.reporting.comparison.statistics import paired
 from r2s.reporting.comparison.transfers import comparable, read_transfers
 from r2s.tasks.measures import Measure, MeasureTable, write_measures
-from r2s.tasks.reach import REACH
-from r2s.tasks.rollout import gap
+from r2s.tasks.reach import REACH, ReachTask
+from r2s.tasks.rollout import episode_measures, gap
 from r2s.tasks.task import Episodes
-from r2s.tasks.track import TRACK
+from r2s.tasks.track import TRACK, TrackTask
 
 T = 100  # steps of an episode of 1 s
 
@@ -39,7 +39,9 @@ def episodes(off_mm, goals, path=True, ee_mm=0.0):
     )  # fmt: skip
 
 
-def carry(root, name, off_mm, adapt="none", *, goals=None, path=True, ee_mm=0.0, policy="paths", **given):
+def carry(
+    root, name, off_mm, adapt="none", *, goals=None, path=True, ee_mm=0.0, policy="paths", predicts=True, **given
+):
     """Write a transfer: adapter, what the arm was asked (payload=1.0, ...), and how far off its hand was."""
     folder, goals = root / name, range(len(off_mm)) if goals is None else goals
     folder.mkdir(parents=True)
@@ -47,7 +49,7 @@ def carry(root, name, off_mm, adapt="none", *, goals=None, path=True, ee_mm=0.0,
     config = {
         "policy": f"runs/train/{policy}",
         "adapt": {"name": adapt} | given.pop("settings", {}),
-        "arm": {"name": "twin", "make": 1, "seed": 0, "payload": 0.0, "friction": 1.0, "late": 0.0} | given,
+        "arm": {"name": "twin", "variant": "rigid", "seed": 0, "payload": 0.0, "friction_scale": 1.0} | given,
     }
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     (folder / "policy.yaml").write_text(yaml.safe_dump({"robot": robot}))
@@ -58,8 +60,10 @@ def carry(root, name, off_mm, adapt="none", *, goals=None, path=True, ee_mm=0.0,
     (folder / "summary.json").write_text(json.dumps({"twin": {"asked": len(off_mm)}}))
     timing = {"what": ["policy", "adapter"], "median_ms": [0.3, 0.012]}
     pd.DataFrame(timing).to_csv(folder / "timing.csv", index=False)
-    np.savez(folder / "episodes_twin.npz", **asdict(episodes(off_mm, goals, path, ee_mm)))
-    np.savez(folder / "episodes_predicted.npz", **asdict(episodes(off_mm, goals, path)))
+    ran, predicted = episodes(off_mm, goals, path, ee_mm), episodes(off_mm, goals, path) if predicts else None
+    np.savez(folder / "episodes_twin.npz", **asdict(ran))
+    rows = episode_measures(TrackTask() if path else ReachTask(), ran, predicted)
+    pd.DataFrame(rows).to_csv(folder / "episodes_twin.csv", index=False)
     write_measures(folder, TRACK if path else REACH)
 
 
@@ -176,10 +180,9 @@ def test_adapters_on_different_arms_do_not_compare(tmp_path):
 
 
 def test_the_gap_is_that_of_the_transfer(tmp_path):
-    """Over all episodes it is `gap`; the prediction may have another order."""
+    """Over all episodes it is `gap`."""
     carry(tmp_path, "n", [1.0, 2.0], ee_mm=3.0)
-    ran, model = episodes([1.0, 2.0], [0, 1], ee_mm=3.0), episodes([1.0, 2.0], [1, 0])
-    np.savez(tmp_path / "n" / "episodes_predicted.npz", **asdict(model))
+    ran, model = episodes([1.0, 2.0], [0, 1], ee_mm=3.0), episodes([1.0, 2.0], [0, 1])
     found = read_transfers([tmp_path / "n"])[0][0].episodes["ee_path_rmse_mm"]
     assert np.sqrt((found**2).mean()) == pytest.approx(gap(ran, model)["ee_path_rmse_mm"])
 
@@ -203,8 +206,7 @@ def test_measures_of_a_task_from_outside_r2s_are_compared(tmp_path):
 
 def test_without_a_prediction_there_is_no_gap(tmp_path):
     """As with simulator=none; a line reports it."""
-    carry(tmp_path, "n", [1.0, 2.0])
-    (tmp_path / "n" / "episodes_predicted.npz").unlink()
+    carry(tmp_path, "n", [1.0, 2.0], predicts=False)
     found = made(tmp_path)
     assert "ee_path_rmse_mm" not in found.measures
     assert "1 of 1 transfers have no path gap: with simulator=none there is no prediction." in lines(found)
@@ -269,20 +271,22 @@ def test_what_cannot_be_compared_is_set_apart(tmp_path):
 @pytest.mark.parametrize(
     ("arm", "words"),
     [
-        ({"make": 2, "seed": 7, "payload": 0, "load": None, "friction": 1, "late": 0.0}, "nominal"),  # older keys
         ({"variant": "elastic", "payload": 0, "declared_payload": None, "friction_scale": 1}, "nominal"),
         ({"payload": 1}, "1.0 kg"),
         ({"payload": {"mass": 1}}, "1.0 kg"),
         ({"payload": {"mass": 1.0, "on_s": 2}}, "1.0 kg, on_s=2"),
         ({"payload": {"mass": 0.0, "on_s": 2}}, "nominal"),
-        ({"load": 0.5, "friction": 0.8, "late": 0.005}, "0.5 kg declared, friction x 0.8, 0.005 s later"),
+        (
+            {"declared_payload": 0.5, "friction_scale": 0.8, "extra_delay_s": 0.005},
+            "0.5 kg declared, friction x 0.8, 0.005 s later",
+        ),
         ({"stiffness": 10000}, "stiffness 10000.0"),
         ({"soft_start_s": 0.5}, "nominal"),
     ],
 )
 def test_conditions_in_words(arm, words):
     """Without variant and seed; equal conditions have equal words."""
-    assert in_words(condition(current(arm))) == words
+    assert in_words(condition(arm)) == words
 
 
 def test_conditions_in_order():

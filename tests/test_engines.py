@@ -10,13 +10,13 @@ from conftest import conf
 
 from r2s.engines.dart import DartEngine
 from r2s.engines.episodes import EngineArms
-from r2s.engines.interface import MujocoEngine
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.learning.policy import make_policy
 from r2s.learning.randomization import UniformRandomization
 from r2s.physics.dynamics import STICTION_MODELS, nominal_dynamics
 from r2s.physics.robot import load_robot
+from r2s.physics.simulator import single_arm
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import rollout
 
@@ -46,6 +46,24 @@ ODD_ARM = """
   </worldbody>
 </mujoco>
 """
+
+
+class _MujocoEngine:
+    """MuJoCo without r2s's friction."""
+
+    def __init__(self, robot, dynamics):
+        self.model = single_arm(robot, dynamics)
+        self.model.jnt_user[:] = 0.0  # no friction from r2s
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, q, dq):
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = q, dq
+
+    def step(self, tau):
+        self.data.qfrc_applied[:] = tau
+        mujoco.mj_step(self.model, self.data)
+        return self.data.qpos.copy(), self.data.qvel.copy()
 
 
 def panda(**change):
@@ -175,7 +193,7 @@ def test_a_policy_meets_the_same_arm_in_every_engine(hold):
     def dart(d):
         return DartEngine(robot, gravity=False, masses=d.mass, coms=d.com, inertias=d.inertia)
 
-    for make in (dart, lambda d: MujocoEngine(robot, d)):
+    for make in (dart, lambda d: _MujocoEngine(robot, d)):
         away = rollout(policy, EngineArms(make, robot, task, draw, 4), task, starts, goals)
         assert np.linalg.norm(away.ee - home.ee, axis=-1).max() < 1e-6  # no joint gets to a hard stop
         np.testing.assert_allclose(away.reward, home.reward, atol=1e-3)

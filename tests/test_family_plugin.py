@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import conf
+from test_physics import compiled_slope
 
 from r2s.arm.recorder import record
 from r2s.arm.simulated import SimulatedArm
@@ -38,10 +39,6 @@ def law(dq, p, sign):
     return p[0] * np.tanh(dq / p[1]) + p[2] * dq
 
 
-def slope(dq, p, sign):
-    return p[0] * (1 - np.tanh(dq / p[1]) ** 2) / p[1] + p[2]
-
-
 @njit
 def native(p, v, h, memory):
     turned = np.tanh(v / p[1])
@@ -61,7 +58,6 @@ TANH = Family(
     optional=("viscous",),
     formula="level tanh(v / width) + viscous v",
     law=law,
-    law_slope=slope,
     native=native,
     start=start,
 )
@@ -145,7 +141,7 @@ def test_its_native_form_is_its_numpy_form(path, arm):
     for k in range(21):
         law, own = (family(path), phi[k]) if k < 20 else (SIGMOID, np.array([[1.0, 10.0, 0.0]] * 2))
         mass = np.linalg.inv(InverseInertia(arm)(q[k : k + 1])[0])
-        torque, slope = law.torque(dq[k], own), law.slope(dq[k], own)
+        torque, slope = law.torque(dq[k], own), compiled_slope(law, dq[k], own)
         step = np.linalg.solve(mass + 1e-3 * np.diag(slope), mass @ (free[k] - dq[k]) - 1e-3 * torque)
         # of a few dozen operations, each within eps of the largest term, through a matrix of this condition
         bound = 100 * np.finfo(float).eps * np.linalg.cond(mass) * max(1.0, np.abs(dq[k]).max())

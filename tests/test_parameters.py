@@ -173,7 +173,7 @@ def test_the_arm_of_another_family_has_the_same_level(panda, paper, name):
 def test_measured_edges_of_the_dead_zone_move_with_the_offset(panda, paper):
     """The command at which a joint let go was seen: edge = command + offset, on its own side of zero."""
     command = np.stack([np.full(7, -0.4), np.full(7, 0.6)], -1)
-    space = parameter_space(panda, paper, {"offset": [-2.0, 2.0]}, breakaway_command=command)
+    space = replace(parameter_space(panda, paper, {"offset": [-2.0, 2.0]}), breakaway_command=command)
     x = np.array([[0.0] * 7, [0.1] * 7, [-0.25] * 7, [0.9] * 7, [-0.9] * 7])
     edges = space.dynamics(x).breakaway
     np.testing.assert_allclose(edges[:, 0], [[-0.4, 0.6], [-0.3, 0.7], [-0.65, 0.35], [0.0, 1.5], [-1.3, 0.0]])

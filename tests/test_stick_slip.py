@@ -9,6 +9,7 @@ from conftest import conf
 from numba import njit
 from test_physics import (
     THREE,
+    compiled_slope,
     light,
     mass_matrix,
     named,
@@ -82,7 +83,7 @@ def agree_step_by_step(robot, dynamics, k, q, dq, tau, out):
         nominal, actual = (weight(model, data, *one, robot.gravity) for one in links)
         loaded = d.load * np.abs(nominal)
         friction = d.friction(v, np.sign(v)) + loaded * np.sign(v)
-        slope = d.family.law_slope(v, list(d.phi.T), np.where(v > 0, 1.0, -1.0))  # of either branch: without the jump
+        slope = compiled_slope(d.family, v, d.phi, sharp=True)
         damping = model.dof_damping + np.maximum(slope, 0.0)
         pull = d.offset + d.drag[:, 0] * np.sin(data.qpos) + d.drag[:, 1] * np.cos(data.qpos) + actual - nominal
         drive = torque + pull - bias - model.dof_damping * v

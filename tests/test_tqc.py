@@ -11,7 +11,7 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.modules.distributions import TanhNormal
 from torchrl.objectives import TQCLoss
 
-from r2s.learning.networks import sample_tanh
+from r2s.learning.learner import sample_tanh
 from r2s.learning.tqc import TQC, QuantileHuber
 
 D, N, B = 11, 3, 64

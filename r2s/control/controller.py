@@ -27,16 +27,6 @@ class ControlledTask(Protocol):
         ...
 
 
-class Trajectory(Protocol):
-    """A task whose goals are reference motions of the joints."""
-
-    def trajectory(
-        self, t: np.ndarray, goals: np.ndarray, ahead_s: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, dq, ddq (m, n) of the references `goals` at t (m,) s plus ahead_s."""
-        ...
-
-
 @dataclass(frozen=True)
 class Controller:
     """An action space and a control law, for all arms of one robot; `control=` selects the function that makes it.

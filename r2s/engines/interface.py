@@ -55,23 +55,3 @@ class FrictionTorque:
         ddq = np.linalg.solve(self._mass + np.diag(slope), drive)
         own = m.opt.timestep * self._file_damping  # the engine itself applies the file's damping
         return d.qfrc_passive + self._file_damping * dq - (slope - own) * ddq
-
-
-class MujocoEngine:
-    """MuJoCo without r2s's friction: the reference in tests of the other engines."""
-
-    def __init__(self, robot: Robot, dynamics: Dynamics):
-        self._model = single_arm(robot, dynamics)
-        self._model.jnt_user[:] = 0.0  # no friction from r2s
-        self._data = mujoco.MjData(self._model)
-
-    def reset(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Set q, dq (n,) rad, rad/s."""
-        mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos[:], self._data.qvel[:] = q, dq
-
-    def step(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Apply tau (n,) Nm for 1 ms; return the new (q, dq)."""
-        self._data.qfrc_applied[:] = tau
-        mujoco.mj_step(self._model, self._data)
-        return self._data.qpos.copy(), self._data.qvel.copy()

@@ -26,8 +26,7 @@ from r2s.physics.robot import Robot
 from r2s.recordings.speed_noise import MAX_NOISE
 
 SIDES = ("negative", "positive")
-FIXED = ("phi", "offset", "inertia")
-OPTIONAL = ("mass", "com", "armature", "load", "drag", "gain", "speed_noise")  # absent in files of older versions
+FIXED = ("phi", "offset", "inertia", "mass", "com", "armature", "load", "drag", "gain", "speed_noise")
 # limits of a plausible file, beyond those of any arm: friction and offsets, Nm; a link's centre from its joint, m
 MOST_NM, FARTHEST_M = 1e4, 10.0
 
@@ -63,7 +62,7 @@ def save_parameters(
         document["parameters"][name] = entry | {"identifiable": seen[0] if name in WHOLE_ARM else seen}
     document["fixed"] = {f"breakaway_{side}": fixed.breakaway[:, i].tolist() for i, side in enumerate(SIDES)}
     document["fixed"] |= {"stiction_model": fixed.stiction_model}
-    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in (*FIXED, *OPTIONAL)}
+    document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
     rounded = (np.round(a, 6).tolist() for a in (d.mass, d.com, d.inertia))  # for readers; `load_parameters` skips it
@@ -109,11 +108,10 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
             raise ValueError(f"{name}: not {count} finite value{'s' * (count > 1)}")
         return array
 
-    rows = [k for k in (*FIXED, *OPTIONAL) if k in FIXED or k in fixed]
-    own: dict[str, Any] = {k: numbers(k, fixed[k], robot.n) for k in rows}
+    own: dict[str, Any] = {k: numbers(k, fixed[k], robot.n) for k in FIXED}
     own["breakaway"] = np.stack([numbers(k, fixed[k], robot.n) for k in map("breakaway_{}".format, SIDES)], -1)
     own |= {k: float(fixed[k]) for k in TIMING}
-    own["stiction_model"] = fixed.get("stiction_model", fixed.get("hold", "command"))  # of older files
+    own["stiction_model"] = fixed["stiction_model"]
     family = friction_family(document["friction_family"])
     nominal = replace(Dynamics.of(robot, own["phi"], family, float(fixed["dq_min"])), **own)
     everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}

@@ -191,12 +191,7 @@ def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:
             raise UserError(f"{where}.{name}: {list(pair)} is not [low, high] with low < high (low > 0 for {name})")
 
 
-def parameter_space(
-    robot: Robot,
-    nominal: Dynamics,
-    bounds: Mapping[str, Sequence[ArrayLike]],
-    breakaway_command: np.ndarray | None = None,
-) -> ParameterSpace:
+def parameter_space(robot: Robot, nominal: Dynamics, bounds: Mapping[str, Sequence[ArrayLike]]) -> ParameterSpace:
     """Return the space of the parameters in `bounds`, {"phi1": [low, high], ...}; an end is a number or (n,).
 
     Raises:
@@ -214,7 +209,7 @@ def parameter_space(
         raise UserError(f"bounds.{wrong[0]}: friction family '{family.name}' has {choices(family.names)}")
     if "inertia_scale" in bounds and set(bounds) & set(LINK):
         raise UserError("bounds: inertia_scale and link_... describe the same tensors: name one of the two")
-    space = ParameterSpace(tuple(bounds), robot.n, np.zeros(0), np.zeros(0), nominal, robot, breakaway_command)
+    space = ParameterSpace(tuple(bounds), robot.n, np.zeros(0), np.zeros(0), nominal, robot)
     ends = ({k: np.asarray(pair[i], dtype=float) for k, pair in bounds.items()} for i in (0, 1))
     lower, upper = (space.expand(end, 0.0) for end in ends)
     return replace(space, lower=lower, upper=upper)

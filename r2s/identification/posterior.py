@@ -67,11 +67,11 @@ def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:
 
 
 def _inside(u: np.ndarray, steps: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return steps (S, P) that end in the cube: values that would leave it stop at its side, and others compensate.
+    """Return steps (S, P) that end in the cube: values that would leave it are clipped, and the others compensate.
 
-    h (P, P) is half the Hessian of the sum of squares. If an offset is correlated with an asymmetry at its bound,
-    stopping the asymmetry alone would change their sum. Values stop one at a time, the farthest first: of two
-    correlated values, this often brings the other back.
+    h (P, P) is half the Hessian of the sum of squares. Clipping alone would bias sums: an offset, for example, is
+    correlated with an asymmetry at its bound. Values are clipped one at a time, the farthest first, which often
+    brings a correlated value back.
     """
     steps = steps.copy()
     for step in steps:

@@ -7,13 +7,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.link_inertia import LINK, PAYLOAD
-from r2s.identification.parameters import (
-    ParameterSpace,
-    check_parameters,
-    logarithmic,
-    parameter_space,
-    torque_like,
-)
+from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, parameter_space, torque_like
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import known_families
 from r2s.physics.robot import Robot

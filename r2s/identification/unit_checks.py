@@ -111,7 +111,7 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the joints that another column explains, and these columns, or None; shares (S, S): unexplained."""
+    """Return joints that other columns fit better, and these columns, or None; pairs (S, S): unexplained shares."""
     order = linear_sum_assignment(pairs)[1]
     off = np.flatnonzero(order != np.arange(len(own)))
     if len(off) and own[off].mean() > REFUSED and pairs[off, order[off]].mean() < CORRECTED * own[off].mean():

@@ -123,23 +123,28 @@ class TaskEnv(EnvBase):
         after = self._step(tensordict)
         tensordict.set("next", after)
         cut = np.flatnonzero(self._count >= self.task.steps)
-        return tensordict, self._tensors(self._restart(cut)) if len(cut) else after.exclude("reward")
+        return tensordict, self._present(self._restart(cut)) if len(cut) else after.exclude("reward")
 
     def read(self) -> TensorDict:
         """Return the tensordict of the present state."""
-        return self._tensors(self.arms.read())
+        return self._present(self.arms.read())
 
-    def _tensors(self, state: State) -> TensorDict:
-        none = torch.zeros((self.nsim, 1), dtype=torch.bool)
-        distance, _ = self._judge(state, np.zeros_like(self._dq))
+    def _present(self, state: State) -> TensorDict:
+        distance, terms = self._judge(state, np.zeros_like(self._dq))
+        return self._tensors(self._observe(state), np.zeros_like(terms), distance, np.zeros(self.nsim, dtype=bool))
+
+    def _tensors(
+        self, observation: np.ndarray, terms: np.ndarray, distance: np.ndarray, cut: np.ndarray
+    ) -> TensorDict:
+        done = torch.from_numpy(cut[:, None])
         return TensorDict(
             {
-                "observation": torch.from_numpy(self._observe(state)),
-                "reward_terms": torch.zeros(self.nsim, len(self.weights)),
+                "observation": torch.from_numpy(observation),
+                "reward_terms": torch.from_numpy(terms.astype(np.float32)),
                 "distance": torch.from_numpy(distance[:, None].astype(np.float32)),
-                "done": none,
-                "terminated": none.clone(),
-                "truncated": none.clone(),
+                "done": done,
+                "terminated": torch.zeros_like(done),
+                "truncated": done.clone(),
             },
             batch_size=self.batch_size,
         )
@@ -177,19 +182,9 @@ class TaskEnv(EnvBase):
         observation = self._observe(state)
         check_finite("observation", observation, self._count)
         check_finite("reward", terms, self._count)
-        cut = torch.from_numpy((self._count >= self.task.steps)[:, None])
-        return TensorDict(
-            {
-                "observation": torch.from_numpy(observation),
-                "reward_terms": torch.from_numpy(terms.astype(np.float32)),
-                "distance": torch.from_numpy(distance[:, None].astype(np.float32)),
-                "reward": torch.from_numpy((terms @ self.weights)[:, None].astype(np.float32)),
-                "done": cut,
-                "terminated": torch.zeros_like(cut),
-                "truncated": cut.clone(),
-            },
-            batch_size=self.batch_size,
-        )
+        after = self._tensors(observation, terms, distance, self._count >= self.task.steps)
+        after["reward"] = torch.from_numpy((terms @ self.weights)[:, None].astype(np.float32))
+        return after
 
     def _set_seed(self, seed: int | None) -> None:
         self.rng = np.random.default_rng(seed)

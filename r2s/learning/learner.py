@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from r2s.errors import UserError, check_number
 from r2s.learning.networks import Actor, Critics, Normalizer, Policy
@@ -53,7 +54,6 @@ class Learner(nn.Module, ABC):
         check_number("n_critics", critics[0], "[1, inf)", whole=True)
         check_number("gamma", gamma, "[0, 1)")
         check_number("tau", tau, "(0, 1]")
-        check_number("lr", lr, "(0, 1]")
         check_number("lr", lr, "[1e-12, 1]")  # smaller steps vanish in float32
         check_number("action_l2", action_l2, "[0, inf)")
         obs_dim, act_dim = len(scale[0]), len(action_scale)
@@ -184,7 +184,7 @@ class EntropyLearner(Learner):
 
     Args:
         scale, action_scale, critics, shared: see `Learner`.
-        alpha_init: initial temperature. target_entropy: None: minus the number of actions.
+        alpha_init: initial temperature. target_entropy: its goal; None: minus the number of actions.
     """
 
     def __init__(
@@ -233,6 +233,18 @@ class EntropyLearner(Learner):
         actor = (alpha * log_prob - value).mean() + self.action_l2 * action.square().mean()
         temperature = -(self.log_alpha * (log_prob.detach() + self.target_entropy)).mean()
         return {"loss_actor": actor, "loss_alpha": temperature, "entropy": -log_prob.mean()}
+
+
+def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Return tanh(loc + scale * noise) (B, a) and its log-density (B,) for a Gaussian (loc, scale); noise ~ N(0, 1).
+
+    The identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) keeps the density finite where tanh saturates.
+    """
+    loc, scale = gaussian
+    x = loc + scale * noise
+    log_prob = -0.5 * noise.square() - scale.log() - 0.9189385332046727  # log(2 pi) / 2
+    log_prob = log_prob - 2.0 * (0.6931471805599453 - x - F.softplus(-2.0 * x))
+    return torch.tanh(x), log_prob.sum(-1)
 
 
 @torch.no_grad()

@@ -32,11 +32,7 @@ class Actor(nn.Module):
     """
 
     def __init__(
-        self,
-        obs_dim: int,
-        act_dim: int,
-        hidden: tuple[int, ...],
-        log_std: tuple[float, float] = (-5.0, 2.0),
+        self, obs_dim: int, act_dim: int, hidden: tuple[int, ...], log_std: tuple[float, float] = (-5.0, 2.0)
     ):
         super().__init__()
         sizes = [obs_dim, *hidden]
@@ -127,15 +123,3 @@ def _outputs(
         x = torch.baddbmm(b, x, w)
         x = F.relu(torch.addcmul(s, F.layer_norm(x, x.shape[-1:]), g))
     return torch.baddbmm(last_bias, x, last_weight)
-
-
-def sample_tanh(gaussian: tuple[Tensor, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tanh(loc + scale * noise) (B, a) and its log-density (B,) for a Gaussian (loc, scale); noise ~ N(0, 1).
-
-    The identity log(1 - tanh(x)^2) = 2 (log 2 - x - softplus(-2 x)) keeps the density finite where tanh saturates.
-    """
-    loc, scale = gaussian
-    x = loc + scale * noise
-    log_prob = -0.5 * noise.square() - scale.log() - 0.9189385332046727  # log(2 pi) / 2
-    log_prob = log_prob - 2.0 * (0.6931471805599453 - x - F.softplus(-2.0 * x))
-    return torch.tanh(x), log_prob.sum(-1)

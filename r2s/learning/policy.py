@@ -47,8 +47,6 @@ def load_policy(folder: Path, robot: Robot, task: Task) -> Policy:
     if not path.is_file():
         raise UserError(f"policy: no policy.pt in {folder}")
     saved = load_tensors(path, "policy")
-    if "told" in saved:  # inputs of adapters that were removed
-        raise UserError(f"policy: {path} was trained with adapt=osi or rma, which were removed; train it again")
     try:
         policy = make_policy(robot, task, tuple(saved["hidden"]))
         policy.load_state_dict(saved["state"])

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2s.learning.learner import EntropyLearner
-from r2s.learning.networks import sample_tanh
+from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class SAC(EntropyLearner):

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from r2s.errors import check_number
-from r2s.learning.learner import EntropyLearner
-from r2s.learning.networks import sample_tanh
+from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):

@@ -30,9 +30,8 @@ class Family:
         bounds: (low, high) of each parameter, for those that `identify.bounds` does not list.
         optional: the last parameters; each is 0 and not estimated unless `identify.terms` names it.
         formula: the law in one line.
-        law, law_slope: (dq, p, sign) -> torque, Nm, and its derivative by dq, Nm s/rad. dq and sign have shape
-            (..., n); p is a list of K arrays (..., n). `sign` is tanh(dq / 0.01), or the bristle deflection of a
-            family with a memory, in [-1, 1].
+        law: (dq, p, sign) -> torque, Nm. dq and sign have shape (..., n); p is a list of K arrays (..., n). `sign` is
+            tanh(dq / 0.01), or the bristle deflection of a family with a memory, in [-1, 1].
         native: the law for one joint and one step of h seconds, compiled by numba.njit:
             (p (PHI,), v, h, memory (1,)) -> torque and slope at v. `memory` is the joint's state, 0 after a reset.
         sharp: `native` with the jump at rest, for stiction_model="net", which solves for rest. None: the law has no
@@ -50,7 +49,6 @@ class Family:
     units: tuple[str, ...]
     formula: str
     law: Callable[..., np.ndarray]
-    law_slope: Callable[..., np.ndarray]
     native: Callable[..., tuple[float, float]]
     start: Callable[[np.ndarray], list[np.ndarray]]
     logarithmic: tuple[str, ...] = ()
@@ -98,15 +96,8 @@ class Family:
             phi: (..., n, K), in the order of `names`; optional parameters may be missing.
             bristle: (..., n) bristle deflection in [-1, 1], such as of `presliding`; default: tanh(dq / 0.01).
         """
-        return self.law(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
-
-    def slope(self, dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
-        """Return the derivative of `torque` by dq, Nm s/rad."""
-        return self.law_slope(dq, self._columns(phi), np.tanh(dq / WIDTH_DQ))
-
-    def _columns(self, phi: np.ndarray) -> list[np.ndarray]:
-        missing = [np.zeros(())] * (len(self.names) - phi.shape[-1])
-        return [phi[..., k] for k in range(phi.shape[-1])] + missing
+        columns = [phi[..., k] for k in range(phi.shape[-1])] + [np.zeros(())] * (len(self.names) - phi.shape[-1])
+        return self.law(dq, columns, np.tanh(dq / WIDTH_DQ) if bristle is None else bristle)
 
     def level(self, phi: np.ndarray, dq_max: np.ndarray) -> np.ndarray:
         """Return the mean magnitude of friction (..., n) Nm at plus and minus `dq_max` (..., n) rad/s."""
@@ -128,11 +119,6 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 def _sigmoid_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
     """Eq. (5) of the paper, and a viscous term."""
     return p[0] * (sigmoid(p[1] * (dq + p[2])) - sigmoid(p[1] * p[2])) + p[3] * dq
-
-
-def _sigmoid_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    s = sigmoid(p[1] * (dq + p[2]))
-    return p[0] * p[1] * s * (1.0 - s) + p[3]
 
 
 @njit(cache=True)
@@ -159,7 +145,6 @@ SIGMOID = Family(
     optional=("viscous",),
     formula="phi1 (s(phi2 (v + phi3)) - s(phi2 phi3)) + viscous v, s the logistic function: eq. (5)",
     law=_sigmoid_law,
-    law_slope=_sigmoid_slope,
     native=_sigmoid_native,
     start=_sigmoid_start,
 )
@@ -167,11 +152,6 @@ SIGMOID = Family(
 
 def _coulomb_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
     return p[0] * (1 + np.sign(sign) * p[1]) * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
-
-
-def _coulomb_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    side = np.sign(dq)
-    return p[0] * (1 + side * p[1]) * (1 - sign**2) / WIDTH_DQ + p[2] * (1 + side * p[-1])
 
 
 @njit(cache=True)
@@ -200,7 +180,6 @@ COULOMB = Family(
     optional=("viscous_asymmetry",),
     formula="coulomb (1 ± asymmetry) sign(v) + viscous (1 ± viscous_asymmetry) v",
     law=_coulomb_law,
-    law_slope=_coulomb_slope,
     native=_coulomb_native,
     sharp=_coulomb_sharp,
     start=_coulomb_start,
@@ -211,13 +190,6 @@ def _stribeck_law(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.n
     side = np.sign(sign)
     level = p[0] * (1 + side * p[1]) * (1 + p[3] * (1 + side * p[-2]) * np.exp(-((dq / p[4]) ** 2)))
     return level * sign + p[2] * (1 + np.sign(dq) * p[-1]) * dq
-
-
-def _stribeck_slope(dq: np.ndarray, p: list[np.ndarray], sign: np.ndarray) -> np.ndarray:
-    side = np.sign(dq)
-    level, bump = p[0] * (1 + side * p[1]), p[3] * (1 + side * p[-2]) * np.exp(-((dq / p[4]) ** 2))
-    fall = level * bump * -2 * dq / p[4] ** 2
-    return level * (1 + bump) * (1 - sign**2) / WIDTH_DQ + fall * sign + p[2] * (1 + side * p[-1])
 
 
 @njit(cache=True)
@@ -253,7 +225,6 @@ STRIBECK = Family(
         "+ viscous (1 ± viscous_asymmetry) v"
     ),
     law=_stribeck_law,
-    law_slope=_stribeck_slope,
     native=_stribeck_native,
     sharp=_stribeck_sharp,
     start=_stribeck_start,
@@ -293,7 +264,6 @@ BRISTLE = Family(
     optional=STRIBECK.optional,
     formula="Stribeck's law with a sign that changes over the distance `presliding`: it has a memory and stiction",
     law=_stribeck_law,
-    law_slope=_stribeck_slope,
     native=_bristle_native,
     start=_bristle_start,
     held=_bristle_held,

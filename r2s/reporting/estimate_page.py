@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import rerun as rr
 
 from r2s.files import atomic_write
 from r2s.reporting.figures.colours import colours
 from r2s.reporting.figures.panels import panels
+from r2s.reporting.viewer.layout import log_series
 
 LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # of the estimate and of the edges of its interval, in rerun
 
@@ -46,7 +46,6 @@ def write_estimate_recording(path: Path, rows: pd.DataFrame) -> Path:
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
     index = [rr.TimeColumn("time", duration=rows["t"].to_numpy())]
     colour = colours(["estimate"])["estimate"]
-    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
     with atomic_write(path) as part:
         stream.save(part)
         for name in rows.columns:
@@ -58,9 +57,7 @@ def write_estimate_recording(path: Path, rows: pd.DataFrame) -> Path:
                 half = rows[f"{name}_half"].to_numpy()
                 lines |= {"low": (x - half, EDGE_WIDTH), "high": (x + half, EDGE_WIDTH)}
             for label, (values, width) in lines.items():
-                at = f"{name}/{label}"
-                stream.log(at, rr.SeriesLines(names=label, colors=rgb, widths=width), static=True)
-                stream.send_columns(at, indexes=index, columns=rr.Scalars.columns(scalars=values))
+                log_series(stream, f"{name}/{label}", index, values, label, colour, width)
         stream.flush()
         stream.disconnect()
     return path

@@ -67,7 +67,7 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         side = summary["validation"]
         after, before = (float(np.mean(side[k])) for k in ("torque_rmse_Nm", "nominal_torque_rmse_Nm"))
         return f"torque RMSE {after:.3g} Nm, nominal {before:.3g}"
-    if stage in ("estimate", "watch"):
+    if stage == "estimate":
         return f"payload {summary['mass_kg']:.3g} ± {summary['mass_kg_half']:.2g} kg"
     if stage == "train":
         return _in_words(folder, summary["best"])

@@ -107,6 +107,16 @@ def file_data(cfg):
     return called(FileData, "data", given)
 
 
+def read_file(robot, file, path):
+    """Return the recording at `path`, with the columns of a `FileData`."""
+    from r2s.recordings.readers import read
+
+    keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    how = {k: getattr(file, k) for k in keys}
+    return read(path, **how, n_joints=robot.n, model_joints=names if all(names) else None)
+
+
 def read_motion(robot, file, share):
     """Return training and validation motion of a `FileData`; they must not have motion in common.
 
@@ -116,13 +126,8 @@ def read_motion(robot, file, share):
     import numpy as np
 
     from r2s.identification.checks import check_recording
-    from r2s.recordings.readers import read
 
-    keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
-    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
-    how = {k: getattr(file, k) for k in keys}
-    how |= {"n_joints": robot.n, "model_joints": names if all(names) else None}
-    recording = read(file.path, **how)
+    recording = read_file(robot, file, file.path)
     check_recording(robot, recording)
     if file.period is None and (periodic := recording.in_phase()) is not recording:
         recording = periodic
@@ -132,7 +137,7 @@ def read_motion(robot, file, share):
         return recording.split(share)
     if os.path.realpath(file.validation) == os.path.realpath(file.path):
         raise UserError("data.validation is the training file itself: it must hold other motion")
-    validation = read(file.validation, **how)
+    validation = read_file(robot, file, file.validation)
     check_recording(robot, validation)
     rows = {row.tobytes() for row in np.column_stack([recording.q, recording.dq])}
     same = sum(row.tobytes() in rows for row in np.column_stack([validation.q, validation.dq]))
@@ -164,6 +169,11 @@ def read_user_ramps(robot, file):
     return ramps
 
 
+def check_data(cfg):
+    """Raise UserError if the settings of data=arm or data=simulated are out of range."""
+    called(SimulatedData if cfg.data.kind == "simulated" else ArmData, "data", plain(cfg.data))
+
+
 def ramp_poses(cfg, robot):
     """Return the postures (., n) rad of the ramps; raise UserError if no path leads there."""
     from r2s.arm.ramp import check_paths, poses_about
@@ -175,7 +185,7 @@ def ramp_poses(cfg, robot):
 
 
 def record_motion(cfg, robot, motion, k, label):
-    """Return the k-th recording of an arm, of a given motion or of one optimized for data.seconds."""
+    """Return the k-th motion of an arm, given or optimized for data.seconds, and its recording."""
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
     from r2s.progress import Progress

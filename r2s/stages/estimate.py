@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
-from r2s.errors import Stopped, UserError, check_number, nearest
+from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
 from r2s.stages.adapter_factory import calibrated, with_declared_payload
-from r2s.stages.build import called, check_source, make_dynamics, make_robot, open_run, opened_source, plain
+from r2s.stages.build import check_source, make_dynamics, make_robot, open_run, opened_source
+from r2s.stages.data import check_data, file_data, read_file
 
 WHY = {
     "arm": "only data=arm moves an arm",
@@ -73,24 +74,16 @@ def given_recording(cfg, robot):
         UserError: no such file, another torque than the commanded one, or an arm that cannot be moved.
     """
     from r2s.adaptation.offline_estimation import at_rate
-    from r2s.recordings.readers import read
-    from r2s.stages.data import ArmData, SimulatedData
 
     if cfg.data.kind != "recording":
-        called(SimulatedData if cfg.data.kind == "simulated" else ArmData, "data", plain(cfg.data))
+        check_data(cfg)
     if cfg.data.torque != "commanded":
         raise UserError(f"data.torque: expected commanded for stage=estimate, got {cfg.data.torque}")
     if cfg.data.kind != "recording":
         check_source(cfg, robot)
         return None
-    path = located(cfg.data.path)
-    if not path.exists():
-        near = nearest(path.name, [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else [])
-        raise UserError(f"data.path: no such file: {path}{near}")
-    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
-    settings = {k: plain(cfg.data)[k] for k in ("torque", "columns", "max_gap_s", "topic", "joints")}
-    recording = read(str(path), **settings, n_joints=robot.n, model_joints=names if all(names) else None)
-    return at_rate(robot, recording)
+    file = file_data(cfg)
+    return at_rate(robot, read_file(robot, file, file.path))
 
 
 def record_arm(cfg, robot):

@@ -6,15 +6,7 @@ from typing import Any
 
 from r2s.errors import check_number
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
-from r2s.stages.data import (
-    ArmData,
-    SimulatedData,
-    file_data,
-    ramp_poses,
-    read_motion,
-    read_user_ramps,
-    record_arm,
-)
+from r2s.stages.data import check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
 from r2s.stages.parts import called, part, plain
 
 WHY = {
@@ -79,7 +71,7 @@ def make_parts(cfg):
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         ramps = read_user_ramps(robot, file)
         return Parts(robot, nominal, searches, file.files, None, train, validation, ramps)
-    called(SimulatedData if cfg.data.kind == "simulated" else ArmData, "data", plain(cfg.data))
+    check_data(cfg)
     ramp_poses(cfg, robot)
     check_source(cfg, robot)
     if not cfg.data.excitation:

@@ -133,7 +133,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     """Return {label: words of a command} for each step: identify, train, transfer.
 
     Both trainings have the same settings, time and machine, so that on the arm only the model differs. With an
-    adapter, the arm is identified without payload and other changes; the transfer adds them unannounced.
+    adapter, identification runs on the unchanged arm; payload, friction and delay change in the transfer only.
 
     Args:
         cfg: config of the pipeline. name: of the pipeline; the names of its steps begin with it.

@@ -141,17 +141,8 @@ def train(cfg, overrides):
             progress(share, ", ".join([text, *measures.in_words(row)]))
 
         callbacks = Callbacks(lambda row: run.log("metrics", row), evaluated, show)
-        dump = run.folder / "dump.pt"
-        run_train(
-            parts.env,
-            algo,
-            parts.evaluate,
-            parts.loop,
-            parts.budget,
-            checkpoint=checkpoint,
-            dump=dump,
-            callbacks=callbacks,
-        )
+        given = parts.env, algo, parts.evaluate, parts.loop, parts.budget
+        run_train(*given, checkpoint=checkpoint, dump=run.folder / "dump.pt", callbacks=callbacks)
         progress.close()
         conclude(cfg, run, parts, selection)
         checkpoint.clear()

@@ -95,8 +95,8 @@ class ObservationTerm:
     Attributes:
         name: of the term. unit: SI, "1" if dimensionless.
         of: its source: q, dq, ee, goal, error (goal - ee), effort, or pull (J^T error). With a plan, `goal` is the
-            current reference position, and there are ahead (the next positions - ee), velocity (of the path),
-            limited, q_off and dq_off (plan minus arm). A controller that observes its torque adds control.
+            current reference position. More sources of a plan: ahead (next positions - ee), velocity (of the path),
+            limited, q_off and dq_off (plan minus arm). control: the torque of a controller that observes it.
         divided_by: one number, or one per element; None: nothing. tanh: whether tanh follows.
     """
 

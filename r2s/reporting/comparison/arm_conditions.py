@@ -12,24 +12,16 @@ SETTINGS: dict[str, tuple[Any, str]] = {  # keys that set a condition: nominal v
     "extra_delay_s": (0.0, "{} s later"),
     "stiffness": (None, "stiffness {}"),
 }
-# keys in the config of an older run, and the values of its `make`
-RENAMED = {"make": "variant", "load": "declared_payload", "friction": "friction_scale", "late": "extra_delay_s"}
-VARIANTS = {1: "rigid", 2: "elastic"}
-
-
-def current(arm: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arm's config with the present keys: the older `make: 1` is `variant: rigid`."""
-    return {RENAMED.get(k, k): VARIANTS.get(v, v) if k == "make" else v for k, v in arm.items()}
 
 
 def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, Any]:
     """Return the settings of conf/arm that differ from nominal: {"payload": 1.0}.
 
     Args:
-        arm: its config (`current`). typed: overrides such as "arm.live", which count as settings too.
+        arm: its config. typed: overrides such as "arm.live", which count as settings too.
     """
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
-    keys = dict.fromkeys([*SETTINGS, *(RENAMED.get(k, k) for k in own)])
+    keys = dict.fromkeys([*SETTINGS, *own])
     values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
     return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and (_size(v) or "payload" not in k)}
 

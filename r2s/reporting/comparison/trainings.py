@@ -1,7 +1,7 @@
 """Finished trainings, read from their run folders, and which of them are comparable."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import yaml
 
 from r2s.errors import UserError
 from r2s.reporting.measures import measures_of
+from r2s.reporting.trackers.tracker import flat
 from r2s.tasks.measures import MeasureTable
 
 # config groups that a training reads, beside its seed; runs with equal values are seeds of one group
@@ -117,12 +118,12 @@ def _read(folder: Path) -> Trained:
     typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
     measures = measures_of(folder)
     curve, last = _evaluations(folder, measures)
-    alike = dict(flat({k: v for k, v in config.items() if k in ALIKE}))
+    alike = settings_in(config, ALIKE)
     return Trained(
         folder,
         int(config["seed"]),
         name,
-        dict(flat({k: v for k, v in config.items() if k in read})),
+        settings_in(config, read),
         alike | {"evaluation.episodes": config.get("evaluation", {}).get("episodes")},
         typed,
         typed.get("experiment") == "toy",
@@ -131,6 +132,12 @@ def _read(folder: Path) -> Trained:
         curve,
         last,
     )
+
+
+def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
+    """Return {"dr.phi_relative": 0.1, ...} of these groups of a config, without `_target_`."""
+    own = flat({group: node for group, node in config.items() if group in groups})
+    return {key: value for key, value in own if not key.endswith("_target_")}
 
 
 def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, dict[str, float]]:
@@ -199,12 +206,3 @@ def by_reason(why: Mapping[str, str], most: int = 4, width: int = 24) -> list[st
         reasons.setdefault(reason, []).append(name if len(name) <= width else f"{name[: width - 1]}…")
     more = {reason: f" and {len(names) - most} more" * (len(names) > most) for reason, names in reasons.items()}
     return [f"{', '.join(names[:most])}{more[reason]} ({reason})" for reason, names in reasons.items()]
-
-
-def flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield ("a.b", value) of nested dicts, without `_target_`."""
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        elif key != "_target_":
-            yield f"{prefix}{key}", value

@@ -14,11 +14,10 @@ import pandas as pd
 import yaml
 
 from r2s.files import DAMAGED
-from r2s.reporting.comparison.arm_conditions import condition, current
-from r2s.reporting.comparison.trainings import flat, typed_in, why_not
+from r2s.reporting.comparison.arm_conditions import condition
+from r2s.reporting.comparison.trainings import settings_in, typed_in, why_not
 from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
-from r2s.tasks.rollout import Episodes, episode_measures, select_episodes
 
 FILES = ("config.yaml", "policy.yaml", "overrides.yaml", "summary.json")
 ARM_SPECIFIC = ("calibration",)  # keys of conf/adapt that are no settings of the adapter
@@ -73,31 +72,27 @@ def _read(folder: Path) -> Transferred:
     config = yaml.safe_load((folder / "config.yaml").read_text())
     policy = yaml.safe_load((folder / "policy.yaml").read_text())
     meta = json.loads((folder / "meta.json").read_text())
-    arm, adapt, measures = current(config["arm"]), config["adapt"], measures_of(folder)
-    ran = _load(folder, arm["name"])
+    arm, adapt, measures = config["arm"], config["adapt"], measures_of(folder)
+    with np.load(folder / f"episodes_{arm['name']}.npz", allow_pickle=False) as saved:
+        t, goals = saved["t"], saved["goal"]
     row = json.loads((folder / "summary.json").read_text())[arm["name"]]
-    step = float(ran.t[0])
+    step = float(t[0])
     words = {"name": "{}", "variant": "{}", "seed": "seed {}"}
     return Transferred(
         folder,
         str(meta["start"]),
         os.path.abspath(config["policy"]),
         adapt["name"],
-        dict(flat({k: v for k, v in adapt.items() if k != "name" and k not in ARM_SPECIFIC})),
+        settings_in(adapt, adapt.keys() - {"name", *ARM_SPECIFIC}),
         ", ".join(word.format(arm[k]) for k, word in words.items() if k in arm),
         condition(arm, typed_in(folder)),
-        dict(flat(policy["robot"])),
+        settings_in(policy["robot"], policy["robot"]),
         measures,
-        f"{step * len(ran.t):g} s at {1 / step:g} Hz",
+        f"{step * len(t):g} s at {1 / step:g} Hz",
         int(row["asked"]),
         0.0 if adapt["name"] == "none" else _cost(folder / "timing.csv"),
-        _episodes(folder, arm["name"], ran, measures),
+        pd.read_csv(folder / f"episodes_{arm['name']}.csv").set_axis(list(_names(goals))),
     )
-
-
-def _load(folder: Path, label: str) -> Episodes:
-    with np.load(folder / f"episodes_{label}.npz", allow_pickle=False) as saved:
-        return Episodes(**saved)
 
 
 def _cost(path: Path) -> float:
@@ -105,26 +100,6 @@ def _cost(path: Path) -> float:
         return np.nan
     table = pd.read_csv(path).set_index("what")["median_ms"]
     return 1e3 * float(table.get("adapter", np.nan))
-
-
-def _episodes(folder: Path, label: str, ran: Episodes, measures: MeasureTable) -> pd.DataFrame:
-    """Return `Transferred.episodes`; an older run without episodes_*.csv is measured again."""
-    path, names = folder / f"episodes_{label}.csv", list(_names(ran.goal))
-    table = pd.read_csv(path) if path.is_file() else _measured_again(folder, ran, names, measures)
-    return table.set_axis(names)
-
-
-def _measured_again(folder: Path, ran: Episodes, names: Sequence[str], measures: MeasureTable) -> pd.DataFrame:
-    from r2s.tasks.reach import ReachTask
-    from r2s.tasks.track import TRACK, TrackTask
-
-    predicted = None
-    if (folder / "episodes_predicted.npz").is_file():
-        model = _load(folder, "predicted")
-        at = {name: k for k, name in enumerate(_names(model.goal))}
-        if set(names) <= at.keys():
-            predicted = select_episodes(model, np.array([at[name] for name in names]))
-    return pd.DataFrame(episode_measures(TrackTask() if measures == TRACK else ReachTask(), ran, predicted))
 
 
 def _names(goals: np.ndarray) -> Iterator[str]:

@@ -21,12 +21,7 @@ from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 from r2s.reporting.document import Item, report_html, report_markdown
-from r2s.reporting.identification.figures import (
-    convergence_figure,
-    friction_figure,
-    position_figure,
-    torque_figure,
-)
+from r2s.reporting.identification.figures import convergence_figure, friction_figure, position_figure, torque_figure
 from r2s.reporting.identification.identifiability import identifiability
 from r2s.reporting.identification.paper_tables import (
     breakaway_table,
