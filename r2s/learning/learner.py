@@ -54,6 +54,7 @@ class Learner(nn.Module, ABC):
         check_number("n_critics", critics[0], "[1, inf)", whole=True)
         check_number("gamma", gamma, "[0, 1)")
         check_number("tau", tau, "(0, 1]")
+        check_number("lr", lr, "(0, 1]")
         check_number("lr", lr, "[1e-12, 1]")  # smaller steps vanish in float32
         check_number("action_l2", action_l2, "[0, inf)")
         obs_dim, act_dim = len(scale[0]), len(action_scale)

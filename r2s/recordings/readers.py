@@ -71,8 +71,7 @@ def read(
         columns: names in the file of t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
             DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau denotes a (T, n) array, or numbered columns
             q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. `{j}` (from 1) or `{i}` (from 0) in a name is the
-            joint number;
-            a list names the joints one by one. In HDF5 a name is a path: robot/q.
+            joint number; a list names the joints one by one. In HDF5 a name is a path: robot/q.
         n_joints: expected number of joints.
         max_gap_s: a longer pause in time begins a new trajectory; None: no splitting.
         period: s, see `Recording`.
@@ -115,7 +114,10 @@ def from_table(table: Table, how: Options) -> Recording:
     if not np.any(arrays["tau"]):  # position-controlled and simulated arms fill the field with zeros
         raise UserError(f"tau ({listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
     if constant is not None:
-        arrays["tau"] = arrays["tau"] * _per_joint(constant, arrays["tau"])
+        joints = arrays["tau"].shape[-1] if arrays["tau"].ndim > 1 else 1
+        if constant.ndim and constant.shape != (joints,):
+            raise UserError(f"data.torque_constant: expected {joints} values, one per joint, got {constant.size}")
+        arrays["tau"] = arrays["tau"] * constant
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
@@ -173,13 +175,6 @@ def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
         raise UserError(f"{where}: expected a number of Nm/A or one per joint, got {value}") from None
     if constant.ndim > 1 or not np.all(np.isfinite(constant)) or np.any(constant == 0):
         raise UserError(f"{where}: expected finite Nm/A other than 0, one or one per joint, got {constant.tolist()}")
-    return constant
-
-
-def _per_joint(constant: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    joints = tau.shape[-1] if tau.ndim > 1 else 1
-    if constant.ndim and constant.shape != (joints,):
-        raise UserError(f"data.torque_constant: expected {joints} values, one per joint, got {constant.size}")
     return constant
 
 

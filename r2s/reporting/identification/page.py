@@ -157,7 +157,7 @@ def identification_sections(
         ],
         "Convergence": [
             *shown("convergence"),
-            "Costs compare within one search only: the residuals are reweighed between searches.",
+            "Costs are comparable within one search only, because residuals are reweighted between searches.",
         ],
         "Filtering of the recording": _filtering(commanded, evidence.window_s, evidence.cutoff_hz),
     }
