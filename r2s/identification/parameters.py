@@ -57,7 +57,7 @@ class ParameterSpace:
         nominal: start values of a search, and values of all parameters that are not in x.
         robot: the arm; inertia blocks are relative to its links.
         breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. The breakaway torques
-            then follow the offset (torque = command + offset). NaN keeps the nominal torque; None: all.
+            then follow the offset (torque = command + offset). NaN or None: the nominal torque.
     """
 
     blocks: tuple[str, ...]
