@@ -7,7 +7,10 @@ import os
 import re
 import time
 import uuid
+from copy import copy
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -46,6 +49,15 @@ def in_blocks(page: Path) -> list[str]:
     whole = [re.sub(r" *\\\n *", " ", block) for block in blocks]
     lines = [re.sub(r"(^| +)# .*", "", line).strip() for block in whole for line in block.splitlines()]
     return [line for line in lines if line]
+
+
+def unfenced(robot: Robot, task: Any) -> Any:
+    """Return a task in which everything may touch, so that its driver has no fence, as in training."""
+    model = robot.model(gravity=False)
+    bodies = [model.body(k).name for k in range(model.nbody)]
+    task = copy(task)
+    object.__setattr__(task, "may_touch", tuple(combinations([*bodies, "table"], 2)))
+    return task
 
 
 @pytest.fixture(scope="session")

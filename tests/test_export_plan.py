@@ -58,12 +58,15 @@ def along(exported, cycles: int, calm: int) -> dict[str, np.ndarray]:
     motion, rng, n = hostile(robot, task, cycles), np.random.default_rng(1), robot.n
     plans = np.load(exported.folder / "plans.npz")["plans"]
     motion |= {"goal": plans, "which": motion["which"] % len(plans)}
+    begin = motion["begin"]
+    motion["q"][begin], motion["dq"][begin] = plans[motion["which"][begin], 0, 6 : 6 + n], 0.0  # else it is refused
     t = np.arange(calm) / task.substeps
     row = np.minimum(t.astype(int), task.steps)
     plan, share = plans[0], np.where(row < task.steps, t - row, 0.0)[:, None]
     near = plan[row] + share * (plan[row + 1] - plan[row])
     motion["q"][:calm] = near[:, 6 : 6 + n] + CALM_RAD * rng.normal(size=(calm, n))
     motion["dq"][:calm] = near[:, 6 + n : 6 + 2 * n] + CALM_SHARE * robot.dq_max * rng.normal(size=(calm, n))
+    motion["dq"][0] = 0.0
     motion["begin"][1:calm], motion["which"][:calm], motion["applied"][:calm] = False, 0, np.nan
     return motion
 
@@ -215,6 +218,37 @@ def test_a_plan_of_another_size_or_that_is_not_finite_is_refused(planned, runtim
         other(*np.zeros((3, 7)))
     with pytest.raises(runtime.BundleError, match=r"\(7,\), \(3,\); 7 joints and no goal are allowed"):
         other(*np.zeros((3, 7)), np.zeros(3))
+
+
+def moved(plan: np.ndarray, row: int, column: int, by: float) -> np.ndarray:
+    plan = plan.copy()
+    plan[row, column] += by
+    return plan
+
+
+BEYOND: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
+    "a joint": (lambda p: moved(p, 40, 6 + 3, 4.0), "row 40 of the plan: joint 4 at .* rad is beyond its limit"),
+    "a speed": (lambda p: moved(p, 40, 13 + 4, 3.0), "row 40 of the plan: joint 5 at .* rad/s is beyond its limit"),
+    "the region": (lambda p: moved(p, 40, 2, -0.4), "row 40 of the plan: the goal is "),
+    "its own angles": (lambda p: moved(p, 40, 2, 0.002), "row 40 of the plan is 2.0 mm from where its joint angles"),
+}
+
+
+@pytest.mark.parametrize("kind", BEYOND)
+def test_a_plan_beyond_limits_or_region_is_refused(planned, runtime, kind):
+    """Before a motion, in one line."""
+    change, words = BEYOND[kind]
+    other = runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned)))
+    with pytest.raises(runtime.BundleError, match=words):
+        other.reset(change(np.load(planned.folder / "plans.npz")["plans"][0]))
+
+
+def test_a_motion_begins_at_the_first_row_of_its_plan(planned, runtime):
+    other = runtime.Runtime(planned.folder, runtime.Arm(**arm_of(planned)))
+    plan = np.load(planned.folder / "plans.npz")["plans"][0]
+    other.reset(plan)
+    with pytest.raises(runtime.BundleError, match=r"joint . is at .* rad; motions begin within 0.05 rad of"):
+        other(plan[0, 6:13] + 0.1, np.zeros(7), np.zeros(7))
 
 
 def model(contract: dict) -> dict:

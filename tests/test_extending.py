@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from conftest import ROOT
-from test_cli import TOY, succeed
+from test_cli import TOY, r2s, succeed
 
 PAGE = (ROOT / "docs" / "how_to" / "extending.md").read_text()
 EXAMPLES = {part.split("\n")[0]: part for part in re.split(r"^## ", PAGE, flags=re.M)[1:]}
@@ -50,7 +50,8 @@ def test_a_task_with_its_own_action_space_goes_through_every_stage(tmp_path):
     """Eight values per action, a law and a measure of its own, a reward and a tracker from outside r2s.
 
     Training, transfer to a second engine and a twin, comparison, list and export know them through the task alone.
-    The exported law runs without r2s' compiler, and gives the torque of the driver.
+    A run folder that names them is read where the user trusts their modules. The exported law runs without r2s'
+    compiler, and gives the torque of the driver.
     """
     for path, text in files_of("A task with its own action space", "A reward", "A tracker").items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
@@ -62,6 +63,10 @@ def test_a_task_with_its_own_action_space_goes_through_every_stage(tmp_path):
     assert "torque_Nm" in json.loads((run / "summary.json").read_text())["best"]
     assert '"table": "summary"' in (run / "lines.jsonl").read_text()
     transfer = "stage=transfer", "policy=runs/train/soft", "name=soft", "evaluation.episodes=2", "threads=1"
+    refused = r2s(*transfer, "simulator=mujoco", "arm=none", at=tmp_path)
+    assert refused.returncode == 2
+    assert "add trust=[gentle,lines,soft]" in refused.stderr
+    transfer = *transfer, "trust=[gentle,lines,soft]"
     out = succeed(*own, *transfer, "simulator=dart", "arm=twin", at=tmp_path)
     assert "torque, Nm" in out
     rows = json.loads((tmp_path / "runs" / "transfer" / "soft" / "summary.json").read_text())
@@ -69,7 +74,7 @@ def test_a_task_with_its_own_action_space_goes_through_every_stage(tmp_path):
     assert all(row["torque_Nm"] > 0 for row in rows.values())
     succeed("stage=compare", "runs=runs/train/*", at=tmp_path)
     assert "success at 1 cm" in succeed("list", at=tmp_path)
-    succeed("export", "runs/train/soft", at=tmp_path)
+    succeed("export", "runs/train/soft", "trust=gentle,lines,soft", at=tmp_path)
     contract = json.loads((run / "bundle" / "contract.json").read_text())
     assert contract["control"]["name"] == "impedance"
     assert len(contract["control"]["action_scale"]) == 8

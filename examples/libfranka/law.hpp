@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <string>
 
 #include "contract.hpp"
 
@@ -125,12 +126,17 @@ inline void solve(Square& a, Joints& b, int k) {
 
 class Driver {
  public:
-  enum Why { runs, silent, not_finite, outside, law_not_finite };
+  enum Why { runs, silent, not_finite, outside, law_not_finite, requested };
   Model model;
   Joints effort{};  // Nm, the target torque after the low-pass
   Why why = runs;   // why the arm is being brought to rest
 
   explicit Driver(double soft_start_s = 0.0) : fade_(std::lround(soft_start_s / c::cycle_s)) {}
+
+  // Bring the arm to rest, from the next cycle on; the first reason is kept.
+  void stop() {
+    if (why == runs) why = requested;
+  }
 
   // Whether a motion that is being stopped is at rest, or its time is over.
   bool done() const { return why != runs && (rests_ || damped_ * c::cycle_s >= c::damp_s); }
@@ -281,6 +287,37 @@ class Driver {
     return push;
   }
 };
+
+// Why the training had no such goal (m, in the base frame); empty: it had.
+inline std::string refused(const Vec& goal) {
+  constexpr double rounding = 1e-6;  // m and rad, of a goal on the border
+  const Vec way = goal - Vec{c::shoulder[0], c::shoulder[1], c::shoulder[2]};
+  const double away = std::sqrt(dot(way, way)), azimuth = std::abs(std::atan2(goal[1], goal[0]));
+  if (!finite(goal)) return "the goal is not finite";
+  if (away < c::goal_nearest - rounding || away > c::goal_farthest + rounding)
+    return "the goal is " + std::to_string(away) + " m from the shoulder; the training had " +
+           std::to_string(c::goal_nearest) + " to " + std::to_string(c::goal_farthest) + " m";
+  if (goal[2] < c::goal_lowest - rounding)
+    return "the goal is at a height of " + std::to_string(goal[2]) + " m; the training had " +
+           std::to_string(c::goal_lowest) + " m and more";
+  if (azimuth > c::goal_azimuth + rounding)
+    return "the goal is " + std::to_string(azimuth) + " rad to the side; the training had up to " +
+           std::to_string(c::goal_azimuth) + " rad";
+  return "";
+}
+
+// Why no motion of the training began in this state; empty: one did.
+inline std::string refused(const Joints& q, const Joints& dq) {
+  for (int j = 0; j < n; ++j) {
+    const std::string joint = "joint " + std::to_string(j + 1);
+    if (!(std::abs(q[j] - c::start[j]) <= c::start_within))
+      return joint + " is at " + std::to_string(q[j]) + " rad; motions begin within " +
+             std::to_string(c::start_within) + " rad of " + std::to_string(c::start[j]);
+    if (!(std::abs(dq[j]) <= c::start_fastest))
+      return joint + " moves at " + std::to_string(dq[j]) + " rad/s; motions begin at rest";
+  }
+  return "";
+}
 
 // The policy's observation; the model must be at q already.
 inline std::array<float, c::observations> observe(const Driver& driver, const Joints& q, const Joints& dq,

@@ -6,6 +6,8 @@ import inspect
 import json
 import os
 import shutil
+import subprocess
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,7 +35,7 @@ from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
 # modules that the one file of a bundle contains beside runtime.py, in this order
-HERE, PARTS = "r2s.export.", ("law", "control", "inverse_dynamics", "plan")
+HERE, PARTS = "r2s.export.", ("law", "control", "inverse_dynamics", "plan", "fences")
 EXAMPLES = 4  # plans in a bundle
 SAME = 1e-4  # of action_scale, largest difference between policy.onnx and policy.pt
 
@@ -95,17 +97,11 @@ def write_bundle(
 
 
 def check_with_own_runtime(folder: Path) -> None:
-    """Raise BundleError if the bundle's own r2s_runtime.py, which has its control law, refuses its contract.
-
-    It is not imported: an import would leave a __pycache__ in the bundle.
-    """
-    path = folder / "r2s_runtime.py"
-    runtime: dict[str, Any] = {"__name__": path.stem}
-    exec(compile(path.read_text(), str(path), "exec"), runtime)
-    try:
-        runtime["load"](folder)
-    except runtime["BundleError"] as error:
-        raise BundleError(str(error)) from None
+    """Raise BundleError if the bundle's own r2s_runtime.py, which has its control law, refuses its contract."""
+    command = [sys.executable, "-B", str(folder / "r2s_runtime.py"), str(folder)]  # -B: no __pycache__ in the bundle
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BundleError(done.stderr.strip().removeprefix("error: "))
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
@@ -161,9 +157,9 @@ def one_file(control: Controller) -> str:
     ours = [node for node in imports(text) if isinstance(node, ast.ImportFrom) and f"{node.module}".startswith(HERE)]
     for node in ours:
         lines[node.lineno - 1 : node.end_lineno] = [""] * (1 + (node.end_lineno or 0) - node.lineno)
-    lines[ours[0].lineno - 1] = (
-        "from collections.abc import Callable\n\n\n" + "\n\n\n".join(map(own, PARTS)) + "\n\n\n"
-    )
+    words = {ast.unparse(node) for name in PARTS for node in imports((here / f"{name}.py").read_text())}
+    others = "\n".join(sorted(line for line in words if not line.startswith("from r2s")))
+    lines[ours[0].lineno - 1] = others + "\n\n\n" + "\n\n\n".join(map(own, PARTS)) + "\n\n\n"
     return "".join(lines)
 
 

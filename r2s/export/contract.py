@@ -9,12 +9,13 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from r2s.arm import driver
+from r2s.arm import drive_cycle, driver
+from r2s.arm.clients.fr3 import as_driven
 from r2s.control.computed_torque import ComputedTorque
 from r2s.control.controller import Controller
 from r2s.errors import UserError
 from r2s.export.inverse_dynamics import FRICTION
-from r2s.export.law import LAW_JOINT
+from r2s.export.law import LAW_JOINT, Model
 from r2s.export.plan import COLUMNS, OF_PLAN, width
 from r2s.export.runtime import CONVENTION, FORMAT, MADE_OF
 from r2s.learning.policy import observation_words
@@ -28,6 +29,8 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import ObservationTerm, Task, observation_scale
 from r2s.tasks.track import TrackTask
 
+NEAR_RAD = 0.05  # rad, of an arm that was moved to a start posture; half of what a move_to may be off its path
+RESTING = 0.1  # rad/s, of a joint at rest: five times the driver's STILL, for noise of slower sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
 UNITS |= {"asked": "Nm", "q_stop_low": "rad", "q_stop_high": "rad", "dq_stop": "rad/s"}
@@ -55,6 +58,13 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
     control = task.control(robot)
     own = Dynamics.of(robot, np.zeros((robot.n, 3)))
     links, hand = chain(robot, own, friction=False)
+    model = {
+        "gravity": "none: the arm compensates it",
+        "links": links_of(robot, own),
+        "hand_m": listed(hand[:3, 3]),
+        "rotors": listed(robot.armature if rotors is None else rotors),
+    }
+    place = shoulder(model, robot)
     return {
         "format": FORMAT,
         "robot": robot.name,
@@ -76,15 +86,17 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
         },
         "observation": observation(robot, task),
         "start": start(robot, task),
-        "goal": plans(robot, task) if isinstance(task, TrackTask) else goal(robot, task),
-        "model": {
-            "gravity": "none: the arm compensates it",
-            "links": links_of(robot, own),
-            "hand_m": listed(hand[:3, 3]),
-            "rotors": listed(robot.armature if rotors is None else rotors),
-        },
-        "law": {"units": UNITS, "joint": of_joints(robot, task, friction), "number": numbers(task)},
+        "goal": plans(robot, task, place) if isinstance(task, TrackTask) else goal(robot, task, place),
+        "model": model,
+        "law": {"units": UNITS, "joint": of_joints(as_driven(robot), task, friction), "number": numbers(task)},
     }
+
+
+def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
+    """Return the place of the second joint, m, from which tasks count the distance of goals."""
+    arm = Model(model)
+    arm.place(robot.q_home)
+    return listed(arm.origin[min(1, robot.n - 1)])
 
 
 def check_exportable(robot: Robot, task: Task) -> None:
@@ -163,23 +175,24 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
     return words | {"normalised": "in policy.onnx", "entries": entries}
 
 
-def goal(robot: Robot, task: Task) -> dict[str, Any]:
+def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
     """Return the format of a goal that is a point, and the region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
     if hasattr(task, "region"):
         low, high = task.region(robot)
-        own = {"shoulder_distance_m": [low, high], "lowest_m": task.height, "azimuth_rad": task.azimuth}  # type: ignore[attr-defined]
+        own = {"shoulder_m": shoulder_m, "shoulder_distance_m": [low, high]}
+        own |= {"lowest_m": task.height, "azimuth_rad": task.azimuth}  # type: ignore[attr-defined]
         out["trained"] = own
     return out
 
 
-def plans(robot: Robot, task: TrackTask) -> dict[str, Any]:
+def plans(robot: Robot, task: TrackTask, shoulder_m: list[float]) -> dict[str, Any]:
     """Return the format of a goal that is a plan, and the family of the training's plans."""
     ends = np.cumsum([0, 3, 3, robot.n, robot.n, robot.n]).tolist()
     low, high = task.region(robot)
     trained = {"kinds": list(task.kinds), "size_m": list(task.size), "fastest_m_per_s": list(task.speed)}
     trained |= {"seconds": task.episode_s, "ramp_s": task.ramp_s, "shoulder_distance_m": [low, high]}
-    trained |= {"lowest_m": task.height, "azimuth_rad": task.azimuth}
+    trained |= {"shoulder_m": shoulder_m, "lowest_m": task.height, "azimuth_rad": task.azimuth}
     return {
         "kind": "plan",
         "shape": [task.steps + 1 + task.preview, ends[-1]],
@@ -194,10 +207,12 @@ def plans(robot: Robot, task: TrackTask) -> dict[str, Any]:
 
 
 def start(robot: Robot, task: Task) -> dict[str, Any]:
-    """Return the posture at which motions begin, at rest."""
+    """Return the posture at which motions begin, at rest, and how far from it an arm may be."""
+    rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
-        return {"words": "at rest, at the joint angles of a plan's first row"}
-    return {"q_rad": listed(robot.q_home), "within_rad": getattr(task, "start_spread", None)}
+        return {"words": "at rest, at the joint angles of a plan's first row"} | rest
+    spread = getattr(task, "start_spread", None)
+    return {"q_rad": listed(robot.q_home)} | rest | {"within_rad": None if spread is None else spread + NEAR_RAD}
 
 
 def computed_torque_model(control: ComputedTorque) -> dict[str, Any]:
@@ -244,7 +259,7 @@ def numbers(task: Task) -> dict[str, float]:
     own = {"cycle_s": SIM_DT, "low_pass": low_pass_factor(task.cutoff_hz), "brake_s": law.BRAKE_S, "rate": law.RATE}
     own |= {"approach": law.APPROACH, "allowed": law.ALLOWED, "nothing": law.FADED, "exact": law.TOLERANCE}
     own |= {"dry": law.FRICTION_WIDTH, "sure": law.FRICTION_SHARE, "pivots": law.PIVOTS, "rounds": law.ROUNDS}
-    return own | {"damp_s": driver.DAMP_S, "still": driver.STILL, "deadline_s": deadline}
+    return own | {"damp_s": driver.DAMP_S, "still": drive_cycle.STILL, "deadline_s": deadline}
 
 
 def listed(values: Any) -> Any:

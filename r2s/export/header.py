@@ -25,7 +25,8 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
     lines += [f"constexpr const char* {name} = {json.dumps(word)};" for name, word in words.items()]
     lines += [f"constexpr const char* joints[n] = {{{joints}}};"]
     lines += [f"constexpr int cycle_hz = {rates['cycle_hz']}, policy_hz = {rates['policy_hz']};"]
-    lines += [f"constexpr double start[n] = {_braced(contract['start']['q_rad'])};  // rad, at rest", ""]
+    lines += [f"constexpr double start[n] = {_braced(contract['start']['q_rad'])};  // rad, at rest"]
+    lines += [*_fences(contract), ""]
     lines += [_rows(name, [link[name] for link in model["links"]]) for name in LINK]
     lines += [f"constexpr double hand[3] = {_braced(model['hand_m'])};"]
     lines += [f"constexpr double rotors[n] = {_braced(model['rotors'])};", ""]
@@ -50,6 +51,17 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
         by = e["divided_by"] if isinstance(e["divided_by"], list) else [e["divided_by"] or 1.0] * (end - begin)
         lines.append(f"    {{of_{e['of']}, {begin}, {end - begin}, {str(e['tanh']).lower()}, {_braced(by)}}},")
     return "\n".join([*lines, "};", "", "}  // namespace contract", ""])
+
+
+def _fences(contract: Mapping[str, Any]) -> list[str]:
+    """Return the constants of where motions begin and goals lie; without limits for a task that has none."""
+    start, trained = contract["start"], contract["goal"].get("trained") or {}
+    near, far = trained.get("shoulder_distance_m", (0.0, None))
+    numbers = {"start_within": start["within_rad"], "start_fastest": start["fastest_rad_per_s"], "goal_nearest": near}
+    numbers |= {"goal_farthest": far, "goal_azimuth": trained.get("azimuth_rad")}
+    lines = [f"constexpr double {name} = {_braced(value)};" for name, value in numbers.items()]
+    lines += [f"constexpr double goal_lowest = {_braced(trained.get('lowest_m'), '-INFINITY')};"]
+    return [*lines, f"constexpr double shoulder[3] = {_braced(trained.get('shoulder_m', [0.0] * 3))};  // m"]
 
 
 def _rows(name: str, values: list[Any]) -> str:

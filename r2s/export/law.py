@@ -241,6 +241,10 @@ class Driver:
             return out, left < 1.0
         return out + self._push(mobility, ddq, low, high), True
 
+    def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
+        """Return the speed (n,) rad/s that the safety filter allows at q (n,) rad, up or down."""
+        return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
+
     def _allowed(self, way: np.ndarray) -> np.ndarray:
         """Return (n,) rad/s, how fast joints may go that have `way` (n,) rad left."""
         j, c = self._j, self._number

@@ -90,6 +90,13 @@ class Follower:
             self._setpoints = self._dynamics.setpoints(q, dq, ddq, self._hz, self._steps + 1)
         self._plan = plan
 
+    @property
+    def start(self) -> np.ndarray:
+        """(n,) rad, where the plan begins."""
+        if not self._plan.size:
+            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
+        return self._plan[0, self._at["q"]]
+
     def __call__(
         self, step: int, q: np.ndarray, dq: np.ndarray, ee: np.ndarray, limited: float
     ) -> dict[str, np.ndarray]:
@@ -101,8 +108,6 @@ class Follower:
             step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the end effector.
             limited: share of the last control period in which the safety filter changed the command.
         """
-        if not self._plan.size:
-            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
         row, at, plan = min(step, self._steps), self._at, self._plan
         now = plan[row]
         made = {"goal": now[at["place"]], "velocity": now[at["velocity"]], "limited": np.array([limited])}

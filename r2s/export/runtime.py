@@ -4,8 +4,9 @@
 
     runtime = Runtime("BUNDLE", Arm(joints=[...], cycle_hz=1000, torque="without gravity", ...))
     runtime.reset()                      # at rest, before a motion
-    while not runtime.done:              # every millisecond
-        tau = runtime(q, dq, tau_J_d, goal)
+    with stopped_by_signals(runtime):    # Ctrl-C and the like bring the arm to rest
+        while not runtime.done:          # every millisecond
+            tau = runtime(q, dq, tau_J_d, goal)
 
 A policy that follows plans takes its plan in `reset`, and no goal in a cycle; `plan` makes one of joint angles. The
 requirements of the bundle are in its contract.json. A mismatch raises a BundleError of one line.
@@ -22,10 +23,12 @@ from typing import Any
 import numpy as np
 
 from r2s.export.control import Control, check_control
+from r2s.export.fences import PolicyThread, check_plan, check_start, outside, stopped_by_signals  # noqa: F401
 from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number, per_joint
 from r2s.export.plan import OF_PLAN, Follower, check_goal, plan_of, width
 
-FORMAT = 3
+FORMAT = 4
+CHANGED = "{} is not what was exported: its sha256 is another"
 CONVENTION = "without gravity"
 # sources of observation terms; `pull` is J^T error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
@@ -39,6 +42,8 @@ class Arm:
         joints: names, from the base on. cycle_hz: rate of its torque commands.
         torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
         q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. Limits of the arm, one per joint.
+        slows: deceleration, rad/s^2, and offset, rad/s, per joint, of an arm that allows at a distance d before a
+            position limit the speed sqrt(2 deceleration d) - offset only, as an FR3 does; None: it does not.
     """
 
     joints: Sequence[str]
@@ -49,6 +54,7 @@ class Arm:
     dq_max: Sequence[float]
     tau_max: Sequence[float]
     dtau_max: Sequence[float]
+    slows: tuple[Sequence[float], Sequence[float]] | None = None
 
 
 def seal_of(contract: dict[str, Any]) -> str:
@@ -68,8 +74,8 @@ def load(folder: str | Path) -> dict[str, Any]:
         contract = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise BundleError(f"{path} cannot be read: {error}") from None
-    if not isinstance(contract, dict) or contract.get("format") != FORMAT:
-        seen = contract.get("format") if isinstance(contract, dict) else None
+    seen = contract.get("format") if isinstance(contract, dict) else None
+    if seen != FORMAT:
         raise BundleError(f"{path} is of format {seen!r}; this runtime reads {FORMAT}")
     try:
         for name, digest in contract["files"].items():
@@ -77,7 +83,7 @@ def load(folder: str | Path) -> dict[str, Any]:
             if not file.is_file():
                 raise BundleError(f"{name} is missing in {folder}")
             if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-                raise BundleError(f"{name} is not what was exported: its sha256 is another")
+                raise BundleError(CHANGED.format(name))
         _check(contract)
         if contract["seal"] != seal_of(contract):
             raise BundleError("contract.json is not what was exported: its seal is another")
@@ -98,10 +104,11 @@ def _check(contract: dict[str, Any]) -> None:
             raise BundleError(f"contract.json: expected {n} joints, got {len(values)} ({name})")
     if missing := [k for k in LAW_NUMBER if not is_number(law["number"].get(k))]:
         raise BundleError(f"contract.json: law.number.{missing[0]} is missing")
-    step = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
-    same = {"tau_max": torque["max_Nm"], "asked": torque["limit_Nm"], "step": step}
-    same["dq_max"] = contract["limits"]["dq_max_rad_per_s"]
-    for name, values in same.items():
+    most = [x * law["number"]["cycle_s"] for x in torque["max_rate_Nm_per_s"]]
+    if any(not 0 < x <= y for x, y in zip(law["joint"]["step"], most, strict=True)):
+        raise BundleError(f"contract.json: law.joint.step is {law['joint']['step']}, at most {most} is allowed")
+    same = {"tau_max": torque["max_Nm"], "asked": torque["limit_Nm"]}
+    for name, values in (same | {"dq_max": contract["limits"]["dq_max_rad_per_s"]}).items():
         if law["joint"][name] != values:
             raise BundleError(f"contract.json: law.joint.{name} is {law['joint'][name]}, expected {values}")
     if torque["convention"] != CONVENTION:
@@ -134,9 +141,7 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
         if theirs != ours:
             raise BundleError(f"expected joint {j} '{ours}', got '{theirs}' of the arm")
     if arm.cycle_hz != contract["rates"]["cycle_hz"]:
-        raise BundleError(
-            f"expected a cycle of {contract['rates']['cycle_hz']} Hz, got {arm.cycle_hz:g} Hz of the arm"
-        )
+        raise BundleError(f"expected {contract['rates']['cycle_hz']} Hz, got {arm.cycle_hz:g} Hz of the arm")
     if arm.torque != contract["torque"]["convention"]:
         raise BundleError(f"expected torque '{contract['torque']['convention']}', got '{arm.torque}' of the arm")
     limits, torque = contract["limits"], contract["torque"]
@@ -154,6 +159,24 @@ def fits(contract: dict[str, Any], arm: Arm) -> None:
             raise BundleError(
                 f"{name} of joint {j + 1}: the arm allows {allowed[j]:g} {unit}, the bundle needs {needed[j]:g}"
             )
+    if arm.slows is not None:
+        _slows(contract, arm)
+
+
+def _slows(contract: dict[str, Any], arm: Arm) -> None:
+    """Raise BundleError if a bundle does not slow down before position limits as the arm demands."""
+    law = Driver(contract["law"], Model(contract["model"]))
+    deceleration, offset = np.array(arm.slows, dtype=float)
+    for way in np.linspace(0.0, 1.0, 101):  # rad before the limit
+        allowed = np.maximum(np.sqrt(2 * deceleration * way) - offset, 0.0)
+        for up in (True, False):
+            asked = law.fastest(np.array(arm.q_max) - way if up else np.array(arm.q_min) + way, up)
+            if (beyond := asked > allowed).any():
+                j = int(beyond.argmax())
+                raise BundleError(
+                    f"{way:.2f} rad before a limit of joint {j + 1} the arm allows {allowed[j]:.2f} rad/s, "
+                    f"the bundle {asked[j]:.2f} rad/s: it was exported for another arm"
+                )
 
 
 class Runtime:
@@ -164,20 +187,24 @@ class Runtime:
 
     Args:
         folder: the bundle. arm: the arm that it runs on. soft_start_s: s over which the torque of a motion fades in.
+        live: whether the arm's clock does not wait: then the policy runs in a thread of its own.
 
     Raises:
         BundleError: the bundle is damaged or made for another arm, or its policy does not match its contract.
     """
 
-    def __init__(self, folder: str | Path, arm: Arm, soft_start_s: float = 0.0):
+    def __init__(self, folder: str | Path, arm: Arm, soft_start_s: float = 0.0, live: bool = False):
         import onnxruntime
 
         self.contract = contract = load(folder)
         fits(contract, arm)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # no waiting for other threads
+        content = (Path(folder) / "policy.onnx").read_bytes()
+        if hashlib.sha256(content).hexdigest() != contract["files"]["policy.onnx"]:
+            raise BundleError(CHANGED.format("policy.onnx"))
         try:
-            policy = onnxruntime.InferenceSession(str(Path(folder) / "policy.onnx"), options)
+            policy = onnxruntime.InferenceSession(content, options)
         except Exception as error:  # of many kinds
             raise BundleError(f"policy.onnx cannot be loaded: {' '.join(str(error).split())}") from None
         agree(contract, policy.get_modelmeta().custom_metadata_map)
@@ -191,7 +218,10 @@ class Runtime:
         self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
         self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
         self._follower = Follower(contract, self._control) if contract["goal"]["kind"] == "plan" else None
-        self._cycle = self._limited = 0
+        self._trained = contract["goal"].get("trained")
+        self._thread = PolicyThread(self.act) if live else None
+        self._cycle = self._limited = self._motion = 0
+        self._goal: np.ndarray | None = None
 
     def reset(self, plan: np.ndarray | None = None) -> None:
         """Begin a motion, from rest and zero torque.
@@ -201,14 +231,22 @@ class Runtime:
                 angles of its first row. The setpoints of computed torque take a tenth of a second.
 
         Raises:
-            BundleError: the plan is missing, of another size or not finite, or the policy takes points.
+            BundleError: the plan is missing, of another size or not finite, beyond the arm's limits or the region of
+                the training's plans, or the policy takes points.
         """
         if self._follower is not None:
             self._follower.take(plan)
+            check_plan(self.contract, self._model, np.array(plan, dtype=float))
         elif plan is not None:
             raise BundleError("the policy of this bundle takes a point in every cycle, and no plan")
         self.driver.reset()
         self._cycle = self._limited = 0
+        self._goal = None
+        self._motion += 1
+
+    def stop(self, why: str = "asked for") -> None:
+        """Bring the arm to rest, from the next cycle on; `driver.stopping` keeps the first reason."""
+        self.driver.stopping = self.driver.stopping or why
 
     @property
     def done(self) -> bool:
@@ -225,9 +263,14 @@ class Runtime:
             goal: (3,) m in the base frame, finite; None if the policy follows a plan, whose time is the number of
                 cycles since `reset`.
 
+        A goal outside the region of the training's goals brings a moving arm to rest.
+
         Raises:
-            BundleError: one of them is of another size, or there is no plan.
+            BundleError: one of them is of another size, there is no plan, the motion is over, or, in its first cycle,
+                the goal is outside the region of the training's goals, or the arm not at rest where motions begin.
         """
+        if self.done:
+            raise BundleError(f"the motion is over, {self.driver.stopping}: call reset before the next one")
         q, dq, tau_J_d = (np.asarray(x, dtype=float) for x in (q, dq, tau_J_d))
         if goal is not None:
             goal = np.asarray(goal, dtype=float)
@@ -240,16 +283,37 @@ class Runtime:
             raise BundleError(
                 f"q, dq, tau_J_d and goal are of shapes {shapes}; {self._model.n} joints and {size} are allowed"
             )
+        self._admit(q, dq, goal)
         with np.errstate(invalid="ignore", over="ignore"):  # the driver stops at values that are not finite
             self._model.place(q)
-            command = None
+            command = None if self._thread is None else self._thread.newest(self._motion)
             if self._cycle % self._every == 0:
                 made = self._look(q, dq, goal)
-                seen = self.observe(made)
-                if np.isfinite(seen).all():
-                    command = np.concatenate([self.act(seen), made.get("setpoint", np.zeros(0))])
+                seen, setpoint = self.observe(made), made.get("setpoint", np.zeros(0))
+                if not np.isfinite(seen).all():
+                    command = None
+                elif self._thread is not None:
+                    self._thread.give(self._motion, seen, setpoint)
+                else:
+                    try:
+                        command = np.concatenate([self.act(seen), setpoint])
+                    except Exception as error:
+                        self.stop(f"the policy failed: {error}")
             self._cycle += 1
             return self.driver(q, dq, tau_J_d, command, placed=True)
+
+    def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
+        """Refuse a start or goal that the training did not have; stop at such a goal in a motion."""
+        if self._cycle == 0:
+            home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
+            check_start(self.contract["start"], np.array(home), q, dq)
+        if goal is None or self._trained is None or np.array_equal(goal, self._goal):  # type: ignore[arg-type]
+            return
+        if why := outside(self._trained, goal):
+            if self._cycle == 0:
+                raise BundleError(why)
+            self.stop(why)
+        self._goal = goal.copy()
 
     def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> dict[str, np.ndarray]:
         """Return the observation sources of this control step; the model is at q already."""

@@ -1,6 +1,6 @@
 """parameters.yaml and posterior.npz: the result of an identification as the other stages read it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ from r2s.identification.parameters import (
     units,
 )
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import check_trusted, family_path
 from r2s.physics.friction import family as friction_family
-from r2s.physics.friction import family_path
 from r2s.physics.robot import Robot
 from r2s.recordings.speed_noise import MAX_NOISE
 
@@ -74,11 +74,13 @@ def save_parameters(
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
-def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, np.ndarray]:
+def load_parameters(folder: str | Path, robot: Robot, trust: Sequence[str] = ()) -> tuple[ParameterSpace, np.ndarray]:
     """Return space and values x of `calibration=RUN_FOLDER` (or of a parameters.yaml); see `ParameterSpace.dynamics`.
 
+    trust: modules from which a friction family may be imported, beside those that were imported before.
+
     Raises:
-        UserError: no such run or file, parameters of another robot, or a damaged file.
+        UserError: no such run or file, parameters of another robot, a foreign friction family, or a damaged file.
     """
     path = Path(folder)
     path = path / "parameters.yaml" if path.is_dir() else path
@@ -89,6 +91,7 @@ def load_parameters(folder: str | Path, robot: Robot) -> tuple[ParameterSpace, n
         document = yaml.safe_load(path.read_text())
         named, joints = document["robot"], document["joints"]
         if (named, joints) == (robot.name, robot.n):
+            check_trusted(str(document["friction_family"]), trust, str(path))
             return _parse(document, robot)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError, yaml.YAMLError) as error:
         seen = " ".join(str(error).split())

@@ -4,7 +4,7 @@ A family contains its law in NumPy, and the same law compiled for the physics st
 `friction.family=` names one of the four below, or, by a dotted path such as my_module.MY_FAMILY, a user's own.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -310,6 +310,16 @@ def family(name: str) -> Family:
                 )
     _imported[name] = found
     return found
+
+
+def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
+    """Raise UserError if `family` would import the name, which a file gives, from a module that is not in `trust`."""
+    module = name.split(".")[0]
+    if "." in name and name not in _imported and module not in trust:
+        raise UserError(
+            f"{file}: friction_family is '{name}', no part of r2s, and r2s would run it; if you trust it, add "
+            f"trust={module}"
+        )
 
 
 def family_path(one: Family) -> str:

@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from r2s.errors import UserError
-from r2s.stages.build import loaded, part, plain
+from r2s.stages.build import part, plain
+from r2s.stages.run_config import loaded, modules
 
 RECORDINGS = ("train.npz", "validation.npz")  # of an identification
 PARAMETERS = "parameters.yaml"
@@ -13,12 +14,12 @@ TORQUE = "commanded"  # adapters compare the commanded torque with the motion
 BESIDE = ("calibration",)  # key of conf/adapt that is no argument of the adapter
 
 
-def calibrated(calibration, robot):
+def calibrated(calibration, robot, trust=()):
     """Return the identified dynamics, and posterior draws and recordings without a payload, each None if missing."""
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.recordings.readers import read
 
-    space, x = load_parameters(calibration, robot)
+    space, x = load_parameters(calibration, robot, trust)
     folder = run_folder(calibration)
     posterior = (space, load_posterior(folder, space)) if (folder / "posterior.npz").is_file() else None
     unloaded = None
@@ -56,7 +57,7 @@ def make_adapter(cfg, robot, source):
     torque = (loaded(folder / PARAMETERS).get("source") or {}).get("torque", TORQUE)
     if torque != TORQUE:
         raise UserError(f"{name}: expected a model identified with data.torque={TORQUE}, got {torque} ({folder})")
-    dynamics, posterior, unloaded = calibrated(folder, robot)
+    dynamics, posterior, unloaded = calibrated(folder, robot, modules(cfg.get("trust")))
     if unloaded is None:
         print(f"{name}: {folder} has no recordings; the uncertainty of its model comes from priors")
     dynamics = with_declared_payload(cfg, robot, dynamics)

@@ -10,7 +10,8 @@ from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
-from r2s.stages.build import CONF, GROUP, PACKAGE, console, make_robot, open_run, unread
+from r2s.stages.build import GROUP, console, make_robot, open_run, unread
+from r2s.stages.run_config import CONF, PACKAGE, replayed
 
 STEPS = (
     "1/3 record the arm and identify it",
@@ -106,7 +107,7 @@ def compose_step(words: Sequence[str], option: str) -> Any:
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        return compose("config", list(words))  # the Hydra of this job includes --config-dir
+        return replayed(compose("config", list(words)))  # the Hydra of this job includes --config-dir
     except (HydraException, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split()).removeprefix("In 'config': ")
         reason = reason.split(" Config search path")[0].split(" To append")[0]

@@ -1,25 +1,22 @@
-// What examples/libfranka/loop.cpp calls of ONNX Runtime's C++ API, declared as there; it does nothing.
+// What examples/libfranka/loop.cpp calls of ONNX Runtime's C++ API, declared as there. The policy behind it asks for a
+// constant action, and stalls or fails where script.h says so.
 #pragma once
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
-#include <memory>
+#include <stdexcept>
+#include <thread>
 #include <vector>
+
+#include "script.h"
 
 enum OrtAllocatorType { OrtArenaAllocator };
 enum OrtMemType { OrtMemTypeDefault };
 enum OrtLoggingLevel { ORT_LOGGING_LEVEL_WARNING };
-struct OrtAllocator;
 struct OrtMemoryInfo;
 
 namespace Ort {
 
-struct AllocatorWithDefaultOptions {
-  operator OrtAllocator*() const { return nullptr; }
-};
-struct AllocatedFree {
-  void operator()(void*) const {}
-};
-using AllocatedStringPtr = std::unique_ptr<char, AllocatedFree>;
 struct Env {
   Env(OrtLoggingLevel, const char*) {}
 };
@@ -34,24 +31,26 @@ struct MemoryInfo {
   operator const OrtMemoryInfo*() const { return nullptr; }
 };
 struct Value {
+  std::vector<float> numbers;
   template <typename T>
   static Value CreateTensor(const OrtMemoryInfo*, T*, std::size_t, const int64_t*, std::size_t) {
     return {};
   }
   template <typename T>
   const T* GetTensorData() const {
-    return nullptr;
+    return numbers.data();
   }
 };
-struct ModelMetadata {
-  AllocatedStringPtr LookupCustomMetadataMapAllocated(const char*, OrtAllocator*) const { return nullptr; }
-};
 struct Session {
-  Session(const Env&, const char*, const SessionOptions&) {}
-  ModelMetadata GetModelMetadata() const { return {}; }
+  long calls = 0;
+  Session(const Env&, const void*, std::size_t, const SessionOptions&) {}
   std::vector<Value> Run(const RunOptions&, const char* const*, const Value*, std::size_t, const char* const*,
                          std::size_t) {
-    return {};
+    ++calls;  // the first is made before there is a motion
+    if (calls == asked("fail_at")) throw std::runtime_error("as asked");
+    if (calls == asked("stall_at"))
+      std::this_thread::sleep_for(std::chrono::milliseconds(static_cast<long>(asked("stall_ms"))));
+    return {Value{std::vector<float>(64, static_cast<float>(asked("action")))}};
   }
 };
 

@@ -1,0 +1,127 @@
+"""config.yaml of a run folder, which may be anybody's: r2s calls its own parts only, and those of `trust=`."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError
+from r2s.stages.parts import target
+
+PACKAGE = Path(__file__).parent.parent
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
+TRUST = (
+    "R2S_TRUST"  # environment variable: `trust=` of a resumed search, whose trainings replay overrides of its folder
+)
+# ${oc.env:HOME}, what may become one, ${a${b}}, and a $ that is escaped
+RESOLVER = re.compile(r"\$\{\s*(\w*)[^}]*(?::|\$\{)|\\\$")
+
+
+def loaded(path):
+    """Return a YAML file of a run folder as a config.
+
+    Raises:
+        UserError: the file cannot be read or is no YAML.
+    """
+    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return OmegaConf.load(path)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+
+
+def modules(trust) -> list[str]:
+    """Return the modules of an option `trust=`: a name, names with commas, a list, or nothing.
+
+    Raises:
+        UserError: it is anything else.
+    """
+    names = trust.strip("[]").split(",") if isinstance(trust, str) else trust
+    if names is None:
+        return []
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"trust: expected names of modules, such as trust=my_parts, got {trust!r}")
+    return [name.strip() for name in names if name.strip()]
+
+
+def run_config(folder, trust=None):
+    """Return the config.yaml of a run folder, as `checked` does; the folder may be anybody's.
+
+    Raises:
+        UserError: the file cannot be read, or names what `trust` does not.
+    """
+    return checked(loaded(Path(folder) / "config.yaml"), Path(folder) / "config.yaml", trust)
+
+
+def replayed(cfg):
+    """Return a composed config; `checked` if its overrides come from a run folder."""
+    return checked(cfg, "resume", os.environ[TRUST]) if TRUST in os.environ else cfg
+
+
+def checked(cfg, where, trust=None):
+    """Return a config of a run folder with its interpolations resolved, if no part of it can run foreign code.
+
+    A part is called, and its module imported, so it has to be one that conf/ names in the same group, or be defined
+    in a module of `trust`. Resolvers can read the environment, so they count as parts of the module `oc`.
+
+    Args:
+        where: the file, for errors. trust: modules that the user trusts, see `modules`; it replaces the config's own.
+
+    Raises:
+        UserError: another part, which was neither imported nor called.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    trusted, foreign = modules(trust), dict[str, tuple[Any, str]]()
+    for key, text in _leaves(OmegaConf.to_container(cfg, resolve=False)):
+        if (found := RESOLVER.search(str(text))) and (found[1] or "oc") not in trusted:
+            foreign[".".join(key)] = text, found[1] or "oc"
+    try:
+        settings = OmegaConf.to_container(cfg, resolve=not foreign)
+    except OmegaConfBaseException as error:
+        raise UserError(f"{where} cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(settings, dict):
+        raise UserError(f"{where} cannot be read: expected settings by name")
+    for key, value in _leaves(settings):
+        if not _is_own(key, value) and not _is_defined_in(key, value, trusted):
+            foreign[".".join(key)] = value, str(value).split(".")[0]
+    if foreign:
+        path, (name, _) = next(iter(foreign.items()))
+        needed = sorted({*trusted, *(module for _, module in foreign.values())})
+        words = needed[0] if len(needed) == 1 else f"[{','.join(needed)}]"
+        raise UserError(
+            f"{where}: {path} is '{name}', no part of r2s, and r2s would run it; if you trust it, add trust={words}"
+        )
+    return OmegaConf.create(settings | {"trust": trusted})
+
+
+def _leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield (keys, value) of nested settings."""
+    if not isinstance(node, dict | list):
+        yield path, node
+        return
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield from _leaves(value, (*path, str(key)))
+
+
+def _is_own(key, value) -> bool:
+    """Return whether a setting is no dotted path, or one of conf/."""
+    if key == ("friction", "family"):
+        return "." not in str(value)
+    if key[-1:] != ("_target_",):
+        return True
+    own = (re.findall(r"_target_: *(\S+)", path.read_text()) for path in CONF.glob(f"{key[0]}/*.yaml"))
+    return any(value in targets for targets in own)
+
+
+def _is_defined_in(key, value, trusted) -> bool:
+    """Return whether a dotted path is of a trusted module, and a part not only reached through it."""
+    head = str(value).split(".")[0]
+    if head not in trusted or key[-1] != "_target_":
+        return head in trusted
+    return str(getattr(target({"_target_": value}, ".".join(key[:-1])), "__module__", "")).split(".")[0] == head
