@@ -11,11 +11,13 @@ import numpy as np
 
 from r2s.errors import UserError
 from r2s.physics.collision import TABLE_M, collision_pairs, link_name
+from r2s.physics.fence import FENCE_M
 from r2s.physics.rigid_body import mujoco_inverse_dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
 TOOL_M = 0.1  # m, default minimum height of the end effector, because the MJCF contains no tool
-CLEARANCE_M = 0.03  # m, between a link and the table or another link: a tracking error of 30 mrad at 1 m
+CLEARANCE_M = 0.03  # m, least distance between a link and the table or another link
+DEVIATION = 0.05  # rad, a deviation of all joints by this must not bring a link nearer than the driver's fence
 FAR_M = 0.1  # m, at larger distances the bounding spheres are accurate enough
 GEOMETRY_HZ = 100
 TORQUE_SHARE = 0.8  # share of tau_max for |gravity| + |dynamics| + friction
@@ -138,6 +140,12 @@ def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: 
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
 
 
+def allowed_deviation(space: "Space", motion: Motion, most: float) -> np.ndarray:
+    """Return (T,) rad, `Space.deviations` along a motion, at most `most`."""
+    rows = _every(motion)
+    return np.interp(motion.t, motion.t[rows], space.deviations(motion.q[rows], most))
+
+
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     """Return (T, n): |gravity| + |dynamics| of the nominal model plus `friction_margin`, over tau_max.
 
@@ -169,13 +177,23 @@ def friction_margin(robot: Robot) -> np.ndarray:
 class Space:
     """Distances of an arm's links from the table and from each other; see `collision` for the geoms that count.
 
+    An arm is not exactly where it was planned to be. If no joint deviates by more than e rad, a distance shrinks by
+    at most e times its lever, to first order: the sum over the joints that change it of how far a rad of that joint
+    moves the link, from the Jacobian at that posture. A planned posture must leave room for DEVIATION, and a plan is
+    followed only as long as the arm is within `deviations`, which are larger where there is room. So no plan is
+    refused for a deviation that the arm never has, and an arm that deviates stops before it comes near.
+
     Attributes:
         clearance: (K,) m, required distances: end effector above z_min (for the search only: `gaps` does not subtract
             it), links above the table, and between pairs of links.
         reach: m, upper bound of the distance between a point of the arm and a joint.
+
+    Args:
+        robot: its links. table, z_min: m, see `check_motion`. deviation: rad, the one to leave room for.
     """
 
-    def __init__(self, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M):
+    def __init__(self, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M, deviation: float = DEVIATION):
+        self._deviation = deviation
         self.model = robot.model(gravity=False)
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site(robot.ee_site).id
@@ -186,7 +204,7 @@ class Space:
         self.reach = float(links + farthest)
         found = collision_pairs(robot, self.model, table=bool(np.isfinite(table)))
         self.table, self.floor = table, z_min
-        self.above, self.pairs = found.above, found.pairs
+        self.above, self.pairs, self._link = found.above, found.pairs, found.link
         self._pose(robot.q_home)
         at_home = self._heights(self.data.geom_xpos[None], self.data.geom_xmat[None])[0] - table
         if (at_home <= 0).any():
@@ -198,19 +216,55 @@ class Space:
             )
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm with a low home posture must be able to return to it
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
+        # more than half of the distance at home is never asked for, so that an arm may return to a low posture
+        self._most = np.maximum(0.5 * self._measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
-        """Return distances minus clearances (T, K) m at postures q (T, n) rad; negative: too near."""
+        """Return distances minus what they have to be, (T, K) m, at postures q (T, n) rad; negative: too near."""
+        distances, levers = self._measured(q)
+        return distances - self._needed(levers)
+
+    def deviations(self, q: np.ndarray, most: float) -> np.ndarray:
+        """Return the deviation (T,) rad of all joints, at most `most`, that clears the fence at q (T, n) rad.
+
+        It is DEVIATION where `gaps` are 0, and nowhere less: an arm that starts too near must be able to leave.
+        """
+        distances, levers = self._measured(q)
+        allowed = (distances[:, 1:] - FENCE_M) / np.maximum(levers[:, 1:], 1e-9)
+        return np.clip(allowed.min(1, initial=most), min(DEVIATION, most), most)
+
+    def _needed(self, levers: np.ndarray) -> np.ndarray:
+        """Return the distances (T, K) m that are asked for; that of the end effector is its height above z_min."""
+        need = np.clip(FENCE_M + self._deviation * levers, self.clearance, self._most)
+        need[:, 0] = 0.0
+        return need
+
+    def _measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances (T, K) m and their levers (T, K) m/rad, 0 for the end effector."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
+        levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs)))
         for k, posture in enumerate(q):
             self._pose(posture)
             tip[k] = self.data.site_xpos[self.site, 2]
             places[k], frames[k] = self.data.geom_xpos, self.data.geom_xmat
             apart[k] = self._apart()
-        distances = np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart])
-        distances[:, 1:] -= self.clearance[1:]
-        return distances
+            levers[k, 1:] = self._levers()
+        return np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart]), levers
+
+    def _levers(self) -> np.ndarray:
+        """Return the most by which a rad of all joints changes each distance, (K - 1,) m/rad, at the present q."""
+        d, radius, link = self.data, self.model.geom_rbound, self._link
+        arm = d.geom_xpos[:, None] - d.xanchor
+        moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3) of each geom's centre
+        joint = np.arange(len(d.xaxis))
+        up = np.abs(moved[:, :, 2]) + radius[:, None] * np.hypot(*d.xaxis.T[:2])
+        lifted = np.where(joint < link[:, None], up, 0.0)[self.above].sum(1)
+        far = np.linalg.norm(moved, axis=2) + radius[:, None]
+        a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
+        between = (joint >= link[a, None]) & (joint < link[b, None])
+        # at the nearest points of two links the joints between them move one link as fast as the other
+        return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0).sum(1)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
         """Raise UserError at the first posture of q (T, n) that is too near; `when(k)` describes row k."""
@@ -218,20 +272,21 @@ class Space:
         bad = np.argwhere(~(gaps >= 0))
         if len(bad):
             row, which = bad[0]
-            raise UserError(f"excitation: {self.explain(int(which), gaps[row, which], when(row))}")
+            raise UserError(f"excitation: {self.explain(int(which), q[row], when(row))}")
 
-    def explain(self, which: int, gap: float, when: str) -> str:
-        """Return the error for column `which` of `gaps` with value `gap` m."""
+    def explain(self, which: int, q: np.ndarray, when: str) -> str:
+        """Return the error for column `which` of `gaps` at q (n,) rad."""
+        distances, levers = self._measured(q[None])
+        seen, allowed = distances[0, which], self._needed(levers)[0, which]
         if which == 0:
-            seen = gap + self.floor
+            seen += self.floor
             return f"the end effector is {seen:.3f} m above the base plane {when}, allowed {self.floor:g} m or more"
-        allowed = self.clearance[which]
         if which <= len(self.above):
             name, other = link_name(self.model, self.above[which - 1]), "above the table"
         else:
             a, b = self.pairs[which - 1 - len(self.above)]
             name, other = link_name(self.model, a), f"from {link_name(self.model, b)}"
-        return f"{name} is {gap + allowed:.3f} m {other} {when}, allowed {allowed:.3g} m or more"
+        return f"{name} is {seen:.3f} m {other} {when}, allowed {allowed:.3g} m or more"
 
     def _pose(self, q: np.ndarray) -> None:
         self.data.qpos[:] = q

@@ -114,11 +114,12 @@ def _violation(robot: Robot, path: np.ndarray, space: Space) -> str:
         # between two samples no point of the arm moves more than twice the clearance
         count = 1 + int(np.ceil(np.abs(path[k + 1] - path[k]).sum() * space.reach / (2 * CLEARANCE_M)))
         share = np.linspace(0, 1, count + 1)[1:]
-        gaps = space.gaps(path[k] + share[:, None] * (path[k + 1] - path[k]))
+        postures = path[k] + share[:, None] * (path[k + 1] - path[k])
+        gaps = space.gaps(postures)
         bad = np.argwhere(~(gaps >= least))
         if len(bad):
             row, which = bad[0]
-            return space.explain(int(which), gaps[row, which], _where(k, len(path), share[row]).strip())
+            return space.explain(int(which), postures[row], _where(k, len(path), share[row]).strip())
     return ""
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.errors import UserError
 from r2s.physics import convex
-from r2s.physics.convex import BODY, BOUND, closer_than, support_point
+from r2s.physics.convex import BODY, BOUND, separation, support_point
 from r2s.physics.kinematics import POSE, link_frames, pose_axes, write_pose
 from r2s.physics.newton_euler import links_of, product, rotate
 from r2s.physics.robot import Robot
@@ -80,7 +80,7 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
     return f"link '{model.body(body).name}'" if model.body(body).name else f"the link of body {body}"
 
 
-class _Scene(NamedTuple):
+class Scene(NamedTuple):
     """Bodies (G, WIDTH), hull vertices (V, 3), body rows in `above` (A,) and `pairs` (P, 2); table and margin, m."""
 
     bodies: np.ndarray
@@ -96,6 +96,7 @@ class CollisionCheck:
 
     Attributes:
         names: of the checked pairs, such as "link 'link5' and link 'link1'", in the order of `first_contact`.
+        links, scene: what the compiled functions below take.
 
     Args:
         robot: its file's geoms.
@@ -121,17 +122,17 @@ class CollisionCheck:
         table = TABLE_M if table is None else table
         found = collision_pairs(robot, model, table=bool(np.isfinite(table)), may_touch=may_touch)
         geoms = sorted({*found.above, *(g for pair in found.pairs for g in pair)})
-        self._links = links_of(robot, robot.mass, robot.com, robot.inertia)
-        bodies, vertices = _bodies(robot, model, geoms, found.link, self._links)
+        self.links = links_of(robot, robot.mass, robot.com, robot.inertia)
+        bodies, vertices = _bodies(robot, model, geoms, found.link, self.links)
         row = {g: k for k, g in enumerate(geoms)}
         above = np.array([row[g] for g in found.above], dtype=int)
         pairs = np.array([(row[a], row[b]) for a, b in found.pairs], dtype=int).reshape(-1, 2)
-        self._scene = _Scene(bodies, vertices, above, pairs, float(table), float(margin))
+        self.scene = Scene(bodies, vertices, above, pairs, float(table), float(margin))
         self.names = [f"{link_name(model, g)} and the table" for g in found.above]
         self.names += [f"{link_name(model, a)} and {link_name(model, b)}" for a, b in found.pairs]
         at_home = int(self.first_contact(robot.q_home[None])[0])
         if optional and 0 <= at_home < len(found.above):
-            self._scene, at_home = self._scene._replace(table=-np.inf), -1
+            self.scene, at_home = self.scene._replace(table=-np.inf), -1
         if at_home >= 0:
             raise UserError(f"{robot.name}: {self.names[at_home]} at {table:g} m touch at robot.q_home")
 
@@ -143,8 +144,21 @@ class CollisionCheck:
         """Return the index (m,) in `names` of the first colliding pair of each arm, -1 for none."""
         q = np.ascontiguousarray(q, dtype=float)
         out = np.empty(len(q), dtype=np.int64)
-        _first_contacts(q, self._links, self._scene, out)
+        _first_contacts(q, self.links, self.scene, out)
         return out
+
+    def distances(self, q: np.ndarray) -> np.ndarray:
+        """Return the distances (m, K) m of the pairs in `names` at q (m, n) rad; 0 or less if they overlap."""
+        q = np.ascontiguousarray(q, dtype=float)
+        out = np.empty((len(q), len(self.names)))
+        _distances(q, self.links, self.scene, out)
+        return out
+
+
+def empty_scene() -> Scene:
+    """Return a scene without pairs."""
+    none = np.zeros((0, 2), dtype=int)
+    return Scene(np.zeros((0, WIDTH)), np.zeros((0, 3)), np.zeros(0, dtype=int), none, -np.inf, 0.0)
 
 
 def _bodies(
@@ -198,44 +212,58 @@ def _shape(model: mujoco.MjModel, g: int) -> tuple[int, float, np.ndarray, np.nd
 
 
 @njit(cache=True, error_model="numpy")
-def _first_contacts(q, links, scene, out):
-    bodies, n = scene.bodies, len(links)
-    frames, axes, poses, work = (
-        np.empty((n, POSE)),
-        np.empty((n, 3)),
-        np.empty((len(bodies), POSE)),
-        np.empty((10, 3)),
-    )
-    for arm in range(len(q)):
-        link_frames(links, q[arm], frames, axes)
-        for g in range(len(bodies)):
-            body, link = bodies[g], int(bodies[g, LINK])
-            if link < 0:
-                for c in range(POSE):
-                    poses[g, c] = body[LOCAL + c]
-                continue
-            f = frames[link]
-            R = pose_axes(f)
-            x, y, z = rotate(R, body[LOCAL], body[LOCAL + 1], body[LOCAL + 2])
-            write_pose(poses[g], f[0] + x, f[1] + y, f[2] + z, product(R, body, LOCAL + 3))
-        out[arm] = _first_pair(scene, poses, work)
+def body_poses(links, bodies, q, frames, poses):
+    """Write the pose (G, POSE) of each body at q (n,) rad; frames: (n, POSE), any content."""
+    link_frames(links, q, frames, np.empty((len(links), 3)))
+    for g in range(len(bodies)):
+        body, link = bodies[g], int(bodies[g, LINK])
+        if link < 0:
+            for c in range(POSE):
+                poses[g, c] = body[LOCAL + c]
+            continue
+        f = frames[link]
+        R = pose_axes(f)
+        x, y, z = rotate(R, body[LOCAL], body[LOCAL + 1], body[LOCAL + 2])
+        write_pose(poses[g], f[0] + x, f[1] + y, f[2] + z, product(R, body, LOCAL + 3))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def pair_distance(scene, k, enough, poses, work):
+    """Return the distance of pair k, m, or a lower bound above `enough` m; work: (10, 3), any content."""
+    bodies, vertices, above, pairs, table = scene[:5]
+    if k < len(above):
+        body, pose = bodies[above[k]], poses[above[k]]
+        bound = pose[2] - body[BOUND] - table
+        if bound > enough:
+            return bound
+        return support_point(body, vertices, pose, 0.0, 0.0, -1.0)[2] - body[convex.RADIUS] - table
+    a, b = pairs[k - len(above), 0], pairs[k - len(above), 1]
+    p, r = poses[a], poses[b]
+    x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
+    bound = np.sqrt(x * x + y * y + z * z) - bodies[a, BOUND] - bodies[b, BOUND]
+    if bound > enough:
+        return bound
+    return separation(enough, bodies[a], p, bodies[b], r, vertices, work)
 
 
 @njit(cache=True, error_model="numpy")
-def _first_pair(scene, poses, work):
-    """Return the index of the first colliding pair, -1 for none."""
-    bodies, vertices, above, pairs, table, margin = scene
-    for k in range(len(above)):
-        body, pose = bodies[above[k]], poses[above[k]]
-        if pose[2] - body[BOUND] > table + margin:
-            continue
-        if support_point(body, vertices, pose, 0.0, 0.0, -1.0)[2] - body[convex.RADIUS] <= table + margin:
-            return k
-    for k in range(len(pairs)):
-        a, b = pairs[k, 0], pairs[k, 1]
-        p, r = poses[a], poses[b]
-        x, y, z = p[0] - r[0], p[1] - r[1], p[2] - r[2]
-        far = bodies[a, BOUND] + bodies[b, BOUND] + margin
-        if x * x + y * y + z * z <= far * far and closer_than(margin, bodies[a], p, bodies[b], r, vertices, work):
-            return len(above) + k
-    return -1
+def _first_contacts(q, links, scene, out):
+    bodies = scene.bodies
+    frames, poses, work = np.empty((len(links), POSE)), np.empty((len(bodies), POSE)), np.empty((10, 3))
+    for arm in range(len(q)):
+        body_poses(links, bodies, q[arm], frames, poses)
+        out[arm] = -1
+        for k in range(len(scene.above) + len(scene.pairs)):
+            if pair_distance(scene, k, scene.margin, poses, work) <= scene.margin:
+                out[arm] = k
+                break
+
+
+@njit(cache=True, error_model="numpy")
+def _distances(q, links, scene, out):
+    bodies = scene.bodies
+    frames, poses, work = np.empty((len(links), POSE)), np.empty((len(bodies), POSE)), np.empty((10, 3))
+    for arm in range(len(q)):
+        body_poses(links, bodies, q[arm], frames, poses)
+        for k in range(out.shape[1]):
+            out[arm, k] = pair_distance(scene, k, np.inf, poses, work)

@@ -1,8 +1,8 @@
-"""Distance test of convex bodies, compiled: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
+"""Distance of convex bodies, compiled: spheres, capsules, cylinders, boxes, ellipsoids and convex hulls.
 
 A body is a core, described by its support function, and a radius around it. The distance of two cores follows
 Gilbert, Johnson and Keerthi (IEEE J. Robot. Autom. 4(2), 1988), with the simplex cases of Ericson (Real-Time
-Collision Detection, 2005, ch. 5); the iteration ends as soon as its bounds decide the test.
+Collision Detection, 2005, ch. 5); the iteration ends as soon as the distance is known to be enough.
 """
 
 import numpy as np
@@ -53,30 +53,30 @@ def support_point(body, vertices, pose, dx, dy, dz):
 
 
 @njit(cache=True, error_model="numpy")
-def closer_than(distance, a, pose_a, b, pose_b, vertices, work):
-    """Return whether two bodies are closer than `distance` m; work: (10, 3), any content."""
-    reach = a[RADIUS] + b[RADIUS] + distance
+def separation(enough, a, pose_a, b, pose_b, vertices, work):
+    """Return the distance of two bodies, m, or a lower bound above `enough` m; 0 or less if they overlap."""
+    around = a[RADIUS] + b[RADIUS]
     if a[KIND] <= SEGMENT and b[KIND] <= SEGMENT:
-        return _segments(a, pose_a, b, pose_b) <= reach * reach
+        return np.sqrt(_segments(a, pose_a, b, pose_b)) - around
     s = work[:4]
     s[0, 0], s[0, 1], s[0, 2] = pose_a[0] - pose_b[0], pose_a[1] - pose_b[1], pose_a[2] - pose_b[2]
     x, y, z, count = s[0, 0], s[0, 1], s[0, 2], 0
     for _ in range(ITERATIONS):
         far = np.sqrt(x * x + y * y + z * z)  # upper bound: the point lies in the Minkowski difference
-        if far <= max(reach, CLOSE):
-            return True
+        if far <= CLOSE:
+            return -around
         ax, ay, az = support_point(a, vertices, pose_a, -x, -y, -z)
         bx, by, bz = support_point(b, vertices, pose_b, x, y, z)
         px, py, pz = ax - bx, ay - by, az - bz
         least = (x * px + y * py + z * pz) / far  # lower bound
-        if least > reach or far - least < CLOSE:
-            return least <= reach
+        if least > enough + around or far - least < CLOSE:
+            return least - around
         s[count, 0], s[count, 1], s[count, 2] = px, py, pz
         count += 1
         x, y, z, count = _nearest(s, count, work[4:])
         if count == 4:
-            return True
-    return far <= reach + CLOSE
+            return -around
+    return far - around
 
 
 @njit(cache=True, error_model="numpy")

@@ -168,7 +168,7 @@ class TrackTask(BaseTask):
             UserError: hardly any path is within the arm's reach and limits and free of collisions.
         """
         paths = self._paths(robot)
-        space, inside = Space(robot, table=-np.inf, z_min=self.height), _Inside(robot, self._region)
+        space, inside = Space(robot, table=-np.inf, z_min=self.height, deviation=0.0), _Inside(robot, self._region)
         found: list[np.ndarray] = []
         middles = self._region.goals(robot, rng, 4 * count)
         for tried in range(TRIES * count + TRIES):
