@@ -72,7 +72,7 @@ class Actuation:
         self.last = np.zeros((m, robot.n))
         self._cycle, self._fade = np.zeros(m, dtype=np.int64), round(soft_start_s / SIM_DT)
         self._factor = low_pass_factor(cutoff_hz)
-        self._tau_max, self._step_max = robot.tau_max, robot.dtau_max * SIM_DT
+        self._tau_max, self._step_max = robot.tau_max, robot.step_max
 
     def reset(self, ids: np.ndarray | None = None) -> None:
         """Start the arms `ids` (all by default) from zero torque."""

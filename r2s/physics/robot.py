@@ -16,6 +16,9 @@ from r2s.files import located
 from r2s.physics.urdf import is_urdf, read_urdf
 
 PANDA = "r2s:models/panda.xml"
+# Share of an arm's torque rate limit that commands use. libfranka's own limiter stays 1e-3 Nm/s below the limit; an
+# FR3 reports its last torque as float32, which moves a step by up to 8e-6 Nm.
+RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
 OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot for tasks, not for `load_robot`
@@ -62,6 +65,11 @@ class Robot:
     def n(self) -> int:
         """Number of joints."""
         return len(self.q_min)
+
+    @property
+    def step_max(self) -> np.ndarray:
+        """(n,) Nm, largest change of a command in one cycle of 1 ms."""
+        return RATE_SHARE * self.dtau_max * SIM_DT
 
     @property
     def q_range(self) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics.linear_algebra import factor, factor_active, solve, solve_active, unpack
 from r2s.physics.rigid_body import InverseInertia
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.robot import Robot
 
 # Latency budget, s: delays up to 8 ms and lags up to 3 ms on real arms, and one cycle.
 LATENCY_S = 0.012
@@ -86,7 +86,7 @@ def filter_limits(robot: Robot, torque: np.ndarray) -> np.ndarray:
     most = (DELAY_PHASE / (RATE * LATENCY_S) - 1) * inertia
     equivalent = inertia * (np.abs(mobility) * torque).max(1)  # Nm at the joint with the effect of any full action
     out[:, ADDED] = np.clip(equivalent / (RATE * out[:, DQ_ALLOWED]) - inertia, 0.0, most)
-    out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.dtau_max * SIM_DT
+    out[:, TAU_MAX], out[:, STEP] = robot.tau_max, robot.step_max
     return out
 
 
