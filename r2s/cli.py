@@ -13,7 +13,8 @@ from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.override_checks import COMMANDS, check_overrides
-from r2s.stages.build import CONF, GROUP, STAGES, loaded
+from r2s.stages.build import GROUP, STAGES
+from r2s.stages.run_config import CONF, TRUST, loaded, modules, replayed, run_config
 
 STOPPED = 3  # exit status of a run that a stopped arm ended
 INTERRUPTED = 130
@@ -83,7 +84,7 @@ def run_job(cfg):
     from hydra.core.hydra_config import HydraConfig
 
     with errors_in_one_line():
-        overrides = list(HydraConfig.get().overrides.task)
+        cfg, overrides = replayed(cfg), list(HydraConfig.get().overrides.task)
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
         check_number("seed", cfg.seed, "[0, inf)", whole=True)
@@ -116,9 +117,11 @@ def resumed(cfg, overrides):
     if not (folder / "config.yaml").is_file():
         names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
         raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
-    if extra := [o for o in overrides if not o.startswith("resume=")]:
+    if extra := [o for o in overrides if not o.startswith(("resume=", "trust="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
-    before = loaded(folder / "config.yaml")
+    before = run_config(folder, cfg.trust)
+    if before.stage == "tune":  # its trainings replay the overrides of the folder
+        os.environ[TRUST] = ",".join(modules(cfg.trust))
     if before.stage not in RESUMABLE:
         raise UserError(f"resume: {folder} is a run of stage={before.stage}; allowed: {choices(RESUMABLE)}")
     if is_done(folder):
@@ -155,7 +158,7 @@ def typed_overrides(folder):
     from r2s.runs import read_meta
 
     words = loaded(folder / "overrides.yaml")
-    if any(not isinstance(w, str) for w in words) or isinstance(words, Mapping):
+    if any(not isinstance(w, str) or w.lstrip("+~").startswith("hydra") for w in words) or isinstance(words, Mapping):
         raise UserError(f"{folder / 'overrides.yaml'} is damaged: it is no list of KEY=VALUE")
     count = read_meta(folder).get("typed", len(words))
     if len(words) != count:

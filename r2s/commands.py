@@ -1,4 +1,4 @@
-"""`r2s list`, `r2s look` and `r2s export`: commands that read run folders; they compose no config."""
+"""`r2s list`, `r2s look`, `r2s export`: commands that read run folders; `r2s check`, which connects to an arm."""
 
 import os
 import sys
@@ -10,6 +10,7 @@ from typing import NoReturn
 from r2s.errors import UserError, choices, nearest
 
 PORT = 9090
+TRUSTED = "modules that a run may execute beside r2s, with commas between, also trust=MODULES"
 
 
 class Parser(ArgumentParser):
@@ -34,19 +35,24 @@ def run_command(words: Sequence[str]) -> None:
     listing.add_argument("--failed", action="store_true", help="only failed and killed runs")
     looking = commands.add_parser("look", help="viewer on one run, or on several side by side")
     looking.add_argument("run", nargs="+", type=Path, metavar="RUN", help="a run folder")
+    looking.add_argument("--trust", help=TRUSTED)
     looking.add_argument("--web", action="store_true", help="serve the viewer to a browser on this computer")
     looking.add_argument("--port", type=int, default=PORT, help=f"of --web, default {PORT}; also uses the next one")
     exporting = commands.add_parser("export", help="bundle of a policy, which runs without r2s")
     exporting.add_argument("run", type=Path, metavar="RUN", help="run folder of a finished training")
     exporting.add_argument("--to", type=Path, help="new folder, also to=FOLDER; default RUN/bundle")
-    typed, unknown = parser.parse_known_args([f"--{w}" if w.startswith("to=") else w for w in words])
+    exporting.add_argument("--trust", help=TRUSTED)
+    checking = commands.add_parser("check", help="connect to an arm without moving it, and compare it with the model")
+    checking.add_argument("override", nargs="+", metavar="KEY=VALUE", help="arm=panda arm.address=..., robot=...")
+    checking.add_argument("--seconds", type=float, default=10.0, help="of reading states, default 10; 0: none")
+    typed, unknown = parser.parse_known_args([f"--{w}" if w.startswith(("to=", "trust=")) else w for w in words])
     if unknown:
         own = commands.choices[typed.command].format_usage().replace("[", " ").replace("]", " ").split()
         options = [w for w in own if w.startswith("--")]
         raise UserError(
             f"{typed.command}: no argument '{unknown[0]}'; allowed: {choices(options)}{nearest(unknown[0], options)}"
         )
-    {"list": list_runs, "look": look, "export": export}[typed.command](typed)
+    {"list": list_runs, "look": look, "export": export, "check": check}[typed.command](typed)
 
 
 def list_runs(typed: Namespace) -> None:
@@ -72,7 +78,8 @@ def look(typed: Namespace) -> None:
     from r2s.reporting.viewer.look import has_screen, open_native, show_in_browser, side_by_side
 
     folders = [viewable(run) for run in typed.run]
-    robot = robot_of(folders)
+    sys.path.append(os.getcwd())
+    robot = robot_of(folders, typed.trust)
     recording, pictures = folders[0] / "recording.rrd", sorted((folders[0] / "figures").glob("*.png"))
     if len(folders) > 1:
         out = folders[0].parent.parent / "look" / "_and_".join(f.name[:30] for f in folders)
@@ -99,7 +106,7 @@ def export(typed: Namespace) -> None:
     from r2s.stages.transfer import trained_config
 
     sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
-    source, trained = trained_config(Namespace(policy=typed.run), "export")
+    source, trained = trained_config(Namespace(policy=typed.run, trust=typed.trust), "export")
     if not is_learner(trained):
         raise UserError(f"export: algo={trained.algo.name} has no network to export ({source})")
     robot = make_robot(trained)
@@ -109,6 +116,42 @@ def export(typed: Namespace) -> None:
     places = [path.stem for group in ("simulator", "arm") for path in (CONF / group).glob("*.yaml")]
     write_bundle(to, source, robot, task, center, policy, plain(trained), places)
     print(f"written: {to}")
+
+
+def check(typed: Namespace) -> None:
+    """Connect to an arm, print what was compared, and raise UserError if anything is refused; nothing moves."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+    from pandas import DataFrame
+
+    from r2s.arm.clients.computer_check import computer_findings, network_findings
+    from r2s.arm.clients.connection_check import Finding, refuse
+    from r2s.arm.interface import ArmStopped
+    from r2s.override_checks import check_overrides
+    from r2s.reporting.tables import print_table
+    from r2s.stages.build import CONF, console, make_robot, opened_arm
+
+    if other := [w for w in typed.override if w.split("=")[0].split(".")[0] not in ("arm", "robot")]:
+        raise UserError(f"check: expected arm=, robot= and their keys, got '{other[0]}'")
+    check_overrides(words := ["stage=identify", *typed.override], None)
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        cfg = compose("config", words)
+    if "collision_torque" not in cfg.arm:
+        raise UserError(
+            f"check: arm={cfg.arm.name} has no connection; allowed: panda, fr3, panda_emulated, fr3_emulated"
+        )
+    if OmegaConf.is_missing(cfg.arm, "address"):
+        raise UserError("arm.address must be given: arm.address=...")
+    with opened_arm(cfg, make_robot(cfg), moves=False) as arm:
+        found = [*arm.findings, *computer_findings("address" in cfg.arm and cfg.arm.realtime)]
+        if cfg.arm.live and typed.seconds > 0:  # in lock-step an arm has no clock
+            try:
+                found += network_findings(*arm.watch(typed.seconds))
+            except ArmStopped as lost:
+                found.append(Finding("states", "one per ms", str(lost), refused=True))
+    rows = {f.name: {"r2s": f.expected, "arm or computer": f.found, "": "REFUSED" * f.refused} for f in found}
+    print_table(console(), DataFrame.from_dict(rows, orient="index"), f"arm={cfg.arm.name}, robot={arm.robot.name}")
+    refuse(found, f"arm={cfg.arm.name} is refused")
 
 
 def viewable(folder: Path) -> Path:
@@ -121,13 +164,12 @@ def viewable(folder: Path) -> Path:
     raise UserError(f"look: '{folder}' is no run folder{nearest(folder.name, names)}")
 
 
-def robot_of(folders: Sequence[Path]):
-    """Return the robot of the runs; raise UserError if they have different ones."""
-    from omegaconf import OmegaConf
-
+def robot_of(folders: Sequence[Path], trust: str | None = None):
+    """Return the robot of the runs; raise UserError if they have different ones, or foreign parts."""
     from r2s.stages.build import make_robot
+    from r2s.stages.run_config import run_config
 
-    configs = [OmegaConf.load(folder / "config.yaml") for folder in folders]
+    configs = [run_config(folder, trust) for folder in folders]
     for folder, cfg in zip(folders, configs, strict=True):
         if cfg.robot != configs[0].robot:
             raise UserError(f"look: {folder} has another robot than {folders[0]}; view them one by one")

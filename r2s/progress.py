@@ -2,6 +2,8 @@
 
 import atexit
 import time
+from queue import SimpleQueue
+from threading import Thread
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -10,9 +12,12 @@ from rich.table import Column
 
 
 class Progress:
-    """A progress bar on a terminal; elsewhere a line of text every `every_s` seconds."""
+    """A progress bar on a terminal; elsewhere a line of text every `every_s` seconds.
 
-    def __init__(self, label: str, every_s: float = 10.0):
+    in_cycle: the calls come from a control cycle, which must not wait for a terminal: a thread writes.
+    """
+
+    def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
@@ -32,9 +37,24 @@ class Progress:
             self._task = self._bar.add_task(label, total=1.0, text="")
             self._bar.start()
             atexit.register(self._bar.stop)  # restores the cursor after an exception
+        self._calls: SimpleQueue[tuple[float, str] | None] | None = SimpleQueue() if in_cycle else None
+        if in_cycle:
+            self._writer = Thread(target=self._write, daemon=True)
+            self._writer.start()
 
     def __call__(self, share: float, text: str = "") -> None:
         """Show that `share` (0 to 1) of the work is done, followed by `text`."""
+        if self._calls is None:
+            self._show(share, text)
+        else:
+            self._calls.put((share, text))
+
+    def _write(self) -> None:
+        assert self._calls is not None
+        while (call := self._calls.get()) is not None:
+            self._show(*call)
+
+    def _show(self, share: float, text: str) -> None:
         now = time.perf_counter()
         if now - self._shown < (0.2 if self._bar else self._every):
             return
@@ -48,6 +68,9 @@ class Progress:
 
     def close(self, text: str = "") -> None:
         """Print the elapsed time and the result in `text`."""
+        if self._calls is not None:
+            self._calls.put(None)
+            self._writer.join()
         if self._bar:
             self._bar.stop()
             atexit.unregister(self._bar.stop)

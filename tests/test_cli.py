@@ -221,7 +221,7 @@ COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / 
 
 COSTLY = ("task=track", "stage=estimate", "-m stage=transfer")  # others do it in process; six transfers
 TYPED = [
-    c for c in COMMANDS if not c.startswith(("resume=", "list", "look", "export"))
+    c for c in COMMANDS if not c.startswith(("resume=", "list", "look", "export", "check"))
 ]  # those have tests of their own
 
 

@@ -261,8 +261,12 @@ def test_timing_counts_every_cycle():
     episodes, timing = rollout(policy, driven, task, starts, goals), driven.timing
     assert driven.stops == []
     assert episodes.q.shape == (2, 10, 7)
-    assert [row["count"] for row in timing.table()] == [20, 400, 398]
-    assert all(0 < row["median_ms"] <= row["p99_ms"] <= row["max_ms"] for row in timing.table())
+    rows = timing.table()
+    assert [(row["what"], row["count"]) for row in rows] == [
+        ("policy", 20), ("driver", 400), ("period", 398), ("robot", 400)
+    ]  # fmt: skip
+    assert all(0 < row["median_ms"] <= row["p99_ms"] <= row["p999_ms"] <= row["max_ms"] for row in rows)
+    assert rows[-1]["lost"] == 0
 
 
 def test_a_slow_policy_is_not_taken_for_a_silent_one():

@@ -28,11 +28,11 @@ from r2s.arm.clients.fr3 import FR3
 from r2s.arm.clients.franka import TORQUE_SHARE
 from r2s.arm.clients.libfranka import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.panda import Panda
-from r2s.arm.emulator.control import Control, Fault
+from r2s.arm.emulator.control import CUTOFF_HZ, Control, Fault
 from r2s.arm.emulator.process import Emulator, _read_robot, main
 from r2s.arm.emulator.robot_model import urdf
 from r2s.arm.emulator.server import open_port
-from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
+from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes, named_signals, signal_sizes
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins.rigid_twin import RigidTwin
@@ -40,7 +40,9 @@ from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.payload import payload_of
 from r2s.physics.robot import SIM_DT, load_robot
+from r2s.recordings.recording import SIGNALS
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import rollout
 
@@ -582,3 +584,141 @@ def test_a_missed_answer_repeats_the_last_torque(panda):
         control.cycle(None)
     assert not control.running
     assert "20 consecutive cycles" in control.stopped_by
+
+
+def loaded(robot, payload=None, declared=None):
+    """Return a simulated arm with a payload, which its gravity compensation may know."""
+    friction = nominal_dynamics(robot, **conf("friction/paper"))
+    still = {"position_noise": 0, "velocity_noise": 0}
+    return SimulatedArm(robot, friction, payload=payload_of(payload), declared_payload=payload_of(declared), **still)
+
+
+def field(control, name):
+    """Return a field of RobotState in double precision."""
+    return control.state[name].astype(float)
+
+
+@pytest.mark.parametrize("version", [5, 10])
+def test_an_undeclared_payload_is_an_external_force(version, panda):
+    """The arm holds it up: a force along +z at its place, whose torque about the end effector is that of its lever.
+
+    1e-4 N: single precision of the frames and of 12 N (1e-6), with a margin.
+    """
+    body = {"mass": 1.2, "centre": [0.03, 0.0, 0.05]}
+    control = Control(loaded(panda, body), version)
+    frame = field(control, "O_T_EE").reshape(4, 4).T
+    up = np.array([0, 0, 1.2 * 9.81])
+    lever = frame[:3, :3] @ body["centre"]
+    wrench = np.concatenate([up, np.cross(lever, up)])
+    np.testing.assert_allclose(field(control, "O_F_ext_hat_K"), wrench, atol=1e-4)
+    own = np.concatenate([frame[:3, :3].T @ wrench[:3], frame[:3, :3].T @ wrench[3:]])
+    np.testing.assert_allclose(field(control, "K_F_ext_hat_K"), own, atol=1e-4)
+    assert np.abs(field(Control(loaded(panda, body, body), version), "tau_ext_hat_filtered")).max() < 1e-12
+    less = Control(loaded(panda, None, body), version)
+    np.testing.assert_allclose(field(less, "O_F_ext_hat_K"), -wrench, atol=1e-4)
+    assert field(less, "m_load") == pytest.approx(1.2)
+
+
+def test_a_load_that_is_set_is_no_external_force(panda):
+    """After SetLoad with the payload's values the estimate is zero; a tilted O_ddP_O is felt as a force."""
+    body = {"mass": 1.2, "centre": [0.03, 0.0, 0.05]}
+    control = Control(loaded(panda, body), 5)
+    before = field(control, "tau_ext_hat_filtered")
+    assert np.abs(before).max() > 3
+    load = payload_of(body)
+    control.set("SetLoad", np.array((1.2, load.centre, load.inertia.ravel()), fci.LOAD))
+    assert np.abs(field(control, "tau_ext_hat_filtered")).max() < 1e-9
+    assert field(control, "m_load") == 1.2
+    tilted = Control(Bare(panda), 5, desk={"O_ddP_O": [9.81 * np.sin(0.2), 0, -9.81 * np.cos(0.2)]})
+    assert np.abs(field(tilted, "tau_ext_hat_filtered")).max() > 3
+    with pytest.raises(UserError, match="desk setting 'm_hand'; allowed: F_T_EE, m_ee"):
+        Control(Bare(panda), 5, desk={"m_hand": 0.7})
+
+
+def test_frames_that_are_set_move_the_end_effector(panda):
+    """SetNEToEE moves O_T_EE; SetEEToK moves the point of the wrench."""
+    control = Control(loaded(panda, 1.0), 5)
+    flange = field(control, "O_T_EE").reshape(4, 4).T
+    up = field(control, "O_F_ext_hat_K")
+    tool = np.eye(4)
+    tool[:3, 3] = 0.02, 0.0, 0.1
+    control.set("SetNEToEE", np.array((tool.T.ravel(),), fci.SETTINGS["SetNEToEE"]))
+    np.testing.assert_allclose(field(control, "O_T_EE").reshape(4, 4).T, flange @ tool, atol=1e-12)
+    np.testing.assert_allclose(field(control, "F_T_EE").reshape(4, 4).T, tool, atol=1e-12)
+    lever = -flange[:3, :3] @ tool[:3, 3]
+    np.testing.assert_allclose(field(control, "O_F_ext_hat_K")[3:], up[3:] + np.cross(lever, up[:3]), atol=1e-6)
+    control.set("SetEEToK", np.array((np.linalg.inv(tool).T.ravel(),), fci.SETTINGS["SetEEToK"]))
+    np.testing.assert_allclose(field(control, "O_F_ext_hat_K"), up, atol=1e-6)
+
+
+def test_contact_and_collision_follow_the_thresholds(panda):
+    """A held link raises the contact flag at the lower threshold, the collision flag and the reflex at the upper."""
+    thresholds = np.full((), 100.0, fci.COLLISION)
+    thresholds["lower_torque"], thresholds["upper_torque"] = 2.0, 6.0
+    control = Control(holdable(panda), 5, [Fault("hold", 40, cycles=10_000)])
+    control.set("SetCollisionBehavior", thresholds)
+    control.begin()
+    control.first_answer()
+    contact = []
+    for k in range(2000):
+        if not control.running:
+            break
+        control.cycle(np.minimum(0.5 * (k + 1), 12.0) * np.eye(7)[0])
+        contact.append((control.state["joint_contact"][0], np.abs(field(control, "tau_ext_hat_filtered")).max()))
+    flags, torque = np.array(contact).T
+    np.testing.assert_array_equal(flags > 0, torque > 2)
+    assert 0 < flags.sum() < len(flags)
+    assert np.flatnonzero(control.state["reflex_reason"]).tolist() == [fci.JOINT_REFLEX]
+    assert control.state["joint_collision"][0] == 1
+    assert "joint 1: external torque" in control.stopped_by
+    assert control.recover()
+    assert not control.state["joint_contact"].any()  # nothing holds the link any more
+
+
+def test_the_external_torque_is_low_passed(panda):
+    """After a step it follows 1 - exp(-2 pi 15 Hz t), the first-order filter of the emulator."""
+    arm = holdable(panda)
+    control = Control(arm, 5)
+    control.begin()
+    arm.external = -np.eye(7)[6]  # what the surroundings do to the arm; the estimate has the other sign
+    arm.move_to(panda.q_home)
+    seen = []
+    for _ in range(30):
+        control._feel()
+        seen.append(field(control, "tau_ext_hat_filtered")[6])
+    np.testing.assert_allclose(seen, 1 - np.exp(-2 * np.pi * CUTOFF_HZ * SIM_DT * (1 + np.arange(30))), atol=1e-12)
+
+
+@pytest.mark.parametrize("version", [5, 10])
+def test_the_box_forgives_no_step(version, panda):
+    """A step of 1.0005 Nm per ms stops the motion; r2s's own arms tolerate 1e-3 Nm of round-off."""
+    for step, goes_on in ((0.9999, True), (1.0005, False)):
+        control, arm = begun(panda, version)
+        control.cycle(np.full(7, step))
+        assert control.running == goes_on
+        assert len(arm.commands) == goes_on
+    assert np.flatnonzero(control.state["errors"]).tolist() == [fci.TORQUE_DISCONTINUITY]
+
+
+def test_clients_read_what_the_arm_knows(client, panda):
+    """Every signal arrives, at rest and in motion; a load that is set reaches the state."""
+    _, make, version = client
+    with Emulator(partial(loaded, panda, 1.0), version=version) as address:
+        arm = make(panda, address)
+        arm.move_to(panda.q_home)
+        drive(arm, 20, BARE)
+        s = arm.read()
+        sizes = {name: np.size(getattr(s, name)) for name in SIGNALS}
+        assert sizes == signal_sizes(7)
+        assert s.O_F_ext_hat_K[2] == pytest.approx(9.81, abs=0.05)  # it moves by 0.1 mrad
+        assert s.control_command_success_rate == pytest.approx(1.0)
+        assert not s.in_contact
+        again = named_signals(s.signals, 7)
+        assert all(np.array_equal(again[name], getattr(s, name)) for name in SIGNALS)
+        arm.stop()
+        assert arm.read().control_command_success_rate == 0
+        arm._client._robot.set_load(0.4, [0.0, 0.0, 0.02], [1e-3, 0, 0, 0, 1e-3, 0, 0, 0, 1e-3])
+        arm.move_to(arm.read().q)
+        assert arm.read().m_load == pytest.approx(0.4)
+        assert arm.read().O_F_ext_hat_K[2] == pytest.approx(0.6 * 9.81, abs=0.05)
+        arm.close()

@@ -298,7 +298,7 @@ def test_a_long_rest_does_not_spoil_what_the_motion_says(arm, truth, wrong, moti
     still["dq"] = NOISE["velocity_noise"] * rng.normal(size=(n, 3))
     both = {k: np.concatenate([getattr(part, k), column]) for k, column in still.items()}
     start = replace(wrong, breakaway=truth.breakaway)
-    result = run(arm, start, replace(part, **both), STAGED, window_s=0.2, stride=20)
+    result = run(arm, start, replace(part, **both, signals=None), STAGED, window_s=0.2, stride=20)
     assert curve_error(result.dynamics, truth, motion.dq).max() < 0.02
     assert not result.unseen
 

@@ -178,7 +178,8 @@ def test_measured_edges_of_the_dead_zone_move_with_the_offset(panda, paper):
     edges = space.dynamics(x).breakaway
     np.testing.assert_allclose(edges[:, 0], [[-0.4, 0.6], [-0.3, 0.7], [-0.65, 0.35], [0.0, 1.5], [-1.3, 0.0]])
     assert np.array_equal(edges, np.broadcast_to(edges[:, :1], edges.shape))
-    own = parameter_space(panda, paper, {"offset": [-2.0, 2.0], "breakaway_positive": [0.0, 1.0]}, command)
+    own = parameter_space(panda, paper, {"offset": [-2.0, 2.0], "breakaway_positive": [0.0, 1.0]})
+    own = replace(own, breakaway_command=command)
     edges = own.dynamics(np.repeat([0.1, 0.25], 7)).breakaway
     np.testing.assert_allclose(edges, np.tile([-0.3, 0.25], (7, 1)))
 

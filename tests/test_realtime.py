@@ -86,6 +86,9 @@ def test_a_policy_that_stalls(panda, tmp_path):
     with RealtimeRunner(partial(Paced, panda, path), panda, TASK, LEVEL) as arms:
         starts, goals = fixed_episodes(panda, TASK, len(stalls))
         episodes = rollout(Stalls(panda, arms, stalls), arms, TASK, starts, goals)
+        state = arms._latest()[1]  # of another process
+    assert state.tau_ext_hat_filtered.shape == (7,)
+    assert (state.m_ee, state.m_load, state.O_T_EE) == (0, 0, None)
     assert [stop.episode for stop in arms.stops] == [1, 2]
     assert all("no finite action for 50 ms" in stop.reason for stop in arms.stops)
     assert np.isfinite(episodes.distance[0]).all()

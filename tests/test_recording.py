@@ -358,6 +358,36 @@ def test_a_saved_recording_is_restored(tmp_path, period):
     assert [p.name for p in tmp_path.iterdir()] == ["saved.npz"]
 
 
+def with_signals(t, **fields):
+    """Return a recording with flags (T, 3) and a load (T,) that tell the row."""
+    row = np.arange(len(t))
+    known = {"joint_contact": np.stack([row, row % 2, 0 * row], axis=1), "m_load": row + 0.5}
+    return sine(t, signals=known, **fields)
+
+
+def test_signals_follow_their_rows(tmp_path):
+    """File, selection and split keep each row's signals; resampling keeps the last logged ones, never a mean."""
+    r = with_signals(jittered_time())
+    r.save(tmp_path / "known.npz")
+    back = read(tmp_path / "known.npz", torque=None)
+    assert_same(back, r)
+    assert back.signals.keys() == r.signals.keys()
+    for kept in (back.select(back.t > 5.5), *back.split(0.3), back):
+        row = np.searchsorted(r.t, kept.t)
+        np.testing.assert_array_equal(kept.signals["m_load"], row + 0.5)
+        np.testing.assert_array_equal(kept.signals["joint_contact"][:, 1], row % 2)
+    grid = r.resample(1e-3)
+    np.testing.assert_array_equal(grid.signals["m_load"], np.searchsorted(r.t, grid.t + 1e-12, side="right") - 0.5)
+    np.testing.assert_array_equal(grid.smooth(50.0).signals["m_load"], grid.signals["m_load"])
+
+
+def test_wrong_signals_are_one_line():
+    t = jittered_time(100)
+    assert "got 'force'" in message(sine, t, signals={"force": np.zeros(100)})
+    assert "expected 100 rows" in message(sine, t, signals={"m_ee": np.zeros(99)})
+    assert "m_ee: expected finite values" in message(sine, t, signals={"m_ee": np.full(100, np.nan)})
+
+
 def test_explicit_columns(tmp_path):
     r = sine(jittered_time(300), name="log")
     table = {"stamp": r.t}

@@ -61,6 +61,7 @@ class Estimator:
         self._before = self._payload()
         self._moved = 0  # spans since a rest, up to SETTLING_SPANS
         self._now: Estimate | None = None
+        apply_jump(Filter.fresh(noise), noise)  # compile before an arm waits
         self.begin()
 
     def begin(self) -> None:

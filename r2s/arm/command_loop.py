@@ -1,7 +1,9 @@
 """An arm behind its driver: the only module of r2s that commands an arm.
 
 Episodes, recordings, ramps and the clients' `move_to` pass their commands through `CommandLoop`. The arm receives the
-driver's torques, and nothing else; tests/test_command_loop.py checks that no other call exists.
+driver's torques, and nothing else; tests/test_command_loop.py checks that no other call exists. Every cycle asks
+r2s/arm/stop_request.py whether the motion may go on. A motion that the driver has brought to rest is over for the arm
+too: the loop stops the arm before it raises.
 """
 
 import time
@@ -12,7 +14,8 @@ import numpy as np
 
 from r2s.adaptation.adapter import Adapter
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
+from r2s.arm.interface import Arm, ArmState, ArmStopped, Holds, Operated, StopRequested
+from r2s.arm.stop_request import begin_ending, requested, serve
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT
 
@@ -21,6 +24,8 @@ REST_S = 0.5  # longest duration
 REST_RATE = 15.0  # 1/s, rate at which damping takes the speed out
 REST_SHARE = 0.2  # of tau_max, limit of the damping torque
 STILL = 0.02  # rad/s, speed below which a joint counts as at rest
+SLIDING = 0.05  # rad/s, of a joint that friction does not hold; after SLIDES_S more damping would not stop it
+SLIDES_S = 0.04
 
 
 class CommandLoop:
@@ -48,13 +53,14 @@ class CommandLoop:
         self.arm, self.driver = arm, driver
         self._adapter, self._adapting = adapter, False
         self._added: np.ndarray | None = None
-        self._log, self._ended = log, False
+        self._log, self._ended, self._requested = log, False, False
         self._inverse = InverseInertia(arm.robot)
         self.state: ArmState
         self.sent, self.clock = np.zeros(arm.robot.n), (0.0, 0.0, 0.0)
 
     def place(self, q: np.ndarray) -> ArmState:
         """Bring the arm to rest at q (n,) rad and begin a motion there; raises ArmStopped as `Arm.move_to`."""
+        self._check_request()
         self._reset()
         try:
             self.state = self.arm.move_to(q)
@@ -64,20 +70,39 @@ class CommandLoop:
         return self.state
 
     def begin(self) -> None:
-        """Begin a motion at the arm's current posture."""
+        """Begin a motion at the arm's current posture; raises StopRequested after a request to stop."""
+        self._check_request()
         self._reset()
         self.state = self.arm.read()
 
-    def __call__(self, command: np.ndarray | None) -> ArmState:
+    def damp(self, hold: np.ndarray) -> None:
+        """Begin a motion that only damps the arm, also after a request to stop; see `rest`."""
+        self._reset()
+        self.state = self.arm.read()
+        self.rest(hold)
+
+    def __call__(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
         """Run one cycle with a command (c,) of the driver's controller, None for no new one; return the next state.
 
+        Args:
+            command: of this cycle. hold: (n,) Nm, part of it that the driver keeps while it brings the arm to rest.
+
         Raises:
+            StopRequested: a request to stop; the driver has brought the arm to rest.
             ArmStopped: the arm stopped itself, or the driver brought it to rest; the motion has then ended.
         """
+        if self.driver.stopping is None and (reason := requested()) is not None:
+            self._requested = True
+            begin_ending()
+            self.driver.stop(reason)
+        return self._cycle(command, hold)
+
+    def _cycle(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
+        """Run one cycle without asking for requests."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
-        self.sent = self.driver(self.state, command, self._added)
+        self.sent = self.driver(self.state, command, self._added, hold)
         driven = time.perf_counter()
         if self._adapter is not None and self._adapting:
             self._adapt(self._adapter)
@@ -91,23 +116,23 @@ class CommandLoop:
             raise
         self.state = self.arm.read()
         if self.driver.done:
-            self._raise(str(self.driver.stopping))
+            self._raise(str(self.driver.stopping), self.driver.held)
         return self.state
 
-    def rest(self) -> None:
-        """Damp the arm's motion and reduce its command, for at most 0.5 s."""
+    def rest(self, hold: np.ndarray | float = 0.0) -> None:
+        """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s."""
         damping = REST_RATE / np.diag(self._inverse(self.state.q[None])[0])
-        limit, step = REST_SHARE * self.arm.robot.tau_max, self.arm.robot.dtau_max * SIM_DT
-        for _ in range(round(REST_S / SIM_DT)):
-            s = self.state
-            if np.abs(s.dq).max() < STILL and (np.abs(s.tau_J_d) <= step).all():
+        limit, step = REST_SHARE * self.arm.robot.tau_max, self.arm.robot.step_max
+        for k in range(round(REST_S / SIM_DT)):
+            s, slow = self.state, STILL if k * SIM_DT < SLIDES_S else SLIDING
+            if np.abs(s.dq).max() < slow and (np.abs(s.tau_J_d - hold) <= step).all():
                 return
-            self(np.clip(-damping * s.dq, -limit, limit))
+            self._cycle(hold + np.clip(-damping * s.dq, -limit, limit))
 
     def halt(self, reason: str) -> None:
-        """Bring the arm to rest, then raise ArmStopped with `reason`."""
+        """Bring the arm to rest without torque, as after a contact, then raise ArmStopped with `reason`."""
         self.rest()
-        self._raise(reason)
+        self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
         """Stop the arm; return the reason if the driver was bringing it to rest, else None."""
@@ -115,12 +140,17 @@ class CommandLoop:
         if reason is not None:
             self._block(reason)
         self._ended = True
-        self.arm.stop()
+        self._stop_arm(self.driver.held)
         return reason
+
+    def _check_request(self) -> None:
+        if (reason := requested()) is not None:
+            serve()
+            raise StopRequested(reason)
 
     def _reset(self) -> None:
         self.driver.reset()
-        self._ended = False
+        self._ended = self._requested = False
         if self._adapter is not None:
             self._adapter.begin()
             self._adapting, self._added = True, np.zeros(self.arm.robot.n)
@@ -139,14 +169,24 @@ class CommandLoop:
                 self.arm.command(self.sent)
                 self.state = self.arm.read()
                 while True:
-                    self(None)
+                    self._cycle(None)
             raise
 
-    def _raise(self, reason: str) -> None:
-        self._ended = True
+    def _raise(self, reason: str, hold: np.ndarray) -> None:
+        """Stop the arm and raise `reason`, which stays the reason whatever stopping the arm reports."""
+        kind = StopRequested if self._requested else ArmStopped
         self._block(reason)
-        raise ArmStopped(reason)
+        self._stop_arm(hold)
+        self._ended = True
+        if kind is StopRequested:
+            serve()
+        raise kind(reason)
+
+    def _stop_arm(self, hold: np.ndarray) -> None:
+        if isinstance(self.arm, Holds):
+            self.arm.hold = hold.copy()
+        self.arm.stop()
 
     def _block(self, reason: str) -> None:
         if isinstance(self.arm, Operated):
-            self.arm.blocked = reason
+            self.arm.blocked = self.arm.blocked or reason

@@ -9,109 +9,38 @@ hostile ones.
 `DriverBatch` drives many arms in lock-step, `Driver` one.
 """
 
-from collections.abc import Callable
-from functools import cache
-from types import FunctionType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from r2s.arm.interface import ArmState
-from r2s.compiled import njit
-from r2s.physics.actuation import condition, low_pass_factor
-from r2s.physics.control_laws import BUILT_IN, ControlLaw, chain, control_law, law_number, registered, torque_law
-from r2s.physics.newton_euler import WORK as DESK
-from r2s.physics.newton_euler import equations, links_of
-from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.safety_filter import (
-    BRAKE_S,
-    DQ_ALLOWED,
-    STEP,
-    TAU_MAX,
-    WORK,
-    JointDynamics,
-    filter_limits,
-    filter_torque,
+from r2s.arm.drive_cycle import (
+    ADDED,
+    LAW_NOT_FINITE,
+    NOT_FINITE,
+    REQUESTED,
+    RUNS,
+    SILENT,
+    TOO_NEAR,
+    Bounds,
+    Given,
+    Memory,
+    Model,
+    compiled_cycle,
 )
+from r2s.arm.interface import ArmState
+from r2s.physics.actuation import low_pass_factor
+from r2s.physics.collision import CollisionCheck, empty_scene
+from r2s.physics.control_laws import BUILT_IN, ControlLaw, law_number, registered, torque_law
+from r2s.physics.fence import Fence
+from r2s.physics.newton_euler import links_of
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 
 DEADLINE_S = 0.05  # s without a fresh finite command, or PERIODS of a slow policy: then the arm is braked and stopped
 PERIODS = 2.5  # control periods
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad inside the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # share of the velocity limits, where the arm is stopped
-STILL = 0.02  # rad/s, below which a joint is at rest
-ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
-RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE = range(5)  # values of `Memory.why`
-
-
-class Memory(NamedTuple):
-    """State of the driver of m arms, which `drive_cycle` updates.
-
-    Attributes:
-        command: (m, c), the last finite one. law: (m, k), memory of the control law.
-        target: (m, n) Nm, torque of the control law. filtered, effort: (m, n) Nm, see `Actuation`.
-        sent: (m, n) Nm, the last torque command.
-        share: (m,), share of the allowed speeds: 1, and falling while the arm is brought to rest.
-        cycle, silent, damped: (m,), cycles in all, since the last finite command, and of braking.
-        why: (m,), RUNS or why the arm is brought to rest. limited: (m,), cycles that the safety filter changed.
-        rests: (m,), whether the arm is at rest. commanded: (m,), whether there was a command.
-    """
-
-    command: np.ndarray
-    law: np.ndarray
-    target: np.ndarray
-    filtered: np.ndarray
-    effort: np.ndarray
-    sent: np.ndarray
-    share: np.ndarray
-    cycle: np.ndarray
-    silent: np.ndarray
-    damped: np.ndarray
-    why: np.ndarray
-    limited: np.ndarray
-    rests: np.ndarray
-    commanded: np.ndarray
-
-    @staticmethod
-    def fresh(m: int, n: int, command: int, law: int) -> "Memory":
-        """Return the state of m arms of n joints before their first cycle, without torque."""
-        own = np.zeros((m, command)), np.zeros((m, law))
-        count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
-        return Memory(*own, *np.zeros((4, m, n)), np.ones(m), *count, *flags)  # type: ignore[call-arg]
-
-
-class Given(NamedTuple):
-    """Inputs of a cycle: command (m, c) if `new`, torque `added` (m, n) Nm of an adapter if `adds`."""
-
-    command: np.ndarray
-    new: bool
-    added: np.ndarray
-    adds: bool
-
-
-class Bounds(NamedTuple):
-    """Limits of an arm: target and adapter torque (n,) Nm, stop limits (n,) rad and rad/s, and three numbers.
-
-    deadline: s without a command. factor: of the low-pass. fade: cycles of the soft start.
-    """
-
-    torque: np.ndarray
-    added: np.ndarray
-    q_low: np.ndarray
-    q_high: np.ndarray
-    dq_max: np.ndarray
-    deadline: float
-    factor: float
-    fade: int
-
-
-class Model(NamedTuple):
-    """Model of the arm: friction (n,) Nm, links of `links_of`, rotors (n,) kg m^2, limits of `filter_limits`."""
-
-    friction: np.ndarray
-    links: np.ndarray
-    rotors: np.ndarray
-    limits: np.ndarray
 
 
 class DriverBatch:
@@ -126,6 +55,8 @@ class DriverBatch:
         soft_start_s: s over which the targets of a motion fade in; 0: not at all.
         friction: (n,) Nm, level of each joint's friction. rotors: (n,) kg m^2, see `Dynamics.armature`; None: the
             robot's. control: control law; None: commands are torques (n,) Nm.
+        fence: the arm is stopped before it touches itself or the table; None: without.
+        speed_share: share of all allowed speeds, in (0, 1].
     """
 
     def __init__(
@@ -140,9 +71,12 @@ class DriverBatch:
         soft_start_s: float = 0.0,
         rotors: np.ndarray | None = None,
         control: ControlLaw | None = None,
+        fence: CollisionCheck | None = None,
+        speed_share: float = 1.0,
     ):
-        self._shape = m, robot.n
-        self._sizes = (robot.n, 0) if control is None else (control.command_size, control.memory_size)
+        self._shape, self._fence, self._speed_share = (m, robot.n), fence, speed_share
+        own = (robot.n, 0) if control is None else (control.command_size, control.memory_size)
+        self._sizes = *own, 0 if fence is None else len(fence.names)
         number = law_number(torque_law if control is None else control.law)
         self._control = float(number), np.zeros(0) if control is None else control.parameters
         self._drive = compiled_cycle(registered() if number >= len(BUILT_IN) else BUILT_IN)
@@ -151,17 +85,21 @@ class DriverBatch:
             added=ADDED * robot.tau_max,
             q_low=robot.q_min + Q_INSIDE,
             q_high=robot.q_max - Q_INSIDE,
-            dq_max=DQ_INSIDE * robot.dq_max,
+            dq_max=DQ_INSIDE * speed_share * robot.dq_max,
             deadline=max(DEADLINE_S, PERIODS * period_s),
             factor=low_pass_factor(cutoff_hz),
             fade=round(soft_start_s / SIM_DT),
         )
+        links, limits = links_of(robot, robot.mass, robot.com, robot.inertia), filter_limits(robot, torque)
+        limits[:, [DQ_ALLOWED, DQ_MAX]] *= speed_share
         self._model = Model(
             friction=np.array(friction, dtype=float),
-            links=links_of(robot, robot.mass, robot.com, robot.inertia),
+            links=links,
             rotors=robot.armature if rotors is None else np.array(rotors, dtype=float),
-            limits=filter_limits(robot, torque),
+            limits=limits,
+            fence=Fence(links, empty_scene() if fence is None else fence.scene),
         )
+        self._nothing, self._free = np.zeros(self._shape), np.zeros(m, dtype=bool)
         self.reset()
         still = np.zeros(self._shape)
         self(np.tile(robot.q_home, (m, 1)), still, still, None)  # compile before an arm waits
@@ -176,6 +114,11 @@ class DriverBatch:
     def effort(self) -> np.ndarray:
         """(m, n) Nm, the target torques after the low-pass, which policies observe."""
         return self._memory.effort
+
+    @property
+    def held(self) -> np.ndarray:
+        """(m, n) Nm, the compensation that is kept while an arm is brought to rest."""
+        return self._memory.held
 
     @property
     def limited(self) -> np.ndarray:
@@ -195,6 +138,8 @@ class DriverBatch:
         tau_J_d: np.ndarray,
         command: np.ndarray | None,
         added: np.ndarray | None = None,
+        hold: np.ndarray | None = None,
+        contact: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the torque commands (m, n) Nm of this cycle.
 
@@ -204,16 +149,27 @@ class DriverBatch:
             command: (m, c) of the controller; None: no new one.
             added: (m, n) Nm of adapters in this cycle, clipped to ADDED of tau_max; None: no adapter. If it is not
                 finite, nothing is added, and the command of the same cycle is ignored.
+            hold: (m, n) Nm, part of the target that compensates a payload that the arm does not know. It and `added`
+                stay while an arm is brought to rest, together at most ADDED of tau_max; None: nothing.
+            contact: (m,), whether the arm reports a contact: then nothing is held. None: no contact.
         """
         memory, new, adds = self._memory, command is not None, added is not None
         own = np.zeros((len(q), self._sizes[0])) if command is None else np.ascontiguousarray(command)
-        given = Given(own, new, q if added is None else added, adds)
+        given = Given(
+            own, new, q if added is None else added, adds,
+            self._nothing if hold is None else hold, self._free if contact is None else contact,
+        )  # fmt: skip
         out = self._drive(q, dq, tau_J_d, given, self._control, self._bounds, self._model, memory)
         if memory.why.any():
             for i in np.flatnonzero(memory.why):
                 if self.stopping[i] is None:
                     self.stopping[i] = self._reason(int(memory.why[i]), q[i], dq[i])
         return out
+
+    def stop(self, reason: str) -> None:
+        """Bring all arms to rest, from the next cycle on; an arm that is being stopped keeps its reason."""
+        self._memory.why[self._memory.why == RUNS] = REQUESTED
+        self.stopping = [reason if own is None else own for own in self.stopping]
 
     def _reason(self, why: int, q: np.ndarray, dq: np.ndarray) -> str:
         """Return in words why the arm at q, dq (n,) is being brought to rest."""
@@ -224,100 +180,15 @@ class DriverBatch:
             return "the arm's state is not finite"
         if why == LAW_NOT_FINITE:
             return "the controller's torque is not finite"
+        if why >= TOO_NEAR and self._fence is not None:
+            apart = self._fence.distances(q[None])[0, why - TOO_NEAR]
+            return f"{self._fence.names[why - TOO_NEAR]} are {apart:.3f} m apart and would come too near"
         out = np.maximum(bounds.q_low - q, q - bounds.q_high)
         if (out > 0).any():
             j = int(out.argmax())
             return f"joint {j + 1} is at {q[j]:.3f} rad, {Q_INSIDE:g} rad from its limit"
         j = int((np.abs(dq) / bounds.dq_max).argmax())
-        return f"joint {j + 1} is at {dq[j]:.3f} rad/s, {DQ_INSIDE:g} of its limit"
-
-
-@njit(cache=True)
-def _watch(i, q, dq, given, bounds, memory):
-    """Take the command of arm i, and decide whether the arm has to stop; return whether its state is finite."""
-    seen = np.isfinite(q).all() and np.isfinite(dq).all()
-    helped = given.adds and np.isfinite(given.added[i]).all()
-    if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
-        memory.command[i] = given.command[i]
-        memory.commanded[i] = True
-        memory.silent[i] = 0
-    else:
-        memory.silent[i] += 1
-    if memory.why[i] == RUNS:
-        if memory.silent[i] * SIM_DT > bounds.deadline:
-            memory.why[i] = SILENT
-        elif not seen:
-            memory.why[i] = NOT_FINITE
-        elif not ((q >= bounds.q_low).all() and (q <= bounds.q_high).all() and (np.abs(dq) <= bounds.dq_max).all()):
-            memory.why[i] = OUTSIDE
-    return seen
-
-
-def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
-    """Return the commands (m, n) Nm of this cycle.
-
-    Args:
-        q, dq, applied: (m, n), state and last torque. given: `Given`. control: number and parameters of the law.
-        bounds: `Bounds`. model: `Model`. memory: `Memory`, updated.
-    """
-    out, (m, n) = np.empty_like(memory.sent), q.shape
-    number, parameters = control
-    limits = model.limits
-    work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
-    inertia, bias, desk, weightless = np.empty((n, n)), np.empty(n), np.empty((n, DESK)), np.zeros(3)
-    mass, law_torque = np.empty(n * (n + 1) // 2), np.empty(n)  # mass: the lower triangle, row by row
-    for i in range(m):
-        seen = _watch(i, q[i], dq[i], given, bounds, memory)
-        stopping = memory.why[i] != RUNS
-        memory.damped[i] += stopping
-        memory.rests[i] = seen and (np.abs(dq[i]) < STILL).all()
-        if stopping:  # brake from the present speed, at once
-            memory.target[i] = 0.0
-            if seen and memory.damped[i] == 1:
-                memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, DQ_ALLOWED]).max())
-            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
-        elif memory.commanded[i]:
-            control_law(number, q[i], dq[i], memory.command[i], parameters, memory.law[i], law_torque)
-            if np.isfinite(law_torque).all():
-                memory.target[i] = np.minimum(np.maximum(law_torque, -bounds.torque), bounds.torque)
-            else:
-                memory.why[i] = LAW_NOT_FINITE
-                memory.target[i] = 0.0
-        at = slice(i, i + 1)
-        conditioned = memory.filtered[at], memory.effort[at], memory.cycle[at]
-        settings = bounds.factor, bounds.fade, limits[:, TAU_MAX], limits[:, STEP]
-        condition(memory.target[at], conditioned, settings, 1, effort)
-        last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
-        if seen:
-            equations(model.links, weightless, q[i], dq[i], inertia, bias, desk)
-            for j in range(n):
-                inertia[j, j] += model.rotors[j]
-                for k in range(j + 1):
-                    mass[j * (j + 1) // 2 + k] = inertia[j, k]
-            share, now = memory.share[i], effort[0, 0]
-            if given.adds and not stopping and np.isfinite(given.added[i]).all():
-                faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
-                for j in range(n):
-                    now[j] += faded * min(max(given.added[i, j], -bounds.added[j]), bounds.added[j])
-            arm = JointDynamics(q[i], dq[i], mass, bias)
-            changed = filter_torque(arm, now, last, share, model.friction, limits, work, out[i])
-            memory.limited[i] += changed
-        else:
-            for j in range(n):
-                out[i, j] = last[j] + min(max(-last[j], -limits[j, STEP]), limits[j, STEP])
-        memory.sent[i] = out[i]
-    return out
-
-
-drive_cycle = njit(cache=True)(_drive_cycle)
-
-
-@cache
-def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
-    """Return `drive_cycle` with these control laws; other than built-in ones are compiled in each process."""
-    if laws == BUILT_IN:
-        return drive_cycle
-    return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))
+        return f"joint {j + 1} is at {dq[j]:.3f} rad/s, {DQ_INSIDE * self._speed_share:g} of its limit"
 
 
 class Driver:
@@ -341,6 +212,11 @@ class Driver:
         return self._drivers.effort[0]
 
     @property
+    def held(self) -> np.ndarray:
+        """(n,) Nm, the compensation that is kept while the arm is brought to rest; zero after a contact."""
+        return self._drivers.held[0]
+
+    @property
     def limited(self) -> int:
         """Number of cycles of the motion in which the safety filter changed the command."""
         return int(self._drivers.limited[0])
@@ -350,12 +226,23 @@ class Driver:
         """Whether a motion that is being stopped is at rest, or DAMP_S is over."""
         return self.stopping is not None and bool(self._drivers.done[0])
 
-    def __call__(self, state: ArmState, command: np.ndarray | None, added: np.ndarray | None = None) -> np.ndarray:
+    def stop(self, reason: str) -> None:
+        """Bring the arm to rest, from the next cycle on; the first reason stays."""
+        self._drivers.stop(reason)
+
+    def __call__(
+        self,
+        state: ArmState,
+        command: np.ndarray | None,
+        added: np.ndarray | None = None,
+        hold: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the torque command (n,) Nm of this cycle.
 
         Args:
             state: of the arm. command: (c,) of the controller; None: no new one.
-            added: (n,) Nm of an adapter; None: no adapter.
+            added: (n,) Nm of an adapter; None: no adapter. hold: (n,) Nm, see `DriverBatch`.
         """
-        given, more = (None if x is None else x[None] for x in (command, added))
-        return self._drivers(state.q[None], state.dq[None], state.tau_J_d[None], given, more)[0]
+        given, more, kept = (None if x is None else x[None] for x in (command, added, hold))
+        contact = np.array([state.in_contact])
+        return self._drivers(state.q[None], state.dq[None], state.tau_J_d[None], given, more, kept, contact)[0]

@@ -7,14 +7,13 @@ The convention is libfranka's: commands exclude gravity, and the arm adds its ow
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from functools import cache
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.recordings.recording import Recording
-
-RATE_TOLERANCE = 1e-3  # Nm: accepts a command that was rate-limited in another floating-point precision
+from r2s.recordings.recording import SIGNALS, Recording
 
 
 class ArmStopped(RuntimeError):  # noqa: N818 (a stop is not a bug)
@@ -31,6 +30,10 @@ class NotCleared(ArmStopped):
     """The arm stopped before, and no operator allowed further motion; the run ends here."""
 
 
+class StopRequested(ArmStopped):
+    """A signal, or the end of the process that sends the commands, ended the motion; the run ends here."""
+
+
 @dataclass(frozen=True, slots=True)
 class ArmState:
     """One 1 kHz sample of n joints.
@@ -40,7 +43,14 @@ class ArmState:
         q, dq: (n,) rad, rad/s, as measured by the arm.
         tau_J: (n,) Nm, link-side torque sensor: includes gravity, excludes most motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
-
+        tau_ext_hat_filtered: (n,) Nm, what the joints exert beyond the arm's own model: tau_J minus gravity, declared
+            load and dynamics. As in the rest, None: this arm does not know it.
+        O_F_ext_hat_K: (6,) N, Nm, the same at the end effector in the base frame, positive on what the arm pushes.
+        joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,), (6,), above 0 where the external
+            torque or force exceeds the thresholds set.
+        control_command_success_rate: share of the last 100 commands that arrived; 0 while no motion runs.
+        O_T_EE: (16,) column by column, end effector's pose in the base frame.
+        m_ee, m_load: kg, end effector and load that the arm's gravity compensation assumes.
     """
 
     t: float
@@ -48,6 +58,42 @@ class ArmState:
     dq: np.ndarray
     tau_J: np.ndarray  # noqa: N815 (libfranka's name)
     tau_J_d: np.ndarray  # noqa: N815
+    tau_ext_hat_filtered: np.ndarray | None = None
+    O_F_ext_hat_K: np.ndarray | None = None
+    joint_contact: np.ndarray | None = None
+    cartesian_contact: np.ndarray | None = None
+    joint_collision: np.ndarray | None = None
+    cartesian_collision: np.ndarray | None = None
+    control_command_success_rate: float | None = None
+    O_T_EE: np.ndarray | None = None
+    m_ee: float | None = None
+    m_load: float | None = None
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the arm reports a contact or a collision; False if it does not know."""
+        flags = self.joint_contact, self.cartesian_contact, self.joint_collision, self.cartesian_collision
+        return any(flag is not None and flag.any() for flag in flags)
+
+    @property
+    def signals(self) -> np.ndarray:
+        """(sum of `signal_sizes`,), what the arm knows of `SIGNALS`; nan where it does not."""
+        sizes = signal_sizes(len(self.q)).items()
+        values = ((getattr(self, name), size) for name, size in sizes)
+        return np.concatenate([np.full(size, np.nan) if x is None else np.reshape(x, size) for x, size in values])
+
+
+@cache
+def signal_sizes(n: int) -> dict[str, int]:
+    """Return how many numbers each of `SIGNALS` has on an arm of n joints."""
+    return dict(zip(SIGNALS, (n, 6, n, 6, n, 6, 1, 16, 1, 1), strict=True))
+
+
+def named_signals(values: np.ndarray, n: int) -> dict[str, Any]:
+    """Return what the arm knows in values (..., k) of `ArmState.signals`, by name: (..., size), or (...) of one."""
+    sizes = signal_sizes(n)
+    parts = zip(sizes, np.split(values, np.cumsum([*sizes.values()])[:-1], axis=-1), strict=True)
+    return {name: x[..., 0] if x.shape[-1] == 1 else x for name, x in parts if not np.isnan(x).all()}
 
 
 class Arm(Protocol):
@@ -93,12 +139,28 @@ class Operated(Protocol):
     blocked: str | None
 
 
+@runtime_checkable
+class Holds(Protocol):
+    """An `Arm` whose `stop` damps the motion.
+
+    Attributes:
+        hold: (n,) Nm, compensation that the next `stop` keeps meanwhile, such as a payload's.
+    """
+
+    hold: np.ndarray
+
+
+def speed_share(arm: Arm) -> float:
+    """Return the share of all allowed speeds that the arm's operator has set, 1 if an arm has no such setting."""
+    return float(getattr(arm, "speed_share", 1.0))
+
+
 class Reflexes:
     """The checks with which a simulated arm stops itself; error messages name the joint."""
 
     def __init__(self, robot: Robot, dt: float = SIM_DT):
         self.robot = robot
-        self._step = robot.dtau_max * dt + RATE_TOLERANCE
+        self._step = robot.dtau_max * dt
 
     def accepts(self, tau: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
         """Return (...), whether an arm accepts tau (..., n) Nm after the command tau_J_d (..., n) Nm."""

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from r2s.arm.policy_runner import PolicyRunner, Stop, Timing
+from r2s.arm.policy_runner import PolicyRunner, Stop
+from r2s.arm.realtime import Timing
 from r2s.tasks.rollout import PolicyLike, rollout
 from r2s.tasks.task import Episodes, Task
 

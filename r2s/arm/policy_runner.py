@@ -7,7 +7,7 @@ for bit. r2s/arm/realtime_process.py runs an arm whose clock does not wait, in a
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, repeat
 
 import numpy as np
@@ -16,7 +16,10 @@ from scipy.signal import savgol_filter
 from r2s.adaptation.adapter import Adapter
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmState, ArmStopped, NotCleared, Operated
+from r2s.arm.interface import Arm, ArmState, ArmStopped, NotCleared, Operated, StopRequested, speed_share
+from r2s.arm.realtime import Timing
+from r2s.arm.stop_request import requested
+from r2s.physics.collision import CollisionCheck
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.task import State, Task
@@ -24,31 +27,6 @@ from r2s.tasks.task import State, Task
 LOGGED_S = 1.0  # before a stop, at 1 kHz
 SMOOTHING_CYCLES = 20  # on each side; an encoder's noise then leaves 2e-4 rad/s of speed
 ATTEMPTS = 3  # to bring an arm to its start, each with the operator's consent
-
-
-@dataclass
-class Timing:
-    """Measured durations, s. In lock-step only the durations of r2s's own computations are meaningful.
-
-    Attributes:
-        policy: time from a state to the policy's command, once per control step. driver: time to compute one command.
-        adapter: one update of the adapter, if there is one. period: from one command to the next.
-    """
-
-    policy: list[float] = field(default_factory=list)
-    driver: list[float] = field(default_factory=list)
-    adapter: list[float] = field(default_factory=list)
-    period: list[float] = field(default_factory=list)
-
-    def table(self) -> list[dict[str, float | str]]:
-        """Return one row per duration: count, median, 99 % quantile and maximum, ms."""
-        rows: list[dict[str, float | str]] = []
-        names = ["policy", "driver", *(["adapter"] if self.adapter else []), "period"]
-        for name in names:
-            x = 1e3 * np.array(getattr(self, name) or [np.nan])
-            row = {"median_ms": np.median(x), "p99_ms": np.percentile(x, 99), "max_ms": x.max()}
-            rows.append({"what": name, "count": len(x), **{k: float(v) for k, v in row.items()}})
-        return rows
 
 
 @dataclass(frozen=True)
@@ -70,12 +48,18 @@ class Stop:
 
 
 def episode_driver(
-    robot: Robot, task: Task, soft_start_s: float, friction: np.ndarray, rotors: np.ndarray | None = None
+    robot: Robot,
+    task: Task,
+    soft_start_s: float,
+    friction: np.ndarray,
+    rotors: np.ndarray | None = None,
+    speed_share: float = 1.0,
 ) -> Driver:
-    """Return the driver of an episode of `task`; friction (n,) Nm and rotors as in `DriverBatch`."""
+    """Return the driver of an episode of `task`; friction (n,) Nm, rotors and speed_share as in `DriverBatch`."""
     period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
     own = {"soft_start_s": soft_start_s, "rotors": rotors, "control": task.control(robot)}
-    return Driver(robot, task.torque_limit(robot), friction, **period, **own)
+    fence = CollisionCheck(robot, table=None, may_touch=task.may_touch)
+    return Driver(robot, task.torque_limit(robot), friction, **period, **own, fence=fence, speed_share=speed_share)
 
 
 class PolicyRunner:
@@ -85,7 +69,8 @@ class PolicyRunner:
         stops: why episodes ended early. timing: see `Timing`.
         done: number of episodes for which the arm moved, or tried to move, to the start.
         speeds: (1, T, n) rad/s after each control step of the last episode, smoothed over 1 kHz cycles.
-        halted: reason for which no further episode runs: the operator did not agree after a stop. None: not halted.
+        halted: reason for which no further episode runs: the operator did not agree after a stop, or a request to
+            stop. None: not halted.
 
     Args:
         arm: an arm that waits for its commands.
@@ -111,8 +96,8 @@ class PolicyRunner:
         self.robot, self._arm, self._substeps = arm.robot, arm, task.substeps
         self._kinematics = Kinematics(arm.robot)
         self._log: deque[tuple[ArmState, np.ndarray]] = deque(maxlen=round(LOGGED_S / SIM_DT))
-        self._adapts = adapter is not None
-        driver = episode_driver(arm.robot, task, soft_start_s, friction, rotors)
+        self._adapts, self._controller = adapter is not None, task.control(arm.robot)
+        driver = episode_driver(arm.robot, task, soft_start_s, friction, rotors, speed_share(arm))
         self._loop = CommandLoop(arm, driver, self._log, adapter)
         self.stops: list[Stop] = []
         self.timing = Timing()
@@ -128,7 +113,9 @@ class PolicyRunner:
         """
         self._log.clear()
         self._angles: list[np.ndarray] = []
-        self._episode, self._stopped, self._sent_at, self._limited = first, False, 0.0, 0
+        self._hold = np.zeros(self.robot.n)
+        self._episode, self._stopped, self._limited = first, False, 0
+        self.timing.begin()
         if self.halted is None:
             self._approach(starts[0])
         self._stopped = self._stopped or self.halted is not None
@@ -150,9 +137,10 @@ class PolicyRunner:
 
     def end(self) -> np.ndarray:
         """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
-        reason = self._loop.end()
+        reason = self._loop.end() or requested() or self.timing.refusal(self._arm)
         if not self._stopped and reason is not None:  # the episode ended before the driver brought the arm to rest
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
+        self.halted = self.halted or requested()
         speeds = smooth_speeds(self._angles, self._substeps)[: self.speeds.shape[1]]
         self.speeds[:] = 0.0  # a stopped arm is at rest
         self.speeds[0, : len(speeds)] = speeds
@@ -171,18 +159,16 @@ class PolicyRunner:
         return self._loop.state, driver.effort, self._stopped, driver.limited
 
     def _cycle(self, command: np.ndarray | None) -> None:
+        if command is not None:
+            self._hold = self._controller.holding_torque(self._loop.state.q)
         try:
-            self._loop(command)
+            self._loop(command, self._hold)
         except ArmStopped as reason:
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
+            if isinstance(reason, StopRequested):
+                self.halted = str(reason)
         self._angles.append(self._loop.state.q)
-        began, driven, adapted = self._loop.clock
-        self.timing.driver.append(driven - began)
-        if self._adapts:
-            self.timing.adapter.append(adapted - driven)
-        if self._sent_at:
-            self.timing.period.append(driven - self._sent_at)
-        self._sent_at = driven
+        self.timing.cycle(self._loop.clock, self._loop.state, self._adapts)
 
     def _approach(self, start: np.ndarray) -> None:
         operated = isinstance(self._arm, Operated)
@@ -190,8 +176,10 @@ class PolicyRunner:
             try:
                 self._loop.place(start)
                 return
-            except NotCleared as reason:
+            except (NotCleared, StopRequested) as reason:
                 self.halted = str(reason)
+                if isinstance(reason, StopRequested):
+                    self._record_stop("on the way to its start", reason)
                 return
             except ArmStopped as reason:
                 if left:

@@ -11,11 +11,13 @@ import numpy as np
 
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmState
+from r2s.arm.interface import Arm, ArmState, speed_share
+from r2s.arm.realtime import Timing
 from r2s.errors import UserError
-from r2s.excitation.motion_checks import TABLE_M, TOOL_M, Space
+from r2s.excitation.motion_checks import DEVIATION, TABLE_M, TOOL_M, Space
 from r2s.excitation.paths import approach
 from r2s.identification.friction.breakaway import MOVED
+from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot, per_joint
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
@@ -25,7 +27,7 @@ SLOW_TAU_MAX = 40.0  # Nm: joints of at least this tau_max have a large inertia,
 SLOW_RATE, FAST_RATE = 2.2, 4.0  # Nm/s; light links reach visible motion within ms at 4 Nm/s
 MAX_SHARE = 0.2  # of tau_max, default torque at which a ramp gives up
 AFTER_MOTION = 5  # cycles recorded after the joint has moved
-STRAY = 0.05  # rad: a joint that moves so far ends the ramp; an arm so far from its pose is placed anew
+STRAY = DEVIATION  # rad: a joint that moves so far ends the ramp; an arm so far from its pose is placed anew
 POSE_MARGIN = 0.15  # rad inside the position limits, which no joint crosses in one ramp
 UNFILTERED_HZ = 1e30  # cutoff of the driver's low-pass: a ramp has no steps, and resting joints need a command of 0
 # The stop after a ramp: each joint brakes with three equal real poles, then its torque is released
@@ -64,6 +66,7 @@ def ramp(
     table: float = TABLE_M,
     z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
+    timing: Timing | None = None,
 ) -> Ramps:
     """Ramp every joint both ways at every pose and return one trajectory per ramp.
 
@@ -82,10 +85,12 @@ def ramp(
         largest: (n,) or one number, Nm, at which a ramp gives up; default 20 % of tau_max.
         moved: rad, well beyond the presliding displacement.
         table, z_min: m, see `r2s.excitation.motion_checks.check_motion`.
-        progress: called after every ramp with (ramps done, total).
+        progress: called after every ramp with (ramps done, total), in a cycle: it must return at once.
+        timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended the motion; no recording is returned.
+        ArmStopped: the arm or the driver ended the motion, or in real time the arm missed more than 1 % of the
+            commands; no recording is returned.
         UserError: an argument is out of range, or a pose has no path.
     """
     robot = arm.robot
@@ -102,7 +107,9 @@ def ramp(
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
     # the ramp of a sliding joint starts at the command that holds it; friction is unknown, this bounds it
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
-    drive, recorded = _Drive(CommandLoop(arm, Driver(robot, most, 2 * most, cutoff_hz=UNFILTERED_HZ))), []
+    timing = timing or Timing()
+    how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot, table=table), "speed_share": speed_share(arm)}
+    drive, recorded = _Drive(CommandLoop(arm, Driver(robot, most, 2 * most, **how)), timing), []
     try:
         for place in places:
             drive.place(place)
@@ -115,6 +122,7 @@ def ramp(
                 if progress is not None:
                     progress(len(recorded), len(which))
             drive.end()
+        timing.check(arm)
     finally:
         drive.end()
     pose, joint, sign = np.array(which).T
@@ -135,9 +143,10 @@ class _Drive:
         base: (n,) Nm, the command at rest. held: (n,) Nm, mean command that held the arm in the last stop.
     """
 
-    def __init__(self, loop: CommandLoop):
+    def __init__(self, loop: CommandLoop, timing: Timing):
         robot = loop.arm.robot
-        self._loop, self._tau_max = loop, robot.tau_max
+        self._loop, self._timing, self._tau_max = loop, timing, robot.tau_max
+        timing.begin()
         self.rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
         self._model = robot.model(gravity=False)
         self._mass = np.zeros((robot.n, robot.n))
@@ -165,7 +174,8 @@ class _Drive:
     def send(self, tau: np.ndarray) -> ArmState:
         """Run one cycle with the target tau (n,) Nm and return the state after it; `rows` gets the command sent."""
         s = self.state
-        after = self._loop(tau)
+        after = self._loop(tau, self.base)
+        self._timing.cycle(self._loop.clock, after)
         self.rows.append((s.t, s.q, s.dq, self._loop.sent))
         return after
 

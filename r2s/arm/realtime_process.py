@@ -3,22 +3,32 @@
 The arm's process continues whatever happens to the policy's process: without a new command for the driver's deadline
 it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock blocks
 every thread (benchmarks/watchdog.py). The processes share memory without a lock, which a killed process would keep.
+
+The arm's process has a session of its own, so that no signal of the terminal reaches it. Every motion, the approach
+too, ends damped if the policy's process receives a signal or ends, or if this process receives a signal
+(r2s/arm/stop_request.py).
 """
 
-import gc
 import multiprocessing
+import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated
-from r2s.arm.policy_runner import PolicyRunner, Stop, Timing, as_state
+from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated, named_signals, signal_sizes
+from r2s.arm.policy_runner import PolicyRunner, Stop, as_state
+from r2s.arm.realtime import Timing, realtime_section
+from r2s.arm.stop_request import handled_signals, parent_ended, requested, serve, watched
+from r2s.arm.warm_up import warm_up
+from r2s.errors import Stopped
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
 from r2s.tasks.task import State, Task
@@ -59,17 +69,25 @@ class Channel(NamedTuple):
     Attributes:
         command: (c,) of the controller, from the policy. state: from the arm, see `_publish`.
         end: above 0 when the policy's process has ended the episode.
+        signal: number of a signal that the policy's process received.
     """
 
     command: Slot
     state: Slot
     end: Slot
+    signal: Slot
 
     @property
     def ended(self) -> bool:
         """Whether the policy's process has ended the episode."""
         end = self.end.read()
         return end is not None and end[1][0] > 0
+
+    def signalled(self) -> str | None:
+        """Return the name of the signal that the policy's process received, or None."""
+        latest = self.signal.read()
+        number = 0 if latest is None else int(latest[1][0])
+        return signal.Signals(number).name if number else None
 
 
 class RealtimeRunner:
@@ -98,33 +116,39 @@ class RealtimeRunner:
         self.done = 0
         self.speeds = np.zeros((1, task.steps, robot.n))
         self.halted: str | None = None
-        self._kinematics = Kinematics(robot)
+        self._kinematics, self._section = Kinematics(robot), ExitStack()
         self._operator: Callable[[str], bool] | None = None
-        self._channel = Channel(Slot(task.control(robot).command_size), Slot(5 * robot.n + 4), Slot(1))
-        self._arguments = open_arm, task, {"friction": friction, **settings}, self._channel
+        sizes = task.control(robot).command_size, 4 + 5 * robot.n + sum(signal_sizes(robot.n).values()), 1, 1
+        self._channel = Channel(*map(Slot, sizes))
+        self._arguments = open_arm, robot, task, {"friction": friction, **settings}, self._channel
 
     def __enter__(self) -> "RealtimeRunner":
         context = multiprocessing.get_context("spawn")  # fork would copy locks that other threads hold
         self._line, remote = context.Pipe()
         # not a daemon: that would be killed while its arm moves, and could not start an emulator
-        self._process = context.Process(target=_serve, args=(remote, *self._arguments), name="arm")
+        self._process = context.Process(target=_serve, args=(remote, os.getpid(), *self._arguments), name="arm")
+        self._signals = ExitStack()
+        self._signals.enter_context(handled_signals(lambda number: self._channel.signal.write(np.array([number]))))
         self._process.start()
         remote.close()
         try:
             self.robot, self._operator = self._receive("ready", START_S)
         except BaseException:
-            self.__exit__()
+            self.__exit__(*sys.exc_info())
             raise
         self._kinematics = Kinematics(self.robot)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *error: Any) -> None:
         self._channel.end.write(np.ones(1))
+        self._section.close()
         self._line.close()  # the process ends at the end of file
-        self._process.join(2 * EXIT_S)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join()
+        for end in (lambda: None, self._process.terminate, self._process.kill):
+            end()
+            self._process.join(2 * EXIT_S)
+            if not self._process.is_alive():
+                break
+        self._signals.__exit__(*error)  # type: ignore[arg-type]
 
     @property
     def cycle(self) -> int:
@@ -136,7 +160,9 @@ class RealtimeRunner:
         self._channel.end.write(np.zeros(1))
         self._line.send(("place", starts, first))
         self.done, self.halted = self._receive("placed")
+        self._note_halt()
         self._due, self._last = 0, (0, 0)
+        self._section.enter_context(realtime_section(priority=None))  # a collection would make the policy late
         return self._observe()
 
     def step(self, command: np.ndarray) -> State:
@@ -161,9 +187,15 @@ class RealtimeRunner:
     def end(self) -> np.ndarray:
         """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
         self._channel.end.write(np.ones(1))
-        self.stops, stopped, timing, self.speeds = self._receive("ended")
-        self.timing.driver, self.timing.adapter, self.timing.period = timing.driver, timing.adapter, timing.period
+        self._section.close()
+        self.stops, stopped, timing, self.speeds, self.halted = self._receive("ended")
+        self._note_halt()
+        self.timing = replace(timing, policy=self.timing.policy)
         return np.array([stopped])
+
+    def _note_halt(self) -> None:
+        if self.halted is not None and requested() is not None:
+            serve()
 
     def _latest(self) -> tuple[int, ArmState, np.ndarray, bool, int]:
         """Return cycle, state, filtered target (n,) Nm, stopped, and cycles changed by the safety filter."""
@@ -171,8 +203,10 @@ class RealtimeRunner:
             if not self._process.is_alive():
                 raise ArmStopped("the process that drove the arm has ended")
         t, cycle, stopped, limited = latest[1][:4]
-        q, dq, tau_J, tau_J_d, effort = latest[1][4:].reshape(5, self._n)
-        return int(cycle), ArmState(t, q, dq, tau_J, tau_J_d), effort, bool(stopped), int(limited)
+        moving, signals = np.split(latest[1][4:], [5 * self._n])
+        q, dq, tau_J, tau_J_d, effort = moving.reshape(5, self._n)
+        state = ArmState(t, q, dq, tau_J, tau_J_d, **named_signals(signals, self._n))
+        return int(cycle), state, effort, bool(stopped), int(limited)
 
     def _observe(self) -> State:
         cycle, s, effort, stopped, limited = self._latest()
@@ -198,17 +232,27 @@ class RealtimeRunner:
 
 
 def _serve(
-    line: Connection, open_arm: Callable[[], Any], task: Task, settings: dict[str, Any], channel: Channel
+    line: Connection,
+    parent: int,
+    open_arm: Callable[[], Any],
+    robot: Robot,
+    task: Task,
+    settings: dict[str, Any],
+    channel: Channel,
 ) -> None:
-    """Open the arm, run the requested episodes, and end when the other process closes the line."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the other process, which stops the arm first
+    """Open the arm, run the requested episodes, and end when the process `parent` closes the line."""
+    os.setsid()  # signals of the terminal go to the other process
 
     def forward(reason: str) -> bool:
         line.send(("operator", reason))
         return line.recv()
 
     try:
+        warm_up(robot, task, settings.get("adapter"))
         with ExitStack() as stack:
+            stack.enter_context(handled_signals())
+            stack.enter_context(watched(parent_ended(parent)))
+            stack.enter_context(watched(channel.signalled))
             opened = open_arm()
             arm: Arm = stack.enter_context(opened) if hasattr(opened, "__enter__") else opened
             stack.callback(arm.stop)
@@ -222,6 +266,8 @@ def _serve(
                 _run_episode(runner, starts, first, line, channel)
     except (EOFError, ConnectionError):
         return  # the other process has ended
+    except Stopped as error:
+        line.send(("failed", ArmStopped(f"the process that drives the arm received {error}")))
     except Exception as error:
         line.send(("failed", error))
 
@@ -231,18 +277,16 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
     runner.place(starts, first)
     _publish(runner, channel)
     line.send(("placed", (runner.done, runner.halted)))
-    gc.collect()
-    gc.disable()  # a collection could delay a cycle
-    try:
-        if runner.halted is None:
-            runner.run(commands)
-            _publish(runner, channel)
-        while not channel.ended and _policy_is_alive():
-            time.sleep(POLL_S)
-    finally:
-        gc.enable()
-        stopped = bool(runner.end()[0])
-    line.send(("ended", (runner.stops, stopped, runner.timing, runner.speeds)))
+    with realtime_section(priority=None):  # an arm sets its own priority
+        try:
+            if runner.halted is None:
+                runner.run(commands)
+                _publish(runner, channel)
+            while not channel.ended and requested() is None:
+                time.sleep(POLL_S)
+        finally:
+            stopped = bool(runner.end()[0])
+    line.send(("ended", (runner.stops, stopped, runner.timing, runner.speeds, runner.halted)))
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:
@@ -258,7 +302,7 @@ def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Itera
             yield latest[1]
         elif runner.cycles:
             yield None
-        elif _policy_is_alive():
+        elif requested() is None:
             time.sleep(POLL_S)
             continue
         else:
@@ -266,12 +310,7 @@ def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Itera
         _publish(runner, channel)
 
 
-def _policy_is_alive() -> bool:
-    parent = multiprocessing.parent_process()
-    return parent is not None and parent.is_alive()
-
-
 def _publish(runner: PolicyRunner, channel: Channel) -> None:
     s, effort, stopped, limited = runner.read()
     head = [s.t, runner.cycles, stopped, limited]
-    channel.state.write(np.concatenate([head, s.q, s.dq, s.tau_J, s.tau_J_d, effort]))
+    channel.state.write(np.concatenate([head, s.q, s.dq, s.tau_J, s.tau_J_d, effort, s.signals]))

@@ -5,7 +5,7 @@ import numpy as np
 from r2s.arm.interface import ArmState, Reflexes
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import Payload, dynamics_with_payload
+from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass_and_moment
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.simulator import Simulator
 
@@ -15,6 +15,7 @@ class SimulatedArm:
 
     Attributes:
         external: (n,) Nm, external joint torque from the next cycle on; zero by default.
+        declared_payload: see below.
 
     Args:
         robot, dynamics: the arm and its true dynamics.
@@ -38,6 +39,7 @@ class SimulatedArm:
         without = dynamics_with_payload(robot, dynamics, None, declared_payload)
         self._dynamics = {False: without, True: dynamics_with_payload(robot, dynamics, payload, declared_payload)}
         self._payload, self._carries = payload, False
+        self.declared_payload, self._load_torque = declared_payload, LoadTorque(robot)
         self._sim = Simulator(robot, without, 1, 1)
         self._motors = Motors(1, robot.n, dynamics.delay, dynamics.lag)
         self._noise = position_noise, velocity_noise
@@ -88,5 +90,12 @@ class SimulatedArm:
         q = self._sim.q[0] + self._noise[0] * self._rng.normal(size=n)
         dq = self._sim.dq[0] + self._noise[1] * self._rng.normal(size=n)
         # the simulation excludes gravity, so this tau_J only equals the command: do not record it as 'measured'
-        self._state = ArmState(t=self._cycle * SIM_DT, q=q, dq=dq, tau_J=self._last.copy(), tau_J_d=self._last.copy())
+        carried, declared = (
+            mass_and_moment(self.robot, x) for x in (self._payload if self._carries else None, self.declared_payload)
+        )
+        self._state = ArmState(
+            self._cycle * SIM_DT, q, dq, self._last.copy(), self._last.copy(),
+            tau_ext_hat_filtered=self._load_torque(self._sim.q[0], carried - declared) - self.external,
+            m_ee=0.0, m_load=float(declared[0]),
+        )  # fmt: skip
         return self._state

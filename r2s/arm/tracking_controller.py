@@ -37,11 +37,11 @@ class TrackingController:
 
     Args:
         robot: the nominal model. excitation: the plan.
-        max_deviation: rad, largest allowed deviation of a joint from the plan.
+        max_deviation: (T,) or one number, rad, largest allowed deviation of a joint from the plan.
     """
 
-    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: float = MAX_DEVIATION):
-        self._plan, self._max_deviation = excitation, max_deviation
+    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: np.ndarray | float = MAX_DEVIATION):
+        self._plan, self._max_deviation = excitation, np.broadcast_to(max_deviation, len(excitation.t))
         self._feedforward, self._mass = _inverse_dynamics(robot, excitation)
         dq = excitation.dq
         basis = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
@@ -64,15 +64,20 @@ class TrackingController:
         added = pd + (self._theta * self._regressor[k]).sum(0)
         return self._feedforward[k] + np.minimum(np.maximum(added, -self._correction), self._correction)
 
+    @property
+    def offset(self) -> np.ndarray:
+        """(n,) Nm, the estimated offset, which a payload that gravity compensation does not know needs at rest."""
+        return self._theta[0]
+
     def deviation(self, k: int, state: ArmState) -> str | None:
         """Return the message for a joint that deviates too far from the plan in cycle k, or None."""
         deviation = np.abs(self._plan.q[k] - state.q)
-        if (deviation <= self._max_deviation).all():
+        if (deviation <= self._max_deviation[k]).all():
             return None
         i = int(deviation.argmax())
         return (
-            f"joint {i + 1} is {deviation[i]:.3f} rad off its path, allowed {self._max_deviation:g} rad: an obstacle "
-            "blocks it, or it cannot follow"
+            f"joint {i + 1} is {deviation[i]:.3f} rad off its path, allowed {self._max_deviation[k]:.3g} rad: an "
+            "obstacle blocks it, or it cannot follow"
         )
 
 
@@ -83,8 +88,8 @@ class LoadedTrackingController(TrackingController):
     larger deviation and a larger correction.
     """
 
-    def __init__(self, robot: Robot, excitation: Excitation):
-        super().__init__(robot, excitation, LOADED_DEVIATION)
+    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: np.ndarray | float = LOADED_DEVIATION):
+        super().__init__(robot, excitation, max_deviation)
         half = np.array(0.5 * MOST_KG)
         payload = Payload(half, np.zeros(3), sphere_inertia(half))
         links = with_payload(robot, payload, (robot.mass, robot.com, robot.inertia))

@@ -47,6 +47,11 @@ class ComputedTorque(Controller):
         """Whether the policy observes the torque to which its action is added."""
         return True
 
+    def holding_torque(self, q: np.ndarray) -> np.ndarray:
+        """Return the model's torque (n,) Nm at rest at q (n,) rad."""
+        still = np.zeros((1, len(q)))
+        return self.model(q[None], still, still, still)[0]
+
     def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m, s): feedforward Nm, q_d rad, dq_d rad/s, and M kg m^2 row by row."""
         q_d, dq_d, _ = task.trajectory(t, goals, 0.0)

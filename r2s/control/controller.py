@@ -76,6 +76,13 @@ class Controller:
         """Return the setpoints (m, s) at t (m,) s of episodes with these goals."""
         return np.empty((len(t), 0))
 
+    def holding_torque(self, q: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) Nm that the law's model needs at rest at q (n,) rad, such as for a payload.
+
+        The driver keeps it while it brings the arm to rest.
+        """
+        return np.zeros(len(q))
+
     def command(self, action: np.ndarray, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the commands (m, c) of the control period that begins at t (m,) s.
 

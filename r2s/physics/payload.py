@@ -7,9 +7,11 @@ not represent it, because that force would depend on the resulting acceleration.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from r2s.errors import UserError, check_number, choices, nearest
@@ -178,3 +180,28 @@ def mass_and_moment(robot: Robot, payload: Payload | None) -> np.ndarray:
     place, axes = ee_pose(robot)
     mass = np.asarray(payload.mass)[..., None]
     return np.concatenate([mass, mass * (place + payload.centre @ axes.T)], -1)
+
+
+class LoadTorque:
+    """Joint torque that holds the weight of a body fixed to an arm's last link."""
+
+    def __init__(self, robot: Robot):
+        self._robot = robot
+
+    @cached_property
+    def _data(self) -> mujoco.MjData:
+        return mujoco.MjData(self._robot.model(gravity=False))
+
+    def __call__(self, q: np.ndarray, load: np.ndarray, gravity: np.ndarray | None = None) -> np.ndarray:
+        """Return (n,) Nm at q (n,) rad.
+
+        Args:
+            load: (4,) kg, kg m, of `mass_and_moment`. gravity: (3,) m/s^2 in the base frame; None: the robot's.
+        """
+        if not load.any():
+            return np.zeros(len(q))
+        d, last = self._data, self._data.model.jnt_bodyid[-1]
+        d.qpos[:] = q
+        mujoco.mj_kinematics(d.model, d)
+        moment = load[0] * (d.xpos[last] - d.xanchor) + d.xmat[last].reshape(3, 3) @ load[1:]
+        return -(d.xaxis * np.cross(moment, self._robot.gravity if gravity is None else gravity)).sum(1)

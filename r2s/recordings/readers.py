@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import DAMAGED
-from r2s.recordings.recording import MIN_ROWS, Recording, declared_torque
+from r2s.recordings.recording import MIN_ROWS, SIGNALS, Recording, declared_torque
 from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra
 
 HDF5 = (".h5", ".hdf5")
@@ -121,9 +121,11 @@ def from_table(table: Table, how: Options) -> Recording:
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
-    saved = set(table) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
+    saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
+    signals = {k: v for k, v in table.items() if k in SIGNALS} if saved else {}
     period = notes.get("period") if saved and how.period is None else how.period
-    recording = Recording(**arrays, torque=torque, period=period, name=notes["name"] if saved else how.name)
+    name = notes["name"] if saved else how.name
+    recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)
     if how.max_gap_s is not None and not saved:
         recording = recording.split_at_gaps(how.max_gap_s)
     return replace(recording, dq=recording.derivative(recording.q)) if derive_dq else recording

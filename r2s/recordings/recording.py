@@ -17,6 +17,10 @@ TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
 SPLIT_GUARD_S = 0.1  # s, rows so close to a held-out row are almost copies of it and belong to neither side
 FIELDS = ("t", "q", "dq", "tau", "trajectory")
+SIGNALS = (  # what an arm may know beside its motion, by libfranka's names; `ArmState` in r2s/arm/interface.py
+    "tau_ext_hat_filtered", "O_F_ext_hat_K", "joint_contact", "cartesian_contact", "joint_collision",
+    "cartesian_collision", "control_command_success_rate", "O_T_EE", "m_ee", "m_load",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,7 @@ class Recording:
         q, dq, tau: (T, n) rad, rad/s, Nm.
         torque: "measured" by a link-side sensor, contains gravity; "commanded", without gravity; or "motor", the
             motor torque times the gear ratio, which contains gravity, all friction and rotor inertia.
+        signals: {name of `SIGNALS`: (T,) or (T, k)}, what the arm knew in each row; None: nothing.
         trajectory: (T,) index of the continuous stretch of each row; None: all rows are one stretch.
         period: s, the excitation repeats itself in `t` with this period (see `split`); None: it does not.
     """
@@ -42,6 +47,7 @@ class Recording:
     trajectory: np.ndarray = None  # type: ignore[assignment]
     period: float | None = None
     name: str = ""
+    signals: Mapping[str, np.ndarray] = None  # type: ignore[assignment]
 
     def __post_init__(self):
         for field in FIELDS[:4]:
@@ -55,8 +61,18 @@ class Recording:
         for field in FIELDS:
             _check_finite(field, getattr(self, field))
         self._check_trajectories()
-        for field in FIELDS:
-            getattr(self, field).flags.writeable = False
+        object.__setattr__(self, "signals", {k: self._signal(k, v) for k, v in (self.signals or {}).items()})
+        for x in (*(getattr(self, field) for field in FIELDS), *self.signals.values()):
+            x.flags.writeable = False
+
+    def _signal(self, name: str, value: np.ndarray) -> np.ndarray:
+        x = _floats(name, value)
+        if name not in SIGNALS or len(x) != len(self.t):
+            raise UserError(
+                f"signals: expected {len(self.t)} rows of {choices(SIGNALS)}; got '{name}', {len(x)} rows"
+            )
+        _check_finite(name, x)
+        return x
 
     def _check_shapes(self):
         t, q = self.t, self.q
@@ -144,24 +160,28 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
-        No anti-aliasing: for a lower rate, resample at the logged rate, `smooth`, then resample again.
+        No anti-aliasing: for a lower rate, resample at the logged rate, `smooth`, then resample again. Signals keep
+        their last logged value, because flags and poses cannot be interpolated.
         Trajectories shorter than `dt` are dropped.
         """
         _positive("dt", dt, "s")
         columns: dict[str, list[np.ndarray]] = {field: [] for field in FIELDS}
+        rows = []
         for s in self.stretches:
             t = self.t[s]
             grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + 1e-6) + 1)
             if len(grid) < 2:
                 continue
             columns["t"].append(grid)
+            rows.append(s.start + np.searchsorted(t, grid + 1e-9 * dt, side="right") - 1)
             columns["trajectory"].append(np.full(len(grid), self.trajectory[s.start]))
             for field in ("q", "dq", "tau"):
                 x = getattr(self, field)[s]
                 columns[field].append(np.stack([np.interp(grid, t, column) for column in x.T], axis=1))
         if not columns["t"]:
             raise UserError(f"no trajectory is as long as dt={dt:g} s; the recording lasts {self.duration:g} s")
-        return replace(self, **{field: np.concatenate(parts) for field, parts in columns.items()})  # type: ignore[arg-type]
+        signals = {name: x[np.concatenate(rows)] for name, x in self.signals.items()}
+        return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
 
     def smooth(self, cutoff_hz: float) -> "Recording":
         """Low-pass q, dq and tau with a zero-phase filter: a Butterworth of order 4, run forwards and backwards.
@@ -279,14 +299,16 @@ class Recording:
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the file, by name."""
         period = {} if self.period is None else {"period": np.asarray(self.period)}
-        return {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")} | period
+        own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
+        return {**own, **period, **self.signals}
 
     def _rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
             rows, trajectory = rows[together], np.unique(trajectory[together], return_inverse=True)[1]
         arrays = {field: getattr(self, field)[rows] for field in FIELDS[:4]}
-        return replace(self, trajectory=trajectory, **arrays)
+        signals = {name: x[rows] for name, x in self.signals.items()}
+        return replace(self, trajectory=trajectory, signals=signals, **arrays)
 
     def _without_lone_rows(self) -> "Recording":
         dense = np.unique(self.trajectory, return_inverse=True)[1]

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from r2s.arm.policy_runner import Stop, Timing
+from r2s.arm.policy_runner import Stop
+from r2s.arm.realtime import Timing
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.episodes import error_figure, latency_figure, traces_figure
@@ -67,7 +68,8 @@ def transfer(
         ]
     }
     if timing:
-        pictures["latency"] = latency_figure(run.figure("latency"), asdict(timing))
+        seconds = {name: values for name, values in asdict(timing).items() if name != "success"}
+        pictures["latency"] = latency_figure(run.figure("latency"), seconds)
         sections["Latencies on this computer, ms"] = [
             pd.DataFrame(timing.table())
             .set_index("what")

@@ -10,14 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.stages.parts import called, check_types, part, plain, target
+from r2s.stages.run_config import CONF, modules
 
-PACKAGE = Path(__file__).parent.parent
-CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
 DRIVE_KEYS = ("soft_start_s", "live")  # of conf/arm; the policy runner reads them, not the arm
 STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate")
-COMMON = ("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker")
+COMMON = (
+    *("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker"),
+    "trust",
+)
 GROUP = "R2S_GROUP"  # environment variable: name that the jobs of a sweep share in trackers
 
 
@@ -54,7 +56,8 @@ def make_dynamics(cfg, robot):
     from r2s.identification.parameter_file import load_parameters
 
     if cfg.calibration:
-        space, x = load_parameters(cfg.calibration, robot)
+        typed = str(cfg.friction.get("family") or "").split(".")[0]
+        space, x = load_parameters(cfg.calibration, robot, (*modules(cfg.get("trust")), typed))
         return space.dynamics(x)
     return dynamics_of(robot, plain(cfg.friction), plain(cfg.inertia))
 
@@ -97,27 +100,42 @@ def _arm_target(cfg) -> Callable[..., Any]:
 
 
 @contextmanager
-def opened_arm(cfg, robot, noise=0):
+def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     """Yield the arm of conf/arm; close it afterwards if it is a context manager.
 
-    noise: number of the sensor-noise stream of a twin.
+    A signal ends the motion of an arm with an operator.
+
+    Args:
+        noise: number of the sensor-noise stream of a twin. task, adapter: of the motions to come, if not recordings.
+        more: further arguments of the arm.
     """
     from r2s.arm.interface import ArmStopped
+    from r2s.arm.stop_request import handled_signals
+    from r2s.arm.warm_up import warm_up
 
+    if not is_twin(cfg):  # the clock of a twin waits
+        warm_up(robot, task, adapter)
     stream = {"noise": noise} if "noise" in inspect.signature(_arm_target(cfg)).parameters else {}
     with ExitStack() as stack:
+        if not is_twin(cfg):
+            stack.enter_context(handled_signals())
         try:
-            arm = part({**plain(cfg.arm), **stream}, "arm", robot, beside=DRIVE_KEYS)
+            arm = part({**plain(cfg.arm), **stream, **more}, "arm", robot, beside=DRIVE_KEYS)
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         yield arm
 
 
-def is_twin(cfg):
-    """Return whether conf/arm is simulated from a seed, so that copies of it can run in parallel."""
+def is_simulated(cfg):
+    """Return whether conf/arm is made from a seed: a twin, or an emulated arm with a twin behind it."""
     made = {"_target_", "seed"} <= cfg.arm.keys()
     return made and "noise" in inspect.signature(target(cfg.arm, "arm")).parameters
+
+
+def is_twin(cfg):
+    """Return whether conf/arm is a twin in this process, without operator: copies of it can run in parallel."""
+    return is_simulated(cfg) and "operator" not in cfg.arm
 
 
 @contextmanager
@@ -133,7 +151,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
 
     how = {"soft_start_s": cfg.arm.get("soft_start_s", 0.0), "rotors": dynamics.armature, "adapter": adapter}
     if not cfg.arm.get("live", False):
-        with opened_arm(cfg, robot, noise) as arm:
+        with opened_arm(cfg, robot, noise, task, adapter) as arm:
             try:
                 yield PolicyRunner(arm, task, dynamics.level, **how)
             finally:
@@ -146,7 +164,10 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
             arms = stack.enter_context(RealtimeRunner(make, robot, task, dynamics.level, **how))
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
-        yield arms
+        try:
+            yield arms
+        except ArmStopped as stop:  # the process of the arm has ended
+            raise Stopped(f"arm={cfg.arm.name}: {stop}") from None
 
 
 @contextmanager
@@ -166,9 +187,16 @@ def opened_source(cfg, robot, noise):
     yield SimulatedArm(robot, dynamics, **sensors, seed=cfg.data.excitation_seed + noise)
 
 
+def within_speed_share(cfg, robot):
+    """Return the robot for which to plan the motion to record: its speed limits times arm.speed_share."""
+    share = cfg.arm.get("speed_share", 1.0) if cfg.data.kind == "arm" else 1.0
+    check_number("arm.speed_share", share, "(0, 1]")
+    return replace(robot, dq_max=share * robot.dq_max)
+
+
 def check_source(cfg, robot):
     """Raise UserError if a simulated arm to record cannot be made; does not touch a real one."""
-    if cfg.data.kind == "simulated" or is_twin(cfg):
+    if cfg.data.kind == "simulated" or is_simulated(cfg):
         with opened_source(cfg, robot, 0):
             pass
 
@@ -182,7 +210,7 @@ def make_truth(cfg, robot):
     from omegaconf import OmegaConf
 
     both = [CONF / group / f"{cfg.data.truth}.yaml" for group in ("friction", "inertia")]
-    if not all(path.is_file() for path in both):
+    if "/" in str(cfg.data.truth) or not all(path.is_file() for path in both):
         known = sorted({p.stem for p in both[0].parent.glob("*")} & {p.stem for p in both[1].parent.glob("*")})
         raise UserError(
             f"data.truth: no '{cfg.data.truth}' in friction and inertia; allowed: "
@@ -233,22 +261,6 @@ def open_run(cfg, overrides, inputs=(), parents=()):
         tracked.keep("group", tracked.group)
     run.tracker = Trackers(trackers, tracked)
     return run
-
-
-def loaded(path):
-    """Return a YAML file of a run folder as a config.
-
-    Raises:
-        UserError: the file cannot be read or is no YAML.
-    """
-    import yaml
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        return OmegaConf.load(path)
-    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise UserError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
 
 
 def console():

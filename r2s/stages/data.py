@@ -1,12 +1,13 @@
 """Training motion, validation motion and breakaway ramps of stage=identify, from files or recorded on an arm."""
 
 import os
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
-from r2s.stages.build import opened_source
+from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
 MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as the path to a start
@@ -184,39 +185,48 @@ def ramp_poses(cfg, robot):
     return poses
 
 
-def record_motion(cfg, robot, motion, k, label):
-    """Return the k-th motion of an arm, given or optimized for data.seconds, and its recording."""
+def record_motion(cfg, robot, motion, k, label, timing):
+    """Return the k-th motion of an arm, given or optimized for data.seconds, and its recording.
+
+    timing: receives the durations of its cycles.
+    """
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
     from r2s.progress import Progress
 
-    progress = Progress(label)
+    progress = Progress(label, in_cycle=True)
     if motion is None:
         seed, gravity = cfg.data.excitation_seed + k, cfg.data.torque == "measured"
-        motion = fourier(robot, duration=cfg.data.seconds, seed=seed, gravity=gravity)
+        motion = fourier(within_speed_share(cfg, robot), duration=cfg.data.seconds, seed=seed, gravity=gravity)
     with opened_source(cfg, robot, k) as arm:  # one client at a time
-        out = record(arm, motion, torque=cfg.data.torque, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
+        how = {"torque": cfg.data.torque, "timing": timing}
+        out = record(arm, motion, **how, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     progress.close(f"{out.duration:.1f} s of motion")
     return motion, out
 
 
-def record_ramps(cfg, robot):
-    """Return the ramps of the breakaway protocol about the home posture, or None for data.ramp_poses=0."""
+def record_ramps(cfg, robot, timing):
+    """Return the ramps of the breakaway protocol about the home posture, or None for data.ramp_poses=0.
+
+    timing: receives the durations of its cycles.
+    """
     from r2s.arm.ramp import ramp
     from r2s.progress import Progress
 
     poses = ramp_poses(cfg, robot)
     if not len(poses):
         return None
-    progress = Progress("ramp the joints until they move")
+    progress = Progress("ramp the joints until they move", in_cycle=True)
     with opened_source(cfg, robot, 2) as arm:
-        out = ramp(arm, poses, progress=lambda k, n: progress(k / n, f"{k} ramps"))
+        out = ramp(arm, poses, timing=timing, progress=lambda k, n: progress(k / n, f"{k} ramps"))
     progress.close(f"{out.recording.duration:.1f} s of ramps")
     return out
 
 
 def record_arm(cfg, robot, run, motion):
     """Return training motion, validation motion and ramps of an arm; a resumed run reads the files that it has.
+
+    The cycles' durations are in timing.csv, also those of a motion that was stopped.
 
     Args:
         run: the run folder of the files. motion: the first excitation; None: it is optimized.
@@ -225,14 +235,25 @@ def record_arm(cfg, robot, run, motion):
         Stopped: the arm was stopped; the motion so far is <name>_until_stop.npz.
     """
     from r2s.arm.interface import ArmStopped
+    from r2s.arm.realtime import Timing
     from r2s.recordings.ramps import read_ramps
     from r2s.recordings.readers import read
+
+    @contextmanager
+    def timed(name):
+        timing = Timing()
+        try:
+            yield timing
+        finally:
+            for row in timing.table():
+                run.log("timing", {"motion": name, **row})
 
     def one(name, motion, k):
         path = run.folder / f"{name}.npz"
         if not path.is_file():
             try:
-                motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion")
+                with timed(name) as timing:
+                    motion, out = record_motion(cfg, robot, motion, k, f"record {name} motion", timing)
             except ArmStopped as stop:
                 if stop.recording is not None:
                     stop.recording.save(run.folder / f"{name}_until_stop.npz")
@@ -245,7 +266,8 @@ def record_arm(cfg, robot, run, motion):
         train = one("train", motion, 0)
         validation = one("validation", None, 1)
         path = run.folder / "ramps.npz"
-        ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot)
+        with timed("ramps") as timing:
+            ramps = read_ramps(path) if path.is_file() else record_ramps(cfg, robot, timing)
         if ramps is not None and not path.is_file():
             ramps.save(path)
     except ArmStopped as stop:

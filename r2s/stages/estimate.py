@@ -5,7 +5,14 @@ from dataclasses import replace
 from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
 from r2s.stages.adapter_factory import calibrated, with_declared_payload
-from r2s.stages.build import check_source, make_dynamics, make_robot, open_run, opened_source
+from r2s.stages.build import (
+    check_source,
+    make_dynamics,
+    make_robot,
+    open_run,
+    opened_source,
+    within_speed_share,
+)
 from r2s.stages.data import check_data, file_data, read_file
 
 WHY = {
@@ -88,7 +95,7 @@ def given_recording(cfg, robot):
 
 def record_arm(cfg, robot):
     """Return the recording of an arm that moves for data.seconds, or along data.excitation."""
-    from r2s.arm.interface import ArmStopped
+    from r2s.arm.interface import ArmStopped, StopRequested
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
     from r2s.excitation.motion import load
@@ -97,14 +104,15 @@ def record_arm(cfg, robot):
     if cfg.data.excitation:
         motion = load(cfg.data.excitation, robot)
     else:
-        slow = replace(robot, dq_max=LIMIT_SHARE * robot.dq_max, ddq_max=LIMIT_SHARE * robot.ddq_max)
+        slow = within_speed_share(cfg, robot)
+        slow = replace(slow, dq_max=LIMIT_SHARE * slow.dq_max, ddq_max=LIMIT_SHARE * slow.ddq_max)
         motion = fourier(slow, duration=cfg.data.seconds, seed=cfg.data.excitation_seed)
-    progress = Progress("record the arm")
+    progress = Progress("record the arm", in_cycle=True)
     try:
         with opened_source(cfg, robot, 0) as arm:
             out = record(arm, motion, loaded=True, progress=lambda k, n: progress(k / n, f"{k / 1000:.1f} s"))
     except ArmStopped as stop:
-        if stop.recording is None:
+        if stop.recording is None or isinstance(stop, StopRequested):
             raise Stopped(f"while the arm was recorded: {stop}") from None
         progress.close(f"stopped: {stop}")
         return stop.recording

@@ -15,7 +15,6 @@ from r2s.stages.build import (
     console,
     is_learner,
     is_twin,
-    loaded,
     make_controller,
     make_draw,
     make_dynamics,
@@ -27,6 +26,7 @@ from r2s.stages.build import (
     set_threads,
 )
 from r2s.stages.parts import part
+from r2s.stages.run_config import run_config
 
 REST_GAP = 0.05  # share of the episodes; a larger gap in `rest` between prediction and arm raises a warning
 FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward")
@@ -52,11 +52,12 @@ def trained_config(cfg, option="policy"):
         names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
         near = nearest(source.name, names) if source else ""
         raise UserError(f"{option}: '{cfg.policy}' is no finished run folder of stage=train{near}")
-    trained = loaded(source / "config.yaml")
+    trained = run_config(source, getattr(cfg, "trust", None))
     if trained.stage != "train":
         raise UserError(f"{option}: expected a run of stage=train, got stage={trained.stage} ({source})")
-    if trained.calibration:
-        trained.calibration = str(source)
+    for node in (trained, trained.dr):  # dr=identified draws from the same calibration
+        if node.get("calibration"):
+            node.calibration = str(source)
     return source, trained
 
 
@@ -157,15 +158,23 @@ class ArmResult:
 
 
 def run_on_arm(cfg, request, runner, predicted):
-    """Return the result of the goals for which the prediction has no contact."""
+    """Return the result of the goals for which the prediction has no contact, and nothing that the driver stops."""
     import numpy as np
 
+    from r2s.physics.collision import CollisionCheck
+    from r2s.physics.fence import first_breaches
+    from r2s.physics.safety_filter import filter_limits
     from r2s.tasks.rollout import rollout, select_episodes
 
-    tried = np.flatnonzero(predicted.collision == "")
-    for e, contact in enumerate(predicted.collision, 1):
+    robot, task = runner.robot, request.task
+    check = CollisionCheck(robot, table=None, may_touch=task.may_touch)
+    near = first_breaches(check, filter_limits(robot, task.torque_limit(robot)), predicted.q, predicted.dq)
+    tried = np.flatnonzero((predicted.collision == "") & (near < 0))
+    for e, (contact, pair) in enumerate(zip(predicted.collision, near, strict=True), 1):
         if contact:
             print(f"episode {e} is skipped: predicted contact, {contact}")
+        elif pair >= 0:
+            print(f"episode {e} is skipped: {check.names[pair]} would come too near")
     if not len(tried):
         return ArmResult(tried)
     with goal_progress(f"on {cfg.arm.name}") as progress:

@@ -12,7 +12,7 @@ from r2s.arm.clients.libfranka import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.process import Emulator
 from r2s.arm.twins.rigid_twin import RigidTwin
-from r2s.errors import UserError, choices
+from r2s.errors import UserError, check_number, choices
 from r2s.physics.robot import Robot
 
 CLIENTS: dict[str, tuple[type[Panda] | type[FR3], int]] = {"panda": (Panda, 5), "fr3": (FR3, 10)}  # with FCI version
@@ -30,25 +30,31 @@ def emulated_arm(
     operator: Operator | str | None = "terminal",
     collision_torque: Sequence[float] = CAUTIOUS.torque,
     collision_force: Sequence[float] = CAUTIOUS.force,
+    moves: bool = True,
+    speed_share: float = 1.0,
 ) -> AbstractContextManager[Franka]:
     """Open an emulated Panda or FR3. These are the keys of conf/arm/*_emulated.yaml.
 
     Args:
         robot: nominal model. client: 'panda' or 'fr3'.
         seed: of the rigid twin. noise, payload, declared_payload: see `TwinBase`.
-        realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force: see `Panda`.
+        realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force, speed_share, moves: see
+            `Panda`.
     """
     if client not in CLIENTS:
         raise UserError(f"arm.client: {client!r}; allowed: {choices(CLIENTS)}")
     make, version = CLIENTS[client]
     CollisionThresholds(collision_torque, collision_force)  # checked before the emulator starts
+    check_number("speed_share", speed_share, "(0, 1]")
     settings: dict[str, Any] = {"collision_torque": collision_torque, "collision_force": collision_force}
+    settings |= {"declared_payload": declared_payload, "moves": moves, "speed_share": speed_share}
     arm = partial(make, robot, operator=find_operator(operator), **settings)
     twin = partial(RigidTwin, robot, seed, payload=payload, noise=noise, declared_payload=declared_payload)
-    return _opened(arm, Emulator(twin, version=version, realtime=realtime))
+    return _opened(arm, Emulator(twin, version=version, realtime=realtime), realtime)
 
 
 @contextmanager
-def _opened(make_arm: Callable[[str], Franka], emulator: Emulator) -> Iterator[Franka]:
+def _opened(make_arm: Callable[[str], Franka], emulator: Emulator, realtime: bool) -> Iterator[Franka]:
     with emulator as address, closing(make_arm(address)) as arm:
+        arm.realtime = realtime  # but without a real-time kernel, which the client would require
         yield arm

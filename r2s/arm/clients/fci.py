@@ -19,9 +19,18 @@ COLLISION = np.dtype(  # both our clients set the thresholds during acceleration
         ("torque_acceleration", "<f8", (2, 7)),
         ("lower_torque", "<f8", 7),
         ("upper_torque", "<f8", 7),
-        ("force", "<f8", (4, 6)),
+        ("force_acceleration", "<f8", (2, 6)),
+        ("lower_force", "<f8", 6),
+        ("upper_force", "<f8", 6),
     ]
 )
+LOAD = np.dtype([("m_load", "<f8"), ("F_x_Cload", "<f8", 3), ("I_load", "<f8", 9)])
+SETTINGS = {  # requests that change the state, with their payload; the emulator ignores other settings
+    "SetCollisionBehavior": COLLISION,
+    "SetLoad": LOAD,
+    "SetEEToK": np.dtype([("EE_T_K", "<f8", 16)]),
+    "SetNEToEE": np.dtype([("NE_T_EE", "<f8", 16)]),
+}
 
 
 _SHARED = ("Connect", "Move", "StopMove")
@@ -58,7 +67,7 @@ IDLE, MOVE_MODE, GUIDING, REFLEX, USER_STOPPED = 1, 2, 3, 4, 5  # robot_mode
 
 # indices in `errors` and `reflex_reason`, of 41
 N_ERRORS = 41
-JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX = 0, 3, 6
+JOINT_POSITION_LIMITS, JOINT_VELOCITY, JOINT_REFLEX, CARTESIAN_REFLEX = 0, 3, 6, 7
 COMMUNICATION_CONSTRAINTS, TORQUE_DISCONTINUITY, TORQUE_RANGE = 25, 32, 34
 
 

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from r2s.arm.clients import fr3_limits
+from r2s.arm.clients import connection_check, fr3_limits
+from r2s.arm.clients.connection_check import Connection
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
 from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds
+from r2s.physics.payload import payload_of
 from r2s.physics.robot import Robot
 
 STOP_DISTANCE = 0.02  # rad, of a joint that brakes from 0.2 rad/s, the speed that an FR3 allows there
@@ -33,11 +35,21 @@ def within_fr3(robot: Robot) -> Robot:
     )
 
 
+def as_driven(robot: Robot) -> Robot:
+    """Return the robot with the limits under which its arm runs: those of `within_fr3` if they fit an FR3."""
+    limits = fr3_limits
+    if robot.n != len(limits.Q_MIN) or robot.velocity_envelope is not None:
+        return robot
+    inside = (robot.q_min >= limits.Q_MIN) & (robot.q_max <= limits.Q_MAX) & (robot.dq_max <= limits.DQ_MAX)
+    return within_fr3(robot) if inside.all() else robot
+
+
 class FR3(Franka):
     """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
 
     Raises:
-        UserError: pylibfranka is missing, or no server of its FCI version answers at the address.
+        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm behind it
+            is not the one of the model.
     """
 
     def __init__(
@@ -49,12 +61,19 @@ class FR3(Franka):
         realtime: bool = False,
         collision_torque: Sequence[float] = CAUTIOUS.torque,
         collision_force: Sequence[float] = CAUTIOUS.force,
+        declared_payload: Any = None,
+        moves: bool = True,
+        speed_share: float = 1.0,
     ):
         thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        super().__init__(within_fr3(robot), _FR3Client(address, realtime), operator, thresholds)
+        expected = Connection(connection_check.FR3, payload_of(declared_payload, "arm.declared_payload"), moves)
+        client = _FR3Client(address, realtime)
+        super().__init__(within_fr3(robot), client, operator, thresholds, expected, realtime, speed_share)
 
 
 class _FR3Client(Client):
+    version = 10  # libfranka connects to no other, and pylibfranka does not pass the number on
+
     def __init__(self, address: str, realtime: bool):
         super().__init__("fr3", "pylibfranka", address, realtime)
         self._control: Any = None

@@ -6,29 +6,35 @@ client package, and the emulator tests the code that moves the hardware.
 """
 
 import weakref
+from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 
 from r2s.arm.clients import fci
+from r2s.arm.clients.connection_check import Connection, Finding, refuse
 from r2s.arm.clients.consent import Operator
 from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds
 from r2s.arm.command_loop import STILL, CommandLoop
 from r2s.arm.driver import Driver
 from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
+from r2s.arm.realtime import realtime_section
 from r2s.arm.tracking_controller import CUTOFF_HZ, TrackingController
-from r2s.errors import UserError
+from r2s.errors import UserError, check_number
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
-from r2s.excitation.motion_checks import Space, friction_margin
+from r2s.excitation.motion_checks import Space, allowed_deviation, friction_margin
 from r2s.excitation.paths import approach
+from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import SIGNALS
 
 # move_to: slow and weak, so that a person who blocks a link meets a bounded force (docs/explanation/safety.md)
 SPEED = 0.2  # of dq_max
 ACCELERATION = 0.2  # of ddq_max
 TORQUE_SHARE = 0.2  # of tau_max, torque limit of the driver
-MAX_DEVIATION = 0.1  # rad off the path; beyond it `move_to` gives up
+MAX_DEVIATION = 0.1  # rad off the path, less where an obstacle is near; beyond it `move_to` gives up
 SETTLE_S = 3.0  # longest time at the end of the path
 INTEGRAL_GAIN = 15.0  # of tau_max per rad s; overcomes breakaway at the end of the path
 INTEGRAL_SHARE = 0.15  # of tau_max, limit of that integral
@@ -44,7 +50,10 @@ class Franka:
 
     Attributes:
         operator, blocked: see `Operated`. Every end of a motion except `stop` blocks the arm: a reflex, a stop button
-            (even if released since), a refused command, a failed `move_to`.
+            (even if released since), a refused command, a failed `move_to`. hold: see `Holds`.
+        findings: of the check at connection.
+        realtime: whether motions run in a `realtime_section`; a recording or an episode with less than 99 % of its
+            commands in time then does not count.
 
     Args:
         robot: limits and nominal model.
@@ -52,6 +61,11 @@ class Franka:
         operator: called with the reason before the arm moves again after a stop. None: `move_to` refuses until a new
             connection begins with an arm that is ready.
         collision: external torque and force at which the arm stops itself.
+        connection: what the arm must be; None: not checked.
+        speed_share: share of all allowed speeds, in every motion.
+
+    Raises:
+        UserError: the arm is not the one of the model; nothing has moved.
     """
 
     def __init__(
@@ -60,21 +74,30 @@ class Franka:
         client: Client,
         operator: Operator | None = None,
         collision: CollisionThresholds = CAUTIOUS,
+        connection: Connection | None = None,
+        realtime: bool = False,
+        speed_share: float = 1.0,
     ):
+        check_number("speed_share", speed_share, "(0, 1]")
         if robot.n != 7:
             raise UserError(f"expected 7 joints for a Franka arm, got {robot.n} ({robot.name})")
-        self.robot, self.operator = robot, operator
+        self.robot, self.operator, self.speed_share = robot, operator, speed_share
         self.blocked: str | None = None
+        self.hold = np.zeros(robot.n)
+        self.realtime, self._section = realtime, ExitStack()
         self._client, self._collision = client, collision
         self._reflexes = Reflexes(robot)
-        self._moving, self._closed, self._thresholds_set = False, False, False
+        self._moving, self._damping, self._closed, self._thresholds_set = False, False, False, False
         self._space: Space | None = None
         self._stopped: str | None = "no motion was started; call move_to first"
         self._read_idle()
+        self._connection, self.findings = connection, self._compared(connection)
+        limits = TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot)
+        fence = CollisionCheck(robot, table=None)
         # a strong reference back to the arm would keep it, and its connection, alive after its last user
         self._loop = CommandLoop(
             weakref.proxy(self),
-            Driver(robot, TORQUE_SHARE * robot.tau_max, 2 * friction_margin(robot), cutoff_hz=CUTOFF_HZ),
+            Driver(robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=speed_share),
         )
 
     def move_to(self, q: np.ndarray) -> ArmState:
@@ -84,6 +107,7 @@ class Franka:
 
         Raises:
             NotCleared: the arm stopped before, and no operator agreed that it may move.
+            StopRequested: a signal, or the end of the process of the policy; the arm is at rest.
             ArmStopped: q is outside the limits; the arm is not ready; no path exists (nothing moved); the arm stopped
                 on the path, deviated from it by 0.1 rad, or ended more than 10 mrad from q.
 
@@ -118,22 +142,31 @@ class Franka:
         try:
             self._reflexes.command(tau, self._state.tau_J_d)
         except ArmStopped as refused:
+            self.blocked = self.blocked or str(refused)
             self.stop()
-            self._stopped = self.blocked = str(refused)
+            self._stopped = str(refused)
             raise
         self._send(tau)
 
     def stop(self) -> None:
-        """Damp the remaining motion for at most 0.5 s, and end it."""
+        """Damp the remaining motion for at most 0.5 s, and end it; `blocked` keeps an earlier reason."""
+        if self._damping:  # the driver's own stop during damping
+            return
         for part in (self._damp, self._end):  # `_end` also runs if damping failed
             try:
                 if self._moving:
                     part()
             except ArmStopped as reason:
-                self._stopped = self.blocked = str(reason)
-        self._moving = False
+                self._stopped = str(reason)
+                self.blocked = self.blocked or self._stopped
+        self._moving, self.hold = False, np.zeros(self.robot.n)
+        self._section.close()
         if self._stopped is None:
             self._stopped = "stop was called"
+
+    def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Read an arm at rest; return the arm's and this computer's time (k,) s of each state."""
+        return self._client.watch(seconds)
 
     def close(self) -> None:
         """Stop and drop the connection."""
@@ -150,39 +183,62 @@ class Franka:
     def _send(self, tau: np.ndarray) -> None:
         try:
             if not self._moving:
+                if self.realtime:
+                    self._section.enter_context(realtime_section())
                 self._begun = _ms(self._client.start())
                 self._moving = True
             self._state = self._sample(self._client.exchange(tau))
         except ArmStopped as reason:
+            self._section.close()
             self._moving, self._stopped = False, str(reason)
-            self.blocked = self._stopped
+            self.blocked = self.blocked or self._stopped
             raise
 
     def _sample(self, s: Any) -> ArmState:
         t = (_ms(s) - self._begun) * SIM_DT
-        return ArmState(t, np.array(s.q), np.array(s.dq), np.array(s.tau_J), np.array(s.tau_J_d))
+        known: dict[str, Any] = {name: np.array(getattr(s, name))[()] for name in SIGNALS}
+        return ArmState(t, np.array(s.q), np.array(s.dq), np.array(s.tau_J), np.array(s.tau_J_d), **known)
 
     def _damp(self) -> None:
         if self._stopped is None:
-            self._loop.begin()
-            self._loop.rest()
+            self._damping = True
+            try:
+                self._loop.damp(self.hold)
+            finally:
+                self._damping = False
 
     def _end(self) -> None:
         self._moving = False
-        self._client.finish()
+        try:
+            self._client.finish()
+        finally:
+            self._section.close()
         self._read_idle()
+
+    def _compared(self, connection: Connection | None) -> list[Finding]:
+        if connection is None:
+            return []
+        found = connection.findings(self.robot, self._client.version, self._client.idle())
+        try:
+            refuse(found if connection.moves else [], f"arm={type(self).__name__.lower()}")
+        except UserError:
+            self._client.close()
+            raise
+        return found
 
     def _read_idle(self) -> None:
         """Read the arm between motions; tau_J_d is then the torque of the arm's own controller, not a command."""
         s = self._client.idle()
         self._begun = _ms(s)
         sample = self._sample(s)
-        self._state = ArmState(0.0, sample.q, sample.dq, sample.tau_J, np.zeros(self.robot.n))
+        self._state = replace(sample, t=0.0, tau_J_d=np.zeros(self.robot.n))
 
     def _prepare(self) -> None:
         """Raise ArmStopped unless the arm can move; after a stop the operator must agree first."""
         if self._closed:
             raise ArmStopped("the connection was closed")
+        if self._connection is not None and not self._connection.moves:
+            raise ArmStopped("the connection is only for a check; open it again to move the arm")
         s = self._client.idle()
         mode = int(s.robot_mode)
         if self.blocked is None and mode == fci.REFLEX:
@@ -217,8 +273,10 @@ class Franka:
 
     def _follow(self, q: np.ndarray) -> None:
         """Follow the straight joint path to q (7,) rad."""
-        path, moving = _slow_path(self.robot, self._state.q, q)
-        controller, loop = TrackingController(self.robot, path, MAX_DEVIATION), self._loop
+        path, moving = _slow_path(self.robot, self._state.q, q, self.speed_share)
+        assert self._space is not None  # of `_plan`
+        room = allowed_deviation(self._space, path, MAX_DEVIATION)
+        controller, loop = TrackingController(self.robot, path, room), self._loop
         limit = INTEGRAL_SHARE * self.robot.tau_max
         integral, last_error = np.zeros(7), np.zeros(7)
         loop.begin()
@@ -236,10 +294,10 @@ class Franka:
                     integral = np.clip(integral + INTEGRAL_GAIN * SIM_DT * self.robot.tau_max * error, -limit, limit)
                     integral = np.where(error * last_error < 0, 0, integral)
                     last_error = error
-                loop(controller(k, s) + integral)
+                loop(controller(k, s) + integral, controller.offset)
             self._end()
         except ArmStopped as reason:
-            self.blocked = str(reason)
+            self.blocked = self.blocked or str(reason)
             raise
         finally:
             if self._moving:  # interrupted, or given up
@@ -256,13 +314,13 @@ def _ms(state: Any) -> int:
     return round(state.time.to_sec() * 1e3)
 
 
-def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray) -> tuple[Excitation, int]:
+def _slow_path(robot: Robot, start: np.ndarray, end: np.ndarray, share: float) -> tuple[Excitation, int]:
     """Return a minimum-jerk path followed by rest, and how many rows move."""
     distance = np.abs(end - start)
     # peaks of minimum jerk: velocity 15/8 distance / T, acceleration 10/sqrt(3) distance / T^2
     duration = max(
         0.2,  # s
-        (15 / 8 * distance / (SPEED * robot.dq_max)).max(),
+        (15 / 8 * distance / (SPEED * share * robot.dq_max)).max(),
         np.sqrt(10 / np.sqrt(3) * distance / (ACCELERATION * robot.ddq_max)).max(),
     )
     moving = int(np.ceil(duration / SIM_DT))

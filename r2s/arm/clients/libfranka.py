@@ -2,6 +2,7 @@
 
 import importlib
 import socket
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -11,6 +12,7 @@ import numpy as np
 
 from r2s.arm.clients import fci
 from r2s.arm.interface import ArmStopped
+from r2s.arm.realtime import kept_scheduler
 from r2s.errors import UserError, check_number
 
 DESK_PORT = 443  # https, Franka's web interface "Desk"
@@ -49,16 +51,22 @@ class Client:
 
     Every method raises ArmStopped with libfranka's message.
 
+    Attributes:
+        version: of the arm's FCI.
+
     Args:
         name: option of the group `arm`, and the extra that installs the package. package: its module.
         address: host name or IP. realtime: require a real-time kernel and priority.
     """
 
+    version: int
+
     def __init__(self, name: str, package: str, address: str, realtime: bool):
         self._package = import_package(package, name)
         config = self._package.RealtimeConfig
         config = config.kEnforce if realtime else config.kIgnore
-        self._robot = connect(lambda: self._package.Robot(address, config), name, address)
+        with kept_scheduler():
+            self._robot = connect(lambda: self._package.Robot(address, config), name, address)
 
     def start(self) -> Any:
         """Start a torque motion; return the RobotState that waits for the first command."""
@@ -75,6 +83,14 @@ class Client:
     def idle(self) -> Any:
         """Return a fresh RobotState while no motion runs; the first one read may be old."""
         return self._call(lambda: (self._robot.read_once(), self._robot.read_once())[1])
+
+    def watch(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Read states of an arm at rest; return the arm's and this computer's time (k,) s of each."""
+        times, begun = [], time.perf_counter()
+        while time.perf_counter() < begun + seconds:
+            times.append((self._call(self._robot.read_once).time.to_sec(), time.perf_counter()))
+        arm, here = np.array(times).reshape(-1, 2).T
+        return arm, here
 
     def recover(self) -> None:
         """Clear a reflex."""

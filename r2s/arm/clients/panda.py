@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from r2s.arm.clients.connection_check import PANDA, Connection
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
 from r2s.arm.clients.libfranka import CAUTIOUS, Client, CollisionThresholds, one_line
 from r2s.arm.interface import ArmStopped
+from r2s.physics.payload import payload_of
 from r2s.physics.robot import Robot
 
 NO_FILTER_HZ = 1000.0  # libfranka's kMaxCutoffFrequency: switches the low-pass off
@@ -30,10 +32,13 @@ class Panda(Franka):
         address: host name or IP of the arm or of an emulator.
         operator: see `Franka`; 'terminal' asks a person at the terminal.
         realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
-        collision_torque, collision_force: see `CollisionThresholds`.
+        collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
+        declared_payload: what the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
+            `payload_of`; the connection is refused if the arm has another mass. moves: see `Connection`.
 
     Raises:
-        UserError: panda-python is missing, or no server of FCI version 5 answers at the address.
+        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm behind it is
+            not the one of the model.
     """
 
     def __init__(
@@ -45,15 +50,21 @@ class Panda(Franka):
         realtime: bool = False,
         collision_torque: Sequence[float] = CAUTIOUS.torque,
         collision_force: Sequence[float] = CAUTIOUS.force,
+        declared_payload: Any = None,
+        moves: bool = True,
+        speed_share: float = 1.0,
     ):
         thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        super().__init__(robot, _PandaClient(address, realtime), operator, thresholds)
+        expected = Connection(PANDA, payload_of(declared_payload, "arm.declared_payload"), moves)
+        client = _PandaClient(address, realtime)
+        super().__init__(PANDA.within(robot), client, operator, thresholds, expected, realtime, speed_share)
 
 
 class _PandaClient(Client):
     def __init__(self, address: str, realtime: bool):
         self._motion: _Motion | None = None
         super().__init__("panda", "panda_py.libfranka", address, realtime)
+        self.version = self._robot.server_version()
 
     def __del__(self):
         if self._motion is not None:  # ends the loop's thread, which waits for a command

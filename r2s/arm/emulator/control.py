@@ -4,14 +4,15 @@ It emulates Franka's Control, without sockets and without a clock: one call of `
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from r2s.arm.clients import fci, fr3_limits
-from r2s.arm.emulator.robot_model import EndEffectorPose, ExternalTorque
-from r2s.arm.interface import Arm, ArmStopped
+from r2s.arm.emulator.robot_model import BoxModel
+from r2s.arm.interface import Arm, ArmStopped, Reflexes
 from r2s.errors import UserError, choices, nearest
 from r2s.physics.robot import SIM_DT
 
@@ -19,6 +20,9 @@ FAULT_KINDS = ("late", "drop", "discontinuity", "joint_limit", "estop", "press",
 MAX_MISSED = 20  # consecutive cycles without an answer, after which Franka's arms stop themselves
 SUCCESS_WINDOW = 100  # commands over which control_command_success_rate is computed
 HOLD = 5e3, 100.0  # Nm/rad, Nm s/rad, of the fault 'hold': stiffer than a person's hand, and stable at 1 kHz
+CUTOFF_HZ = 15.0  # low-pass of the external torque; our choice, Franka does not publish it
+FRAMES = ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE")
+DESK = ("F_T_EE", "m_ee", "F_x_Cee", "m_load", "F_x_Cload", "O_ddP_O")  # what an operator sets in Franka's Desk
 INSIDE = 0.02  # rad from a position limit, to which recovery moves a joint that is beyond it
 _ERRORS = (  # parts of the messages of `Reflexes`, and libfranka's index of the same error
     ("steps", fci.TORQUE_DISCONTINUITY),
@@ -68,9 +72,20 @@ class Control:
         running: whether a motion is active.
         stopped_by: why the last motion was aborted; None if it was not.
 
+    Args:
+        arm: behind the box. Its state may carry the true external torque; otherwise that is zero.
+        version: of the FCI. faults, max_missed: see `Emulator`.
+        desk: settings of `DESK` by name, such as {"m_ee": 0.73}, right or wrong; the arm itself does not change.
     """
 
-    def __init__(self, arm: Arm, version: int, faults: Sequence[Fault] = (), max_missed: int = MAX_MISSED):
+    def __init__(
+        self,
+        arm: Arm,
+        version: int,
+        faults: Sequence[Fault] = (),
+        max_missed: int = MAX_MISSED,
+        desk: Mapping[str, Any] | None = None,
+    ):
         if arm.robot.n != 7:
             raise UserError(f"emulator: expected an arm of 7 joints, got {arm.robot.n} ({arm.robot.name})")
         if any(f.kind == "hold" for f in faults) and not hasattr(arm, "external"):
@@ -79,15 +94,24 @@ class Control:
         self.running = False
         self.stopped_by: str | None = None
         self._arm, self._version, self._faults, self._max_missed = arm, version, tuple(faults), max_missed
-        self._pose = EndEffectorPose(arm.robot)
+        self._model, self._reflexes = BoxModel(arm.robot), Reflexes(arm.robot)
         self._motion, self._cycle, self._missed = -1, 0, 0
         self._answered: deque[bool] = deque(maxlen=SUCCESS_WINDOW)
         self._mode, self._pressed_ms = fci.IDLE, 0
-        self._external, self._held_at = ExternalTorque(arm.robot), np.zeros(0)
-        self._collision = np.full(7, np.inf)
-        for frame in ("F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE"):
+        self._external, self._held_at = np.zeros(7), np.zeros(0)
+        self._thresholds = np.full((), np.inf, fci.COLLISION)
+        for frame in FRAMES:
             self.state[frame] = np.eye(4).ravel()
-        self.state["O_ddP_O"] = arm.robot.gravity  # for the client's model
+        self.state["O_ddP_O"] = arm.robot.gravity
+        if (declared := getattr(arm, "declared_payload", None)) is not None:
+            self.state["m_load"], self.state["F_x_Cload"] = declared.mass, declared.centre
+            self.state["I_load"] = declared.inertia.ravel()
+        self._right = self.state.copy()  # the settings with which the arm's own gravity compensation works
+        for name, value in (desk or {}).items():
+            if name not in DESK:
+                raise UserError(f"emulator: desk setting '{name}'; allowed: {choices(DESK)}{nearest(name, DESK)}")
+            self.state[name] = value
+        self.state["F_T_NE"] = self.state["F_T_EE"]
         self._place(arm.robot.q_home)
 
     @property
@@ -110,7 +134,7 @@ class Control:
         self.running, self.stopped_by = True, None
         self._motion, self._cycle, self._missed = self._motion + 1, 0, 0
         self._answered.clear()
-        self._external.begin(self._arm.read())
+        self._feel(1.0)
         self.state["errors"] = self.state["reflex_reason"] = 0
         self._sense()
 
@@ -134,6 +158,7 @@ class Control:
             tau = np.where(np.arange(7) == 0, last + 2 * self._arm.robot.dtau_max * SIM_DT, tau)
         self._hold_link()
         try:
+            self._reflexes.command(tau, last)
             self._arm.command(tau)
         except ArmStopped as reason:
             error = next((index for part, index in _ERRORS if part in str(reason)), fci.JOINT_REFLEX)
@@ -142,12 +167,8 @@ class Control:
         s = self._arm.read()
         if self._version == 10 and (outside := _outside_fr3(s.q, s.dq)) is not None:
             self._abort(*outside)
-        elif (np.abs(external := self._external(s)) > self._collision).any():
-            i = int(np.argmax(np.abs(external) / self._collision))
-            self._abort(
-                fci.JOINT_REFLEX,
-                f"joint {i + 1}: external torque {external[i]:.1f} Nm, the threshold is {self._collision[i]:g} Nm",
-            )
+        elif (collision := self._feel()) is not None:
+            self._abort(*collision)
         elif self._has("joint_limit"):
             self._abort(fci.JOINT_POSITION_LIMITS, "a joint limit was injected")
         elif self._has("estop") or self._has("press"):
@@ -161,6 +182,7 @@ class Control:
         """End an active motion at the client's request; the arm holds its posture."""
         if self.running:
             self.running = False
+            self._release()
             self._arm.stop()
             self._place(self._arm.read().q)
 
@@ -172,9 +194,17 @@ class Control:
                 self._mode = fci.IDLE
                 self._place(self._arm.read().q)
 
-    def set_collision_thresholds(self, torque: np.ndarray) -> None:
-        """Stop from now on if the estimated external torque of a joint exceeds torque (7,) Nm."""
-        self._collision = torque
+    def set(self, request: str, settings: np.ndarray) -> None:
+        """Apply a request of `fci.SETTINGS`: thresholds, load, or a frame of the end effector."""
+        if request == "SetCollisionBehavior":
+            self._thresholds = settings
+        else:
+            for name in settings.dtype.names or ():
+                self.state[name] = settings[name]
+            f = {name: self.state[name].reshape(4, 4) for name in FRAMES}
+            self.state["F_T_EE"] = (f["NE_T_EE"] @ f["F_T_NE"]).ravel()  # by columns, hence in this order
+        self._feel(1.0)
+        self._sense()
 
     def recover(self) -> bool:
         """Clear a reflex; return whether the arm can move again. A pressed stop button stays pressed.
@@ -194,6 +224,7 @@ class Control:
 
     def _place(self, q: np.ndarray) -> None:
         self._arm.move_to(q)
+        self._feel(1.0)
         self._sense()
 
     def _abort(self, error: int, reason: str) -> None:
@@ -202,6 +233,7 @@ class Control:
 
     def _stop(self, reason: str, mode: int) -> None:
         self.running, self.stopped_by, self._mode = False, reason, mode
+        self._release()
         self._arm.stop()
         self._sense()
 
@@ -215,24 +247,65 @@ class Control:
     def _hold_link(self) -> None:
         """Apply the external torque of the fault 'hold' to the first joint."""
         if not self._has("hold"):
-            self._held_at = np.zeros(0)
-            if hasattr(self._arm, "external"):
-                self._arm.external = np.zeros(7)
-            return
+            return self._release()
         s = self._arm.read()
         if not len(self._held_at):
             self._held_at = s.q.copy()
         torque = HOLD[0] * (self._held_at - s.q) - HOLD[1] * s.dq
         self._arm.external = np.where(np.arange(7) == 0, torque, 0.0)  # type: ignore[attr-defined]
+        return None
+
+    def _release(self) -> None:
+        self._held_at = np.zeros(0)
+        if hasattr(self._arm, "external"):
+            self._arm.external = np.zeros(7)
+
+    def _feel(self, gain: float = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)) -> tuple[int, str] | None:
+        """Filter the external torque, set wrench and flags, and return error and message of a collision.
+
+        As in libfranka, it is tau_J minus the model's torque: what the joints exert on the surroundings, wrong
+        settings of the gravity compensation included. Being exact, it has no friction and no error of the model.
+
+        Args:
+            gain: of the low-pass; 1 for an arm at rest.
+        """
+        s, arm = self.state, self._arm.read()
+        raw = np.zeros(7) if arm.tau_ext_hat_filtered is None else arm.tau_ext_hat_filtered
+        if any((s[name] != self._right[name]).any() for name in DESK[1:]):
+            raw = raw + self._model.compensation(arm.q, self._right) - self._model.compensation(arm.q, s)
+        self._external = s["tau_ext_hat_filtered"] = self._external + gain * (raw - self._external)
+        force = np.zeros(6)
+        if self._external.any():
+            at_k = s["EE_T_K"].reshape(4, 4) @ s["F_T_EE"].reshape(4, 4)  # by columns, hence in this order
+            force = self._model.wrench(arm.q, at_k.T, self._external)
+            rotation = self._model.pose(arm.q, at_k.T)[:3, :3]
+            s["K_F_ext_hat_K"] = np.concatenate([rotation.T @ force[:3], rotation.T @ force[3:]])
+        s["O_F_ext_hat_K"] = force
+        collision = None
+        for kind, what, x, error in (
+            ("cartesian", "force", force, fci.CARTESIAN_REFLEX),
+            ("joint", "torque", self._external, fci.JOINT_REFLEX),
+        ):
+            upper = self._thresholds[f"upper_{what}"]
+            s[f"{kind}_contact"] = np.abs(x) > self._thresholds[f"lower_{what}"]
+            s[f"{kind}_collision"] = over = np.abs(x) > upper
+            if over.any():
+                i = int(over.argmax())
+                collision = (
+                    error,
+                    f"{kind} {i + 1}: external {what} {x[i]:.1f} N or Nm, allowed {upper[i]:g}",
+                )
+        return collision
 
     def _sense(self) -> None:
         arm, s, version = self._arm.read(), self.state, self._version
         s["q"] = s["q_d"] = s["theta"] = arm.q
         s["dq"] = s["dtheta"] = arm.dq
-        s["tau_J"] = arm.tau_J
+        # at rest the box's own controller holds the arm, also where a simulated one would sink
+        s["tau_J"] = arm.tau_J if self.running else self._model.compensation(arm.q, s) + self._external
         s["tau_J_d"] = arm.tau_J_d
-        s["tau_ext_hat_filtered"] = self._external.torque
-        s["O_T_EE"] = s["O_T_EE_d"] = s["O_T_EE_c"] = self._pose(arm.q)
+        pose = self._model.pose(arm.q, s["F_T_EE"].reshape(4, 4).T)
+        s["O_T_EE"] = s["O_T_EE_d"] = s["O_T_EE_c"] = pose.T.ravel()
         s["robot_mode"] = fci.MOVE_MODE if self.running else self._mode
         s["controller_mode"] = fci.EXTERNAL_CONTROLLER if self.running else fci.OTHER_CONTROLLER
         s["motion_generator_mode"] = fci.GENERATOR_RUNNING[version] if self.running else fci.NO_GENERATOR

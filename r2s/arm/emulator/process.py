@@ -13,11 +13,12 @@ It does not emulate a network's jitter, brakes, or what makes a motion safe besi
 import argparse
 import contextlib
 import multiprocessing
-import signal
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Emulator:
         address: a loopback address; default: the first free one, because clients always use port 1337.
         realtime: run at 1 kHz instead of in lock-step.
         faults: injected faults.
-        max_missed: consecutive cycles without an answer that stop the arm.
+        max_missed: consecutive cycles without an answer that stop the arm. desk: settings of the box, see `Control`.
     """
 
     def __init__(
@@ -53,12 +54,13 @@ class Emulator:
         realtime: bool = False,
         faults: Sequence[Fault] = (),
         max_missed: int = MAX_MISSED,
+        desk: Mapping[str, Any] | None = None,
     ):
         if version not in fci.VERSIONS:
             raise UserError(f"emulator: version {version}; allowed: {choices(map(str, fci.VERSIONS))}")
         if address is not None:
             check_loopback(address)
-        self._settings = make_arm, version, address, realtime, faults, max_missed
+        self._settings = make_arm, version, address, realtime, faults, max_missed, desk
 
     def __enter__(self) -> str:
         """Start the server; return its address."""
@@ -84,7 +86,7 @@ class Emulator:
 
 
 def _child(pipe, settings: tuple) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which stops its arm first
+    os.setsid()  # as a control box, it receives no signal of the terminal
     try:
         server = _server(*settings)
     except UserError as error:
@@ -104,6 +106,7 @@ def _server(
     realtime: bool,
     faults: Sequence[Fault],
     max_missed: int = MAX_MISSED,
+    desk: Mapping[str, Any] | None = None,
 ) -> Server:
     socket = open_port(address)
     trial = make_arm()
@@ -111,7 +114,7 @@ def _server(
     trial.command(np.zeros(trial.robot.n))  # compiles; a client would time out during it
     trial.stop()
     arm = make_arm()
-    control = Control(arm, version, faults, max_missed)
+    control = Control(arm, version, faults, max_missed, desk)
     return Server(socket, control, urdf(arm.robot), version, realtime=realtime)
 
 

@@ -1,4 +1,4 @@
-"""The emulated control box's model of its arm: URDF, end-effector pose and external torque."""
+"""The emulated control box's model of its arm: URDF, poses, gravity torque and external wrench."""
 
 from dataclasses import replace
 from xml.etree import ElementTree as ET
@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 
 from r2s.arm.clients import fr3_limits
-from r2s.arm.interface import ArmState
 from r2s.physics import description
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.payload import LoadTorque, ee_pose
+from r2s.physics.robot import Robot
 
-CUTOFF_HZ = 15.0  # first-order low-pass; our choice, needed because dq is differentiated at 1 kHz
+SINGULAR = 0.03  # smallest singular value of the Jacobian, m and 1; our choice. It is 0.22 at Franka's ready pose
 
 
 def urdf(robot: Robot) -> str:
@@ -24,50 +24,43 @@ def urdf(robot: Robot) -> str:
     return ET.tostring(description.urdf(fr3, links), encoding="unicode")
 
 
-class EndEffectorPose:
-    """Forward kinematics in RobotState's format."""
+class BoxModel:
+    """What the control box computes from the posture: poses, and the torques of gravity and declared load."""
 
     def __init__(self, robot: Robot):
-        self._model = robot.model(gravity=False)
-        self._data = mujoco.MjData(self._model)
-        self._site = self._model.site(robot.ee_site).id
+        self._model = robot.model(gravity=True)
+        self._data, self._jacobian = mujoco.MjData(self._model), np.zeros((6, robot.n))
+        self._site, self._load = self._model.site(robot.ee_site).id, LoadTorque(robot)
+        self._place, self._axes = ee_pose(robot)
 
-    def __call__(self, q: np.ndarray) -> np.ndarray:
-        """Return the homogeneous transform (16,), column by column, at q (n,) rad."""
+    def pose(self, q: np.ndarray, tool: np.ndarray) -> np.ndarray:
+        """Return the pose (4, 4) at q (n,) rad of a frame that is given in the flange's, tool (4, 4)."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
-        pose = np.eye(4)
-        pose[:3, :3] = self._data.site_xmat[self._site].reshape(3, 3)
-        pose[:3, 3] = self._data.site_xpos[self._site]
-        return pose.T.ravel()
+        flange = np.eye(4)
+        flange[:3, :3] = self._data.site_xmat[self._site].reshape(3, 3)
+        flange[:3, 3] = self._data.site_xpos[self._site]
+        return flange @ tool
 
+    def wrench(self, q: np.ndarray, tool: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the wrench (6,) N, Nm in the base frame at the frame `tool` that explains torque (n,) Nm best.
 
-class ExternalTorque:
-    """Estimate of the external joint torque: inverse dynamics of the measured motion minus the command, filtered.
+        It is zero near a singularity, as libfranka's.
+        """
+        place, j = self.pose(q, tool)[:3, 3], self._jacobian
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_jac(self._model, self._data, j[:3], j[3:], place, self._model.jnt_bodyid[-1])
+        u, size, v = np.linalg.svd(j, full_matrices=False)
+        return np.zeros(6) if size[-1] < SINGULAR else u @ ((v @ torque) / size)
 
-    A Franka arm has link-side torque sensors; the emulated arm may have none that include gravity. The estimate
-    therefore contains friction and model errors, so that this arm stops itself earlier than a real one.
+    def compensation(self, q: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Return the gravity torque (n,) Nm at q (n,) rad with end effector, load and gravity of RobotState `s`."""
+        self._model.opt.gravity[:] = s["O_ddP_O"]
+        self._data.qpos[:] = q
+        mujoco.mj_forward(self._model, self._data)
+        return self._data.qfrc_bias + self._load(q, self._carried(s), s["O_ddP_O"])
 
-    Attributes:
-        torque: (n,) Nm, filtered.
-    """
-
-    def __init__(self, robot: Robot):
-        self._model = robot.model(gravity=False)
-        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        self._data = mujoco.MjData(self._model)
-        self._gain = -np.expm1(-2 * np.pi * CUTOFF_HZ * SIM_DT)
-        self.torque, self._previous_dq = np.zeros(robot.n), np.zeros(robot.n)
-
-    def begin(self, state: ArmState) -> None:
-        """Begin a motion at rest."""
-        self.torque, self._previous_dq = np.zeros(len(state.q)), state.dq.copy()
-
-    def __call__(self, state: ArmState) -> np.ndarray:
-        """Return `torque` after another cycle."""
-        d = self._data
-        d.qpos[:], d.qvel[:], d.qacc[:] = state.q, state.dq, (state.dq - self._previous_dq) / SIM_DT
-        mujoco.mj_inverse(self._model, d)
-        self._previous_dq = state.dq.copy()
-        self.torque = self.torque + self._gain * (d.qfrc_inverse - state.tau_J_d - self.torque)
-        return self.torque
+    def _carried(self, s: np.ndarray) -> np.ndarray:
+        """Return mass and first moment (4,) in the last link's frame of end effector and load."""
+        parts = ((s["m_ee"], s["F_x_Cee"]), (s["m_load"], s["F_x_Cload"]))
+        return np.sum([np.append(m, m * (self._place + self._axes @ x)) for m, x in parts], axis=0)

@@ -120,11 +120,9 @@ class Server:
         elif name in ("LoadModelLibrary", "GetCartesianLimit") or self._control.running:
             self._reply(name, number, fci.NOT_POSSIBLE)  # that library is machine code
         else:
-            if name == "SetCollisionBehavior":
-                self._control.set_collision_thresholds(
-                    np.frombuffer(payload, fci.COLLISION, 1)[0]["upper_torque"].copy()
-                )
-            self._reply(name, number, fci.DONE)  # impedances and loads have no effect here
+            if name in fci.SETTINGS:  # impedances have no effect here
+                self._control.set(name, np.frombuffer(payload, fci.SETTINGS[name], 1)[0].copy())
+            self._reply(name, number, fci.DONE)
 
     def _connect(self, number: int, payload: bytes) -> None:
         assert self._tcp is not None

@@ -62,8 +62,8 @@ class ElasticTwin(TwinBase):
         p[ej.GEAR] = critical * rng.uniform(0.02, 0.06, robot.n)
         p[ej.LOOP] = critical * rng.uniform(0.45, 0.7, robot.n)
         self._steps = _steps(p, inertia)
-        if self._declared_payload is not None:
-            declared = with_payload(robot, self._declared_payload, (robot.mass, robot.com, robot.inertia))
+        if self.declared_payload is not None:
+            declared = with_payload(robot, self.declared_payload, (robot.mass, robot.com, robot.inertia))
             self._nominal = links_of(robot, *declared)
         self._update_payload()
         self._dq_filter = -np.expm1(-2 * np.pi * rng.uniform(60.0, 120.0) * SIM_DT)

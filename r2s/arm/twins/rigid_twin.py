@@ -50,8 +50,8 @@ class RigidTwin(TwinBase):
         p[[lj.C_NEG, lj.C_POS, lj.S2]] *= self._friction_scale
         if self._stiffness:
             p[lj.COMPLIANCE] = robot.tau_max.max() / (robot.tau_max * self._stiffness)
-        if self._declared_payload is not None:
-            declared = with_payload(robot, self._declared_payload, (robot.mass, robot.com, robot.inertia))
+        if self.declared_payload is not None:
+            declared = with_payload(robot, self.declared_payload, (robot.mass, robot.com, robot.inertia))
             self._nominal.relink(*(a[-1] for a in declared))
         self._update_payload()
         delay = rng.uniform(2.0, 5.0) * 1e-3 / SIM_DT  # cycles

@@ -11,7 +11,7 @@ import numpy as np
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
 from r2s.errors import UserError, check_number
-from r2s.physics.payload import Payload, payload_of
+from r2s.physics.payload import LoadTorque, Payload, mass_and_moment, payload_of
 from r2s.physics.robot import SIM_DT, Robot
 
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
@@ -27,6 +27,9 @@ class TwinBase:
     A variant implements `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command,
     `_attach(payload)`, which changes the payload now, and `_sensors()`, which returns q, dq and tau_J. It sets `_q`
     and `_dq`, which the reflexes check, `_cycle` and `_tau_J_d`, and multiplies its friction by `_friction_scale`.
+
+    Attributes:
+        robot, declared_payload: see below.
 
     Args:
         robot: the nominal arm. seed: of the robot drawn around it.
@@ -56,7 +59,8 @@ class TwinBase:
     ):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
         self._payload = payload_of(payload)
-        self._declared_payload = payload_of(declared_payload, "arm.declared_payload")
+        self.declared_payload = payload_of(declared_payload, "arm.declared_payload")
+        self._declared, self._load_torque = mass_and_moment(robot, self.declared_payload), LoadTorque(robot)
         self._carries = False
         if stiffness is not None:
             check_number("arm.stiffness", stiffness, "(0, inf)")
@@ -89,9 +93,13 @@ class TwinBase:
         return self.read()
 
     def read(self) -> ArmState:
-        """Return the sensors' values of the current cycle."""
+        """Return the sensors' values of the current cycle, and the torque of the payload beyond the declared one."""
         q, dq, tau_J = self._sensors()
-        return ArmState(self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._last_command.copy())
+        load = mass_and_moment(self.robot, self._payload if self._carries else None) - self._declared
+        return ArmState(
+            self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._last_command.copy(),
+            tau_ext_hat_filtered=self._load_torque(self._q, load), m_ee=0.0, m_load=float(self._declared[0]),
+        )  # fmt: skip
 
     def command(self, tau: np.ndarray) -> None:
         """Advance one 1 ms cycle under tau (n,) Nm without gravity; the reflexes raise ArmStopped."""

@@ -35,7 +35,7 @@ from r2s.reporting.identification.tables import error_tables
 from r2s.reporting.identification.values import LEGEND
 from r2s.reporting.identification.whiteness import whiteness_figure, whiteness_table
 from r2s.reporting.tables import number
-from r2s.reporting.viewer.data import Content, Overlay
+from r2s.reporting.viewer.data import Content, Overlay, external_overlay
 from r2s.reporting.viewer.recording import write_recording
 from r2s.runs import Run
 
@@ -102,8 +102,9 @@ def identification_page(
     pictures["convergence"] = convergence_figure(run.figure("convergence"), found.history)
     arrays = {"t": motion.t, "measured": motion.tau, **overlay.predicted}
     np.savez_compressed(run.folder / "torque.npz", **arrays)  # type: ignore[arg-type]
+    overlays = {kind: overlay, **external_overlay(validation)}
     timeless = {name: p for name, p in pictures.items() if name != "torque"}
-    write_recording(run.folder / "recording.rrd", robot, Content(overlays={kind: overlay}, figures=timeless))
+    write_recording(run.folder / "recording.rrd", robot, Content(overlays=overlays, figures=timeless))
     whiteness = whiteness_table(motion.t, error["identified"], cutoff_hz)
     evidence = Evidence(pictures, fastest, whiteness, window_s, cutoff_hz)
     sections = identification_sections(robot, nominal, found, validation, summary, evidence)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from r2s.recordings.recording import Recording
 from r2s.tasks.measures import Measure, MeasureTable
 from r2s.tasks.rollout import Episodes
 
@@ -86,6 +87,15 @@ class Content:
             return []
         keys = dict.fromkeys((*table.curves, *table.comparison))
         return [table[key] for key in keys if any(key in curve for curve in self.curves.values())]
+
+
+def external_overlay(r: Recording) -> dict[str, Overlay]:
+    """Return {label: external torque, and 1 where the arm reported contact}; empty without an external torque."""
+    torque = r.signals.get("tau_ext_hat_filtered")
+    if torque is None or not torque.any():
+        return {}
+    contact = r.signals.get("joint_contact", np.zeros_like(torque))
+    return {"external, and contact": Overlay(r.t, torque, {"contact": (contact > 0).astype(float)})}
 
 
 def first(e: Episodes) -> list[Episode]:

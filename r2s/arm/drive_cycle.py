@@ -1,0 +1,215 @@
+"""One cycle of the driver, compiled, for m arms: what `DriverBatch` (r2s/arm/driver.py) runs once a millisecond."""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.actuation import condition
+from r2s.physics.control_laws import BUILT_IN, chain, control_law
+from r2s.physics.fence import Fence, breached
+from r2s.physics.newton_euler import WORK as DESK
+from r2s.physics.newton_euler import equations
+from r2s.physics.robot import SIM_DT
+from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, STEP, TAU_MAX, WORK, JointDynamics, filter_torque
+
+STILL = 0.02  # rad/s, below which a joint is at rest
+RELEASE = 0.2  # 1/s, share of tau_max by which a held compensation falls while it pushes along a motion; our choice
+ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
+RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
+TOO_NEAR = 100  # and this value plus the number of a pair of `CollisionCheck`
+
+
+class Memory(NamedTuple):
+    """State of the driver of m arms, which `drive_cycle` updates.
+
+    Attributes:
+        command: (m, c), the last finite one. law: (m, k), memory of the control law.
+        target: (m, n) Nm, torque of the control law. filtered, effort: (m, n) Nm, see `Actuation`.
+        sent: (m, n) Nm, the last torque command.
+        held: (m, n) Nm, last torque of the adapter, kept while the arm is brought to rest without contact.
+        share: (m,), share of the allowed speeds: 1, and falling while the arm is brought to rest.
+        cycle, silent, damped: (m,), cycles in all, since the last finite command, and of braking.
+        why: (m,), RUNS or why the arm is brought to rest. limited: (m,), cycles that the safety filter changed.
+        rests: (m,), whether the arm is at rest. commanded: (m,), whether there was a command.
+        least: (m, K) m, least distance of each pair of the fence.
+    """
+
+    command: np.ndarray
+    law: np.ndarray
+    target: np.ndarray
+    filtered: np.ndarray
+    effort: np.ndarray
+    sent: np.ndarray
+    held: np.ndarray
+    share: np.ndarray
+    cycle: np.ndarray
+    silent: np.ndarray
+    damped: np.ndarray
+    why: np.ndarray
+    limited: np.ndarray
+    rests: np.ndarray
+    commanded: np.ndarray
+    least: np.ndarray
+
+    @staticmethod
+    def fresh(m: int, n: int, command: int, law: int, pairs: int) -> "Memory":
+        """Return the state of m arms of n joints before their first cycle, without torque."""
+        own = np.zeros((m, command)), np.zeros((m, law))
+        count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
+        least = np.full((m, pairs), -np.inf)
+        return Memory(*own, *np.zeros((5, m, n)), np.ones(m), *count, *flags, least)  # type: ignore[call-arg]
+
+
+class Given(NamedTuple):
+    """Inputs of a cycle.
+
+    command: (m, c) if `new`. added: (m, n) Nm of an adapter if `adds`. hold: (m, n) Nm of the target, to keep while
+    the arm is brought to rest. contact: (m,), whether the arm reports a contact.
+    """
+
+    command: np.ndarray
+    new: bool
+    added: np.ndarray
+    adds: bool
+    hold: np.ndarray
+    contact: np.ndarray
+
+
+class Bounds(NamedTuple):
+    """Limits of an arm: target and adapter torque (n,) Nm, stop limits (n,) rad and rad/s, and three numbers.
+
+    deadline: s without a command. factor: of the low-pass. fade: cycles of the soft start.
+    """
+
+    torque: np.ndarray
+    added: np.ndarray
+    q_low: np.ndarray
+    q_high: np.ndarray
+    dq_max: np.ndarray
+    deadline: float
+    factor: float
+    fade: int
+
+
+class Model(NamedTuple):
+    """Model of the arm: friction (n,) Nm, links of `links_of`, rotors (n,) kg m^2, limits of `filter_limits`."""
+
+    friction: np.ndarray
+    links: np.ndarray
+    rotors: np.ndarray
+    limits: np.ndarray
+    fence: Fence
+
+
+@njit(cache=True)
+def _watch(i, q, dq, given, bounds, memory):
+    """Take the command of arm i, and decide whether the arm has to stop; return whether its state is finite."""
+    seen = np.isfinite(q).all() and np.isfinite(dq).all()
+    helped = given.adds and np.isfinite(given.added[i]).all()
+    if given.new and np.isfinite(given.command[i]).all() and helped == given.adds:
+        memory.command[i] = given.command[i]
+        memory.commanded[i] = True
+        memory.silent[i] = 0
+    else:
+        memory.silent[i] += 1
+    if memory.why[i] == RUNS:
+        if memory.silent[i] * SIM_DT > bounds.deadline:
+            memory.why[i] = SILENT
+        elif not seen:
+            memory.why[i] = NOT_FINITE
+        elif not ((q >= bounds.q_low).all() and (q <= bounds.q_high).all() and (np.abs(dq) <= bounds.dq_max).all()):
+            memory.why[i] = OUTSIDE
+    return seen
+
+
+@njit(cache=True)
+def _compensate(i, dq, stopping, given, bounds, memory, target):
+    """Add the adapter's torque to the target (n,) Nm of arm i, or the torque held while it is brought to rest."""
+    adds = given.adds and np.isfinite(given.added[i]).all()
+    faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
+    for j in range(len(target)):
+        most = bounds.added[j]
+        if given.contact[i]:  # what an arm pushes against must not be pushed on
+            memory.held[i, j] = 0.0
+        elif not stopping:
+            held = faded * min(max(given.added[i, j], -most), most) if adds else 0.0
+            memory.held[i, j] = min(max(held + given.hold[i, j], -most), most)
+        elif memory.share[i] == 0.0 and abs(dq[j]) > STILL and dq[j] * memory.held[i, j] > 0:
+            # an estimate that contains friction of the motion would keep the joint sliding
+            memory.held[i, j] -= min(RELEASE * SIM_DT * most / ADDED, abs(memory.held[i, j])) * np.sign(dq[j])
+        if stopping:
+            target[j] += memory.held[i, j]
+        elif adds:
+            target[j] += faded * min(max(given.added[i, j], -most), most)
+
+
+def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
+    """Return the commands (m, n) Nm of this cycle.
+
+    Args:
+        q, dq, applied: (m, n), state and last torque. given: `Given`. control: number and parameters of the law.
+        bounds: `Bounds`. model: `Model`. memory: `Memory`, updated.
+    """
+    out, (m, n) = np.empty_like(memory.sent), q.shape
+    number, parameters = control
+    limits = model.limits
+    work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
+    inertia, bias, desk, weightless = np.empty((n, n)), np.empty(n), np.empty((n, DESK)), np.zeros(3)
+    mass, law_torque = np.empty(n * (n + 1) // 2), np.empty(n)  # mass: the lower triangle, row by row
+    for i in range(m):
+        seen = _watch(i, q[i], dq[i], given, bounds, memory)
+        if seen and memory.why[i] == RUNS:
+            pair = breached(model.fence, limits, q[i], dq[i], memory.least[i])
+            if pair >= 0:
+                memory.why[i] = TOO_NEAR + pair
+        stopping = memory.why[i] != RUNS
+        memory.damped[i] += stopping
+        memory.rests[i] = seen and (np.abs(dq[i]) < STILL).all()
+        if stopping:  # brake from the present speed, at once
+            memory.target[i] = 0.0
+            if seen and memory.damped[i] == 1:
+                memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, DQ_ALLOWED]).max())
+            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
+        elif memory.commanded[i]:
+            control_law(number, q[i], dq[i], memory.command[i], parameters, memory.law[i], law_torque)
+            if np.isfinite(law_torque).all():
+                memory.target[i] = np.minimum(np.maximum(law_torque, -bounds.torque), bounds.torque)
+            else:
+                memory.why[i] = LAW_NOT_FINITE
+                memory.target[i] = 0.0
+        at = slice(i, i + 1)
+        conditioned = memory.filtered[at], memory.effort[at], memory.cycle[at]
+        settings = bounds.factor, bounds.fade, limits[:, TAU_MAX], limits[:, STEP]
+        condition(memory.target[at], conditioned, settings, 1, effort)
+        last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
+        if seen:
+            equations(model.links, weightless, q[i], dq[i], inertia, bias, desk)
+            for j in range(n):
+                inertia[j, j] += model.rotors[j]
+                for k in range(j + 1):
+                    mass[j * (j + 1) // 2 + k] = inertia[j, k]
+            share, now = memory.share[i], effort[0, 0]
+            _compensate(i, dq[i], stopping, given, bounds, memory, now)
+            arm = JointDynamics(q[i], dq[i], mass, bias)
+            changed = filter_torque(arm, now, last, share, model.friction, limits, work, out[i])
+            memory.limited[i] += changed
+        else:
+            for j in range(n):
+                out[i, j] = last[j] + min(max(-last[j], -limits[j, STEP]), limits[j, STEP])
+        memory.sent[i] = out[i]
+    return out
+
+
+drive_cycle = njit(cache=True)(_drive_cycle)
+
+
+@cache
+def compiled_cycle(laws: tuple[Callable, ...]) -> Callable:
+    """Return `drive_cycle` with these control laws; other than built-in ones are compiled in each process."""
+    if laws == BUILT_IN:
+        return drive_cycle
+    return njit(FunctionType(_drive_cycle.__code__, {**globals(), "control_law": chain(laws)}))

@@ -1,0 +1,120 @@
+"""Requests to end every motion of this process: a signal, or the end of the process that sends the commands.
+
+`CommandLoop` asks `requested` in every cycle. On a request the driver brings the arm to rest, and the motion ends
+with `StopRequested`. No new motion begins after a request. The request is one per process, as signals are.
+"""
+
+import os
+import signal
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from r2s.errors import Stopped
+
+# a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; SIGKILL and SIGSTOP cannot be handled
+SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
+GRACE_S = 2.0  # s for a motion to end by itself: driver and `rest` take at most 0.5 s each. Then KeyboardInterrupt
+
+
+class _Request:
+    """The request of this process: reason of the first one, and whether a motion ends or has ended because of it."""
+
+    def __init__(self) -> None:
+        self.sources: list[Callable[[], str | None]] = []
+        self.reason: str | None = None
+        self.ending = self.served = False
+
+
+_request = _Request()
+
+
+def requested() -> str | None:
+    """Return why every motion has to end, or None. The first reason stays."""
+    if _request.reason is None:
+        for source in _request.sources:
+            if (reason := source()) is not None:
+                _request.reason = reason
+                break
+    return _request.reason
+
+
+def begin_ending() -> None:
+    """Note that a motion ends because of the request."""
+    _request.ending = True
+
+
+def serve() -> None:
+    """Note that no motion runs after the request; a further signal then raises KeyboardInterrupt at once."""
+    _request.ending, _request.served = False, True
+
+
+@contextmanager
+def watched(source: Callable[[], str | None]) -> Iterator[None]:
+    """Also ask `source` for a request; it returns a reason or None and must cost microseconds."""
+    _request.sources.append(source)
+    try:
+        yield
+    finally:
+        _request.sources.remove(source)
+
+
+def parent_ended(parent: int) -> Callable[[], str | None]:
+    """Return a source: the process `parent`, which sends the commands, has ended."""
+    return lambda: None if os.getppid() == parent else "the process of the policy has ended"
+
+
+def _leave_terminal() -> None:
+    """Discard output to a terminal: after SIGHUP it is closed, and writing to it would end the run with an error."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        if stat.S_ISCHR(os.fstat(stream).st_mode):
+            os.dup2(nowhere, stream)
+    os.close(nowhere)
+
+
+@contextmanager
+def handled_signals(forward: Callable[[int], None] = lambda number: None) -> Iterator[None]:
+    """Turn SIGNALS into a request while an arm is open in this process.
+
+    If no motion has taken the request after GRACE_S, the main thread gets a KeyboardInterrupt; it leaves this context
+    as `Stopped` with the name of the signal. Outside the main thread Python allows no handlers; nothing changes.
+
+    Args:
+        forward: called with the number of each signal, in the handler.
+
+    Raises:
+        Stopped: a signal came while no motion ran.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def request(number: int, _: FrameType | None) -> None:
+        forward(number)
+        if number == signal.SIGHUP:
+            _leave_terminal()
+        if _request.served and not _request.ending:
+            raise KeyboardInterrupt
+        _request.reason = _request.reason or signal.Signals(number).name
+        signal.setitimer(signal.ITIMER_REAL, GRACE_S)
+
+    def insist(number: int, _: FrameType | None) -> None:
+        if _request.ending:
+            signal.setitimer(signal.ITIMER_REAL, GRACE_S)
+        elif not _request.served:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, request) for number in SIGNALS}
+    before[signal.SIGALRM] = signal.signal(signal.SIGALRM, insist)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Stopped(f"{_request.reason or 'interrupted'}; no motion was running") from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _request.reason, _request.ending, _request.served = None, False, False
