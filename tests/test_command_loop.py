@@ -18,11 +18,12 @@ from r2s.arm.clients.libfranka import CAUTIOUS
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
 from r2s.arm.emulator.control import HOLD
-from r2s.arm.interface import ArmStopped, NotCleared, signal_sizes
+from r2s.arm.interface import ArmStopped, NotCleared, StopRequested, signal_sizes
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.ramp import BRAKE_SHARE, MAX_SHARE, poses_about, ramp
 from r2s.arm.recorder import record
 from r2s.arm.simulated import SimulatedArm
+from r2s.arm.stop_request import handled_signals, watched
 from r2s.arm.tracking_controller import CORRECTION_SHARE, MAX_DEVIATION, TrackingController
 from r2s.errors import UserError
 from r2s.excitation.minimum_jerk import minimum_jerk
@@ -146,6 +147,16 @@ def test_a_held_recording_is_bounded():
     assert len(stopped.value.recording.t) > caught  # the rows so far are kept
     end = len(stopped.value.recording.t)
     assert np.abs(plan.q[end, 0] - arm.read().q[0]) >= allowed[end] - 1e-3
+
+
+def test_a_requested_stop_keeps_its_reason():
+    """An arm that brakes on request leaves its plan by more than is allowed; the request stays the reason."""
+    plan, arm = motion(1.2, 0.8), LoggedArm()
+    request = watched(lambda: "a request" if arm.read().t >= 0.6 else None)
+    with handled_signals(), request, pytest.raises(StopRequested, match=r"^a request$"):
+        record(arm, plan)
+    assert np.abs(arm.read().q - plan.q[round(arm.read().t / SIM_DT)]).max() > MAX_DEVIATION
+    assert np.abs(arm.commands[-1]).max() < 1.0
 
 
 def test_the_adaptive_estimate_is_bounded():

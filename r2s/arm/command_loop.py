@@ -130,7 +130,12 @@ class CommandLoop:
             self._cycle(hold + np.clip(-damping * s.dq, -limit, limit))
 
     def halt(self, reason: str) -> None:
-        """Bring the arm to rest without torque, as after a contact, then raise ArmStopped with `reason`."""
+        """Bring the arm to rest without torque, as after a contact, then raise ArmStopped with `reason`.
+
+        An arm that the driver is bringing to rest leaves its path because of that: then this does nothing.
+        """
+        if self.driver.stopping is not None:
+            return
         self.rest()
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
