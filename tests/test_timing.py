@@ -57,7 +57,10 @@ def computer():
     return gc.isenabled(), sys.getswitchinterval(), scheduler
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+OFTEN = ["panda", pytest.param("fr3", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("client", OFTEN)
 @pytest.mark.parametrize(("kind", "cycles"), [("drop", 7), ("late", 11)])
 def test_lost_cycles_are_counted(client, kind, cycles):
     """Dropped states by the robot's clock, late commands by the success rate: a late one counts in 100 states."""
@@ -76,7 +79,7 @@ def test_lost_cycles_are_counted(client, kind, cycles):
         assert np.sum(1 - np.array(timing.success)) == pytest.approx(cycles, abs=1e-3)  # the FR3 sends float32
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", OFTEN)
 def test_a_motion_with_too_few_commands_does_not_count(client):
     """In real time a recording and an episode are refused in one line with the value; in lock-step they count."""
     late = 15
@@ -101,7 +104,7 @@ def test_a_motion_with_too_few_commands_does_not_count(client):
         arm.close()
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", OFTEN)
 def test_every_motion_asks_for_real_time(client):
     """Recording, approach, ramps and episode; afterwards all is as before."""
     before, seen, counts = computer(), [], []
@@ -146,7 +149,7 @@ def test_connecting_keeps_the_scheduler(client):
         arm.close()
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", OFTEN)
 def test_a_reflex_restores_everything(client):
     """The arm ends the motion, not r2s."""
     before = computer()
