@@ -24,7 +24,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -176,7 +176,9 @@ class Acts:
 
     def __call__(self, k: int) -> np.ndarray:
         """Return the action of step k."""
-        action = 0.6 * np.array([1, 0.5, -1, 0.5, 0.3, 1, 0.3]) * np.cos(0.07 * k + self._case.number)
+        # from a turning point, so that the arm swings about its start and keeps clear of itself
+        swing = 0.6 * (-1) ** self._case.number * np.cos(0.12 * k)
+        action = swing * np.array([1, 0.5, -1, 0.5, 0.3, 1, 0.3])
         if self._case.kind == "policy stalls" and k == self._case.step:
             note(self._folder)
             time.sleep(1e-3 * self._case.count)
@@ -193,6 +195,10 @@ class Adapts:
 
     def __init__(self, case: Case, folder: Path):
         self._case, self._folder, self._kinematics = case, folder, Kinematics(ROBOT)
+
+    def __deepcopy__(self, memo: dict) -> "Adapts":
+        """Return the copy that the warm-up runs: the fault belongs to the motion."""
+        return Adapts(replace(self._case, kind="wrong load"), self._folder)
 
     def begin(self) -> None:
         """Begin a motion."""
@@ -251,6 +257,7 @@ def run_case(case: Case, folder: Path) -> bool:
     )
     settings = {"adapter": Adapts(case, folder)} if case.motion == "episode" else {}
     own = {"far": 0.5, "loaded": case.kind == "wrong load", "wakes": case.kind.endswith("frozen")}
+    own |= {"declared": case.declared or None, "realtime": case.realtime}
     motion = Motion(case.motion, case.live, Acts(case, folder), settings, **own)  # type: ignore[arg-type]
     return not run_side(side, ROBOT, motion, folder, LONGEST_S)
 
@@ -269,6 +276,8 @@ def judge(case: Case, folder: Path, ended: bool) -> dict:
     out["aborted"] = (folder / "aborted").read_text() if (folder / "aborted").exists() else ""
     if row is None or not len(ends) or ends[0] < row:
         return out | {"wrong": f"{EARLY}: {out['aborted']} {out['cause']}"}
+    if case.kind not in ("torque step", "joint limit"):  # the cycle in which the arm found itself beyond a limit
+        out["over"] += bool(re.search("position|velocity|commanded torque", out["aborted"]))
     end = int(ends[0])
     late = (CYCLE, STRAY) if log.kind[end] == ENDED else (CYCLE,)  # an answer may cross the arm's own stop
     out["after"] = int(np.isin(log.kind[end:], late).sum())
@@ -460,22 +469,28 @@ def main() -> None:
     known = read_results(results)
     numbers = [k for k in range(o.first, o.first + o.count) if o.count == 1 or k not in known]
     if not o.page:
+        live = [k for k in numbers if draw(o.seed, k).realtime]
         with busy((os.cpu_count() or 1) if o.load else 0):
-            workers = [
-                FORK.Process(target=work, args=(o.seed, numbers[i :: o.workers], results, o.count == 1))
-                for i in range(min(o.workers, len(numbers)))
-            ]
-            try:
-                for worker in workers:
-                    worker.start()
-                for worker in workers:
-                    worker.join()
-            finally:
-                for worker in workers:
-                    worker.terminate()
+            run_workers(o.workers, [k for k in numbers if k not in live], (o.seed, results, o.count == 1))
+            run_workers(1, live, (o.seed, results, o.count == 1))  # real time needs two cores for itself
     if o.count > 1 or o.page:
         words = " ".join(["python", "benchmarks/safety_campaign.py", *(w for w in sys.argv[1:] if w != "--page")])
         page(pd.DataFrame(sorted(read_results(results).values(), key=lambda r: r["number"])), o.seed, words)
+
+
+def run_workers(count: int, numbers: list[int], settings: tuple[int, Path, bool]) -> None:
+    """Run faults in `count` processes; settings: seed, file of results, whether to keep a fault's files."""
+    seed, *others = settings
+    parts = [numbers[i::count] for i in range(min(count, len(numbers)))]
+    workers = [FORK.Process(target=work, args=(seed, part, *others)) for part in parts]
+    try:
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+    finally:
+        for worker in workers:
+            worker.terminate()
 
 
 def read_results(path: Path) -> dict[int, dict]:

@@ -33,6 +33,7 @@ from r2s.arm import realtime_process
 from r2s.arm.clients import fci
 from r2s.arm.clients.emulated import CLIENTS
 from r2s.arm.clients.fr3 import within_fr3
+from r2s.arm.clients.franka import Franka
 from r2s.arm.emulator.control import MAX_MISSED, Control
 from r2s.arm.emulator.robot_model import urdf
 from r2s.arm.emulator.server import Server, open_port
@@ -279,7 +280,8 @@ class Motion(NamedTuple):
         policy: (step) -> action (7,) of an episode; it may stall. settings: of `PolicyRunner`.
         thinks_s: s for which the operator thinks. loaded: see `record`.
         far: share of FAR and 1.2 FAR, the lengths of an approach and of a recording. forks: see `fork_the_arm`.
-        wakes: whether frozen processes go on after the motion.
+        wakes: whether frozen processes go on after the motion. declared: kg of the load that the client expects.
+        realtime: whether the client asks this computer for real time.
     """
 
     kind: str
@@ -291,6 +293,8 @@ class Motion(NamedTuple):
     loaded: bool = False
     forks: bool = True
     wakes: bool = False
+    declared: float | None = None
+    realtime: bool = False
 
 
 def fork_the_arm() -> None:
@@ -324,7 +328,7 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
         _put(folder / "idle", "")
         time.sleep(60)
 
-    open_arm = partial(CLIENTS[client][0], robot, address, operator=Refuses(folder, motion.thinks_s))
+    open_arm = partial(_open, robot, client, address, Refuses(folder, motion.thinks_s), motion)
     try:
         with ExitStack() as stack:
             if motion.live:
@@ -346,6 +350,12 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
         if (recording := getattr(error, "recording", None)) is not None:
             result["rows"] = len(recording.t)
     _put(folder / "result.json", json.dumps(result))
+
+
+def _open(robot: Robot, client: str, address: str, operator: Refuses, motion: Motion) -> Franka:
+    arm = CLIENTS[client][0](robot, address, operator=operator, declared_payload=motion.declared)
+    arm.realtime = motion.realtime  # without a real-time kernel, which the client's own option requires
+    return arm
 
 
 def _run_policy(arms: RealtimeRunner | PolicyRunner, motion: Motion, result: dict) -> None:

@@ -106,6 +106,8 @@ class Timing:
         """Add a cycle of `CommandLoop`: its clock, and the state after it."""
         began, driven, adapted = clock
         (sent_at, t), self._last = self._last, (driven, state.t)
+        if not t:  # the first command starts the motion, which takes longer than a cycle
+            self._last = 0.0, state.t
         self.driver.append(driven - began)
         if adapts:
             self.adapter.append(adapted - driven)

@@ -12,10 +12,12 @@ import numpy as np
 
 from r2s.arm.clients import fci
 from r2s.arm.emulator.control import Control
+from r2s.arm.realtime import realtime_section
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
 IDLE_MS = 20  # between states of an idle arm in lock-step; the clients do not need 1 kHz there
+ANSWER_S = 0.9 * SIM_DT  # least time from a state to the next one, in real time; our choice, a box keeps 1 ms
 BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
 
 
@@ -38,6 +40,10 @@ class Server:
     def serve(self, parent: int | None = None, note: Callable[[str], None] = lambda line: None) -> None:
         """Run until the pipe `parent` closes (None: forever); `note` receives a line per event."""
         self._note = note
+        with realtime_section() if self._realtime else contextlib.nullcontext():
+            self._serve(parent)
+
+    def _serve(self, parent: int | None) -> None:
         while True:
             due = None if self._due is None else max(0.0, self._due - time.monotonic())
             watched = [x for x in (parent, self._socket, self._tcp, self._udp) if x is not None]
@@ -81,7 +87,7 @@ class Server:
         self._client: tuple[str, int] | None = None
         self._move: int | None = None  # id of the Move request whose motion is active
         self._started = False  # whether that motion has had its first answer
-        self._answer: np.ndarray | None = None  # Nm, to the newest state; in real time applied at the cycle's end
+        self._ahead = False  # in real time, whether the newest state was answered and its cycle has run
         self._due: float | None = None  # when the next state is sent; None: only after an answer
         self._message_id = 0
 
@@ -150,7 +156,7 @@ class Server:
             self._reply("Move", number, status["NotPossible"])
         else:
             self._control.begin()
-            self._move, self._started, self._answer = number, False, None
+            self._move, self._started, self._ahead = number, False, False
             self._wait = BACKOFF_S[0]
             self._reply("Move", number, status["MotionStarted"])
             self._due = time.monotonic()
@@ -182,10 +188,11 @@ class Server:
                     self._started = True
                     self._control.first_answer()
                     self._send()
-                elif self._realtime:
-                    self._answer = command["tau_J_d"].copy()
-                else:
+                elif not self._realtime:
                     self._cycle(command["tau_J_d"].copy())
+                elif not self._ahead:  # at once: a real box computes beside the client, not in the client's time
+                    self._control.cycle(command["tau_J_d"].copy())
+                    self._ahead = True
 
     def _cycle(self, tau: np.ndarray | None) -> None:
         """Run one cycle, and the following ones whose states are dropped, because the client cannot answer them."""
@@ -193,6 +200,10 @@ class Server:
         while self._control.dropped and not self._realtime:
             self._message_id += 1
             self._control.cycle(None)
+        self._report()
+
+    def _report(self) -> None:
+        """Send the state after a cycle, or the end of an aborted motion."""
         if self._control.running:
             self._send()
         else:
@@ -203,13 +214,15 @@ class Server:
         """Send the state that is due, and set the time of the next one."""
         assert self._due is not None
         if self._started and self._realtime:
-            answer, self._answer = self._answer, None
-            self._cycle(answer)
+            if not self._ahead:
+                self._control.cycle(None)
+            self._ahead = False
+            self._report()
         else:
             self._send()
         if self._realtime:
-            # after a stall of this computer the robot's time resumes here, without a burst of states
-            self._due = max(self._due, time.monotonic() - SIM_DT) + SIM_DT
+            # this process may wake late; a box does not, so that must not shorten the client's time to answer
+            self._due = max(self._due + SIM_DT, time.monotonic() + ANSWER_S)
         elif self._move is None:
             self._due = time.monotonic() + IDLE_MS * SIM_DT
         else:
