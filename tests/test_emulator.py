@@ -6,6 +6,7 @@ The clients use the real packages (panda-python, pylibfranka); tests of a missin
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -31,7 +32,7 @@ from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.control import CUTOFF_HZ, Control, Fault
 from r2s.arm.emulator.process import Emulator, _read_robot, main
 from r2s.arm.emulator.robot_model import urdf
-from r2s.arm.emulator.server import open_port
+from r2s.arm.emulator.server import Server, open_port
 from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes, named_signals, signal_sizes
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.simulated import SimulatedArm
@@ -317,6 +318,37 @@ def test_wrong_faults_and_thresholds_are_refused(panda):
         CollisionThresholds([1.0] * 3, CAUTIOUS.force)
     with pytest.raises(UserError, match=r"collision_force: expected .*, got 0.0"):
         CollisionThresholds(CAUTIOUS.torque, [0.0] * 6)
+
+
+def test_a_box_that_wakes_late_does_not_shorten_the_clients_time(panda, monkeypatch):
+    """An answer counts however late the emulator's own process wakes up, and the next state leaves it time."""
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("r2s.arm.emulator.server.time", clock)
+    control, now = Control(Bare(panda), 5), 0.0
+    with open_port() as port, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        server = Server(port, control, "", 5, realtime=True)
+        client.bind((server.address, 0))
+        server._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        server._udp.bind((server.address, 0))
+        server._udp.setblocking(False)
+        server._client, server._move, server._due = client.getsockname(), 1, now
+        control.begin()
+
+        def answer():
+            command = np.zeros((), fci.COMMAND[5])
+            command["message_id"] = np.frombuffer(client.recv(4096), fci.STATE[5])[0]["message_id"]
+            client.sendto(command.tobytes(), server._udp.getsockname())
+            server._commands()
+
+        for late in (0.0, 0.2e-3, 0.7e-3, 5e-3, 0.0, 0.4e-3):  # s
+            now = server._due + late
+            server._tick()
+            assert server._due - now >= 0.9 * SIM_DT - 1e-12  # the time from this state to the next one
+            answer()
+            if not server._ahead:  # the first answer starts the motion, with a state of its own
+                answer()
+        assert control.state["control_command_success_rate"] == 1.0
+        server._udp.close()
 
 
 @pytest.mark.slow  # a loaded machine makes the clients time out
