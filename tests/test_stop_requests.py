@@ -31,14 +31,18 @@ from robot_side import (
     Motion,
     RobotSide,
     run_sides,
+    swing,
 )
 
+from r2s.arm.command_loop import REST_S
 from r2s.arm.drive_cycle import STILL
 from r2s.arm.driver import ADDED, DAMP_S, Driver
 from r2s.arm.emulator.control import MAX_MISSED, Fault
-from r2s.arm.interface import ArmState
-from r2s.arm.stop_request import GRACE_S
+from r2s.arm.interface import ArmState, StopRequested
+from r2s.arm.recorder import record
+from r2s.arm.stop_request import GRACE_S, handled_signals, watched
 from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.excitation.motion import Excitation
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, load_robot
 
@@ -324,6 +328,38 @@ def test_a_stop_holds_what_an_adapter_compensates(realtime, sides, tmp_path):
     )
     check_stop(log, cause_of(log, realtime))
     assert np.abs(log.after(cause_of(log, realtime)).dq).max() < STILL
+
+
+@pytest.mark.parametrize(("load", "declared"), [(0.24, 1.3), pytest.param(1.3, 0.0, marks=pytest.mark.slow)])
+def test_a_stop_finds_what_holds_a_wrong_load(load, declared, sides, tmp_path):
+    """An arm whose gravity compensation is wrong by 1 kg, which nothing knows yet, comes to rest within REST_S.
+
+    With the compensation of the moment of the stop alone, its wrist rose at 1.3 rad/s and got faster.
+    """
+    make = partial(RigidTwin, PANDA, 9, payload=load, declared_payload=declared)
+    own = {"live": False, "loaded": True, "declared": declared, "far": 0.5}
+    log, result, _ = run(sides, tmp_path, "record", [Kill(0, 461, "arm", signal.SIGTERM)], motion=own, make_arm=make)
+    assert result["error"] == "SIGTERM"
+    after = log.after(cause_of(log))
+    (end,) = np.flatnonzero(after.kind == ENDED)
+    stopping = after.between(1, int(end))
+    assert len(stopping.kind) <= (DAMP_S + REST_S) / SIM_DT + LAG
+    assert np.abs(stopping.dq[-1]).max() < REST
+
+
+def test_a_request_in_the_last_cycle_of_a_recording_counts():
+    """The plan is over before the driver has brought the arm to rest; the recording still ends as stopped."""
+    whole = swing(PANDA, 0.5)
+    plan = Excitation(*(column[: len(whole.t) // 2] for column in (whole.t, whole.q, whole.dq, whole.ddq)))
+
+    def late():
+        return "a test" if arm.read().t >= plan.t[-2] else None
+
+    arm = RigidTwin(PANDA, 3)
+    with watched(late), handled_signals(), pytest.raises(StopRequested, match="a test") as stop:
+        record(arm, plan)
+    assert len(stop.value.recording.t) == len(plan.t)
+    assert (np.abs(arm.read().dq) < REST).all()
 
 
 def test_a_contact_releases_the_compensation():

@@ -98,7 +98,7 @@ def test_a_motion_with_too_few_commands_does_not_count(client):
         with pytest.raises(ArmStopped) as stop:
             record(arm, motion(0.0))
         assert str(stop.value) == line
-        assert len(stop.value.recording.t) == ROWS
+        assert len(stop.value.recording.t) == ROWS + 1
         arm.realtime = False
         record(arm, motion(0.0))
         arm.close()

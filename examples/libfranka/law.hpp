@@ -159,6 +159,9 @@ class Driver {
       target_ = {};
       if (seen && damped_ == 1) share_ = std::min(1.0, fastest);
       share_ = std::max(0.0, share_ - c::cycle_s / c::brake_s);
+      for (int j = 0; j < n && seen && share_ == 0.0; ++j)  // a spring against joints that a load moves on
+        if (std::abs(dq[j]) > c::still)
+          held_[j] = std::clamp(held_[j] - c::cycle_s * c::spring[j] * dq[j], -c::held_most[j], c::held_most[j]);
     } else if (commanded_) {
       Joints wanted;
       c::control_law(q.data(), dq.data(), command_.data(), memory_.data(), wanted.data());
@@ -188,7 +191,7 @@ class Driver {
  private:
   Command command_{};
   std::array<double, c::memories + 1> memory_{};  // C++ has no empty array
-  Joints target_{}, filtered_{}, sent_{};
+  Joints target_{}, filtered_{}, sent_{}, held_{};
   double share_ = 1.0;
   long fade_, cycle_ = 0, silent_ = 0, damped_ = 0;
   bool rests_ = false, commanded_ = false;
@@ -223,7 +226,7 @@ class Driver {
     model.equations(dq, mass, bias);
     for (int j = 0; j < n; ++j) {
       mass[j][j] += c::added[j];
-      out[j] = (1.0 - std::min(near, 1.0)) * effort[j];
+      out[j] = (1.0 - std::min(near, 1.0)) * (effort[j] + held_[j]);
       if (c::friction[j] > 0.0 && c::added[j] > 0.0)
         eaten[j] = c::sure * c::friction[j] * std::abs(std::tanh(dq[j] / c::dry + out[j] / c::friction[j]));
       high[j] = c::rate * (allowed(c::q_high[j] - q[j], j) - dq[j]);

@@ -13,6 +13,7 @@ from contextlib import suppress
 import numpy as np
 
 from r2s.adaptation.adapter import Adapter
+from r2s.arm.drive_cycle import ADDED, SPRING, turn_against
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Holds, Operated, StopRequested
 from r2s.arm.stop_request import begin_ending, requested, serve
@@ -119,15 +120,31 @@ class CommandLoop:
             self._raise(str(self.driver.stopping), self.driver.held)
         return self.state
 
-    def rest(self, hold: np.ndarray | float = 0.0) -> None:
-        """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s."""
-        damping = REST_RATE / np.diag(self._inverse(self.state.q[None])[0])
-        limit, step = REST_SHARE * self.arm.robot.tau_max, self.arm.robot.step_max
+    def rest(self, hold: np.ndarray | None = None) -> None:
+        """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s.
+
+        Unless the arm reports a contact, `hold` changes against joints that go on sliding, as in the driver; without
+        it, as after a contact, the command goes to zero.
+        """
+        inertia, robot = 1 / np.diag(self._inverse(self.state.q[None])[0]), self.arm.robot
+        limit, step, most = REST_SHARE * robot.tau_max, robot.step_max, ADDED * robot.tau_max
+        held = np.zeros(robot.n) if hold is None else hold.copy()
         for k in range(round(REST_S / SIM_DT)):
             s, slow = self.state, STILL if k * SIM_DT < SLIDES_S else SLIDING
-            if np.abs(s.dq).max() < slow and (np.abs(s.tau_J_d - hold) <= step).all():
+            if np.abs(s.dq).max() < slow and (np.abs(s.tau_J_d - held) <= step).all():
                 return
-            self._cycle(hold + np.clip(-damping * s.dq, -limit, limit))
+            if hold is not None and not s.in_contact:
+                turn_against(s.dq, SPRING**2 * inertia, most, held)
+            self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
+
+    def settle(self) -> None:
+        """At the end of a plan: if the driver is bringing the arm to rest, let it, and raise its reason.
+
+        Raises:
+            StopRequested, ArmStopped: as a cycle.
+        """
+        while self.driver.stopping is not None:
+            self._cycle(None)
 
     def halt(self, reason: str) -> None:
         """Bring the arm to rest without torque, as after a contact, then raise ArmStopped with `reason`.

@@ -17,7 +17,9 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, STEP, TAU_MAX, WORK, JointDynamics, filter_torque
 
 STILL = 0.02  # rad/s, below which a joint is at rest
-RELEASE = 0.2  # 1/s, share of tau_max by which a held compensation falls while it pushes along a motion; our choice
+# rad/s: a joint that goes on sliding while it is brought to rest meets a spring of this frequency, as a change of the
+# held compensation. Our choice, half of the rate of the safety filter, which damps it.
+SPRING = 15.0
 ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
 TOO_NEAR = 100  # and this value plus the number of a pair of `CollisionCheck`
@@ -82,11 +84,13 @@ class Given(NamedTuple):
 class Bounds(NamedTuple):
     """Limits of an arm: target and adapter torque (n,) Nm, stop limits (n,) rad and rad/s, and three numbers.
 
-    deadline: s without a command. factor: of the low-pass. fade: cycles of the soft start.
+    spring: (n,) Nm/rad, see `turn_against`. deadline: s without a command. factor: of the low-pass. fade: cycles of
+    the soft start.
     """
 
     torque: np.ndarray
     added: np.ndarray
+    spring: np.ndarray
     q_low: np.ndarray
     q_high: np.ndarray
     dq_max: np.ndarray
@@ -127,10 +131,26 @@ def _watch(i, q, dq, given, bounds, memory):
 
 
 @njit(cache=True)
+def turn_against(dq, spring, most, held):
+    """Move a held compensation (n,) Nm against joints at dq (n,) rad/s that should be at rest.
+
+    What keeps them sliding is a load that the compensation does not know, or an estimate with the motion's friction.
+
+    Args:
+        spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound of the compensation.
+    """
+    for j in range(len(held)):
+        if abs(dq[j]) > STILL:
+            held[j] = min(max(held[j] - SIM_DT * spring[j] * dq[j], -most[j]), most[j])
+
+
+@njit(cache=True)
 def _compensate(i, dq, stopping, given, bounds, memory, target):
     """Add the adapter's torque to the target (n,) Nm of arm i, or the torque held while it is brought to rest."""
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
+    if stopping and memory.share[i] == 0.0:
+        turn_against(dq, bounds.spring, bounds.added, memory.held[i])
     for j in range(len(target)):
         most = bounds.added[j]
         if given.contact[i]:  # what an arm pushes against must not be pushed on
@@ -138,9 +158,6 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
         elif not stopping:
             held = faded * min(max(given.added[i, j], -most), most) if adds else 0.0
             memory.held[i, j] = min(max(held + given.hold[i, j], -most), most)
-        elif memory.share[i] == 0.0 and abs(dq[j]) > STILL and dq[j] * memory.held[i, j] > 0:
-            # an estimate that contains friction of the motion would keep the joint sliding
-            memory.held[i, j] -= min(RELEASE * SIM_DT * most / ADDED, abs(memory.held[i, j])) * np.sign(dq[j])
         if stopping:
             target[j] += memory.held[i, j]
         elif adds:

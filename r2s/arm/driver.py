@@ -20,6 +20,7 @@ from r2s.arm.drive_cycle import (
     REQUESTED,
     RUNS,
     SILENT,
+    SPRING,
     TOO_NEAR,
     Bounds,
     Given,
@@ -33,6 +34,7 @@ from r2s.physics.collision import CollisionCheck, empty_scene
 from r2s.physics.control_laws import BUILT_IN, ControlLaw, law_number, registered, torque_law
 from r2s.physics.fence import Fence
 from r2s.physics.newton_euler import links_of
+from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
 
@@ -41,6 +43,11 @@ PERIODS = 2.5  # control periods
 DAMP_S = 0.5  # s, longest time to bring an arm to rest
 Q_INSIDE = 0.02  # rad inside the position limits, where the arm is stopped
 DQ_INSIDE = 0.95  # share of the velocity limits, where the arm is stopped
+
+
+def spring(robot: Robot) -> np.ndarray:
+    """Return the stiffness (n,) Nm/rad of `turn_against`, from the nominal inertia at home."""
+    return SPRING**2 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
 
 
 class DriverBatch:
@@ -83,6 +90,7 @@ class DriverBatch:
         self._bounds = Bounds(
             torque=np.array(torque, dtype=float),
             added=ADDED * robot.tau_max,
+            spring=spring(robot),
             q_low=robot.q_min + Q_INSIDE,
             q_high=robot.q_max - Q_INSIDE,
             dq_max=DQ_INSIDE * speed_share * robot.dq_max,

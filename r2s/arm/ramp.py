@@ -121,6 +121,7 @@ def ramp(
                     drive.place(place)
                 if progress is not None:
                     progress(len(recorded), len(which))
+            drive.settle()
             drive.end()
         timing.check(arm)
     finally:
@@ -155,6 +156,10 @@ class _Drive:
     def state(self) -> ArmState:
         """The latest state."""
         return self._loop.state
+
+    def settle(self) -> None:
+        """Raise ArmStopped if the driver is bringing the arm to rest."""
+        self._loop.settle()
 
     def end(self) -> None:
         """Stop the arm."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
-from r2s.arm.interface import Arm, ArmStopped, named_signals, signal_sizes, speed_share
+from r2s.arm.interface import Arm, ArmState, ArmStopped, named_signals, signal_sizes, speed_share
 from r2s.arm.realtime import Timing
 from r2s.arm.tracking_controller import (
     CUTOFF_HZ,
@@ -76,43 +76,57 @@ def record(
     follow, most = (LoadedTrackingController, LOADED_DEVIATION) if loaded else (TrackingController, MAX_DEVIATION)
     room = allowed_deviation(Space(arm.robot, table=table, z_min=z_min), excitation, most)
     controller = follow(arm.robot, excitation, room)
-    rows = len(excitation.t)
-    t = np.empty(rows)
-    q, dq, tau = (np.empty((rows, arm.robot.n)) for _ in range(3))
-    signals = np.empty((rows, sum(signal_sizes(arm.robot.n).values())))
     limits = TORQUE_SHARE * arm.robot.tau_max, 2 * friction_margin(arm.robot)
     fence = CollisionCheck(arm.robot, table=table)
     loop = CommandLoop(arm, Driver(arm.robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=share))
     loop.place(excitation.q[0])
-
-    def recorded(rows: int) -> Recording:
-        known = named_signals(signals[:rows], arm.robot.n)
-        return Recording(
-            t=t[:rows], q=q[:rows], dq=dq[:rows], tau=tau[:rows], torque=torque, name=arm.robot.name, signals=known
-        )
-
-    k, timing = 0, timing or Timing()
+    rows, timing = _Rows(len(excitation.t), arm.robot, torque), timing or Timing()
     timing.begin()
     try:
-        for k in range(rows):
+        for k in range(len(excitation.t)):
             state = loop.state
-            t[k], q[k], dq[k], signals[k] = state.t, state.q, state.dq, state.signals
             if (reason := controller.deviation(k, state)) is not None:
                 loop.halt(reason)
             loop(controller(k, state), controller.offset)
             timing.cycle(loop.clock, loop.state)
-            tau[k] = loop.sent if torque == "commanded" else state.tau_J
-            if progress is not None and (k % PROGRESS_EVERY == 0 or k == rows - 1):
-                progress(k + 1, rows)
+            rows.add(state, loop.sent)
+            if progress is not None and (k % PROGRESS_EVERY == 0 or k == len(excitation.t) - 1):
+                progress(k + 1, len(excitation.t))
+        loop.settle()
         loop.end()
         timing.check(arm)
     except ArmStopped as stop:
-        if k >= MIN_ROWS:
-            stop.recording = recorded(k)
+        if rows.filled >= MIN_ROWS:
+            stop.recording = rows.recording()
         raise
     finally:
         loop.end()
-    return recorded(rows)
+    return rows.recording()
+
+
+class _Rows:
+    """The rows of a recording, allocated before the motion; `filled` counts them."""
+
+    def __init__(self, rows: int, robot: Robot, torque: str):
+        self._robot, self._torque = robot, torque
+        self._t = np.empty(rows)
+        self._q, self._dq, self._tau = (np.empty((rows, robot.n)) for _ in range(3))
+        self._signals = np.empty((rows, sum(signal_sizes(robot.n).values())))
+        self.filled = 0
+
+    def add(self, state: ArmState, sent: np.ndarray) -> None:
+        """Keep the state of the next cycle, and the command (n,) Nm sent in it."""
+        k = self.filled
+        self._t[k], self._q[k], self._dq[k], self._signals[k] = state.t, state.q, state.dq, state.signals
+        self._tau[k] = sent if self._torque == "commanded" else state.tau_J
+        self.filled += 1
+
+    def recording(self) -> Recording:
+        """Return the rows so far."""
+        rows = self.filled
+        t, q, dq, tau = (x[:rows] for x in (self._t, self._q, self._dq, self._tau))
+        known = named_signals(self._signals[:rows], self._robot.n)
+        return Recording(t=t, q=q, dq=dq, tau=tau, torque=self._torque, name=self._robot.name, signals=known)
 
 
 def _check(robot: Robot, e: Excitation, share: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 LAW_JOINT = (
     *("q_low", "q_high", "q_fade", "most", "slowing", "offset", "dq_max", "added", "tau_max", "step"),
-    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop"),
+    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop", "spring", "held_most"),
 )
 LAW_NUMBER = (
     *("cycle_s", "low_pass", "rate", "approach", "allowed", "nothing", "exact", "dry", "sure", "pivots", "rounds"),
@@ -136,7 +136,7 @@ class Driver:
     def reset(self) -> None:
         """Begin a motion, from zero torque."""
         n = self._model.n
-        self.effort, self._target, self._filtered, self._sent = np.zeros((4, n))
+        self.effort, self._target, self._filtered, self._sent, self._held = np.zeros((5, n))
         self.stopping: str | None = None
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
         self.limited = 0
@@ -175,6 +175,10 @@ class Driver:
             if seen and self._damped == 1:
                 self._share = min(1.0, float((np.abs(dq) / j["most"]).max()))
             self._share = max(0.0, self._share - c["cycle_s"] / c["brake_s"])
+            if seen and self._share == 0.0:  # a spring against joints that a load or a friction estimate moves on
+                slides = np.abs(dq) > c["still"]
+                turned = self._held - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
+                self._held = np.clip(turned, -j["held_most"], j["held_most"])
         elif self._command is not None:
             target = self._command if self._control is None else self._control(q, dq, self._command)
             if np.isfinite(target).all():
@@ -224,7 +228,7 @@ class Driver:
             float((np.maximum(q - j["q_high"], j["q_low"] - q) / j["q_fade"]).max()),
         )
         left = 1.0 - min(max(near, 0.0), 1.0)
-        out = left * self.effort
+        out = left * (self.effort + self._held)
         mass, bias = self._model.equations(dq)
         mobility = np.linalg.inv(mass + np.diag(j["added"]))
         ddq = mobility @ (out - bias)

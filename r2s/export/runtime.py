@@ -27,7 +27,7 @@ from r2s.export.fences import PolicyThread, check_plan, check_start, outside, st
 from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number, per_joint
 from r2s.export.plan import OF_PLAN, Follower, check_goal, plan_of, width
 
-FORMAT = 4
+FORMAT = 5
 CHANGED = "{} is not what was exported: its sha256 is another"
 CONVENTION = "without gravity"
 # sources of observation terms; `pull` is J^T error

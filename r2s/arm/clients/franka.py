@@ -295,6 +295,7 @@ class Franka:
                     integral = np.where(error * last_error < 0, 0, integral)
                     last_error = error
                 loop(controller(k, s) + integral, controller.offset)
+            loop.settle()
             self._end()
         except ArmStopped as reason:
             self.blocked = self.blocked or str(reason)
