@@ -18,7 +18,7 @@ NUMERIC = (
 )
 # a million cycles, whose property is no matter of rounding; what torch compiles, for the processor that it finds
 LEFT_OUT = ("hostile_policy", "nor_those_of_an_fr3", "compiled_learns", "without_a_compiler")
-# what a processor must have for a row (in numpy's names for the levels of x86-64), and what the libraries are told
+# what a processor must have for a row (in numpy's names for the levels of x86-64), and the settings of the libraries
 PROCESSORS = {
     # a server with AVX-512, as first built
     "skylakex": ("X86_V4", {"OPENBLAS_CORETYPE": "SkylakeX"}),

@@ -144,7 +144,7 @@ def test_a_joint_that_does_not_move_or_does_not_rest_leaves_the_others_alone(pan
 
 
 def test_an_arm_that_stops_says_so(panda, truth):
-    """ArmStopped goes through, and the arm has been told to stop."""
+    """ArmStopped goes through, and the arm is stopped."""
 
     class Touchy(Watched):
         stops = 0
@@ -271,7 +271,7 @@ def test_what_does_not_move_is_listed_and_the_rest_survives():
     parts = [
         by_hand(t, 0.2),
         by_hand(t, 9.0),  # nothing moves
-        by_hand(t, 0.25),  # told the wrong way
+        by_hand(t, 0.25),  # labelled the wrong way
         by_hand(t, 0.21),
         by_hand(t, 0.02, wait=0.04),  # gone before the command rises
         by_hand(np.arange(0, 0.4, 0.02), 0.1, far=0.06),  # too few rows
@@ -398,11 +398,11 @@ def test_ramps_of_a_users_own(tmp_path, suffix):
 
 
 def test_where_a_ramp_ends(tmp_path):
-    """At a clock that starts anew, a trajectory, a pause; joint and sign may be told once for each ramp."""
+    """At a clock that starts anew, a trajectory, a pause; joint and sign may be given once per ramp."""
     columns = own_ramps()
     back = np.flatnonzero(np.diff(columns["t"]) < 0) + 1
     edges = [0, *back, len(columns["t"])]
-    told = {k: columns[k][edges[:-1]] for k in ("joint", "sign")}
+    labels = {k: columns[k][edges[:-1]] for k in ("joint", "sign")}
     each = np.repeat(np.arange(5), np.diff(edges))
     one = {k: np.ones(len(each)) for k in ("joint", "sign")} | {
         k: np.concatenate([columns[k][: back[0]]] * 5) for k in ("q", "tau_J_d")
@@ -410,8 +410,8 @@ def test_where_a_ramp_ends(tmp_path):
     rows = np.tile(np.arange(back[0]), 5)
     clock = columns["t"][: back[0]]
     for change in (
-        told,
-        told | {"t": np.arange(len(each)) * 2e-3, "trajectory": 7 - each},
+        labels,
+        labels | {"t": np.arange(len(each)) * 2e-3, "trajectory": 7 - each},
         {k: v[: len(rows)] for k, v in one.items()} | {"t": np.tile(clock, 5)},
         {k: v[: len(rows)] for k, v in one.items()} | {"t": np.concatenate([clock + 2 * k for k in range(5)])},
     ):

@@ -112,7 +112,7 @@ def loaded(folder: Path) -> ModuleType:
 
 
 def arm_of(exported: Exported, **other: Any) -> dict[str, Any]:
-    """Return what a runtime is told of the arm, with some of it changed."""
+    """Return the arm's state for a runtime, with some of it changed."""
     r = exported.robot
     own = {"joints": [f"joint{j + 1}" for j in range(r.n)], "cycle_hz": 1000, "torque": "without gravity"}
     own |= {"q_min": r.q_min, "q_max": r.q_max, "dq_max": r.dq_max, "tau_max": r.tau_max, "dtau_max": r.dtau_max}
@@ -140,11 +140,11 @@ def hostile(robot: Robot, task: Any, cycles: int) -> dict[str, np.ndarray]:
         rows = np.flatnonzero(rng.random(cycles) < odd)
         values[rows, rng.integers(n, size=len(rows))] = rng.choice([np.nan, np.inf, -np.inf], len(rows))
     applied = np.where(rng.random((cycles, 1)) < 0.05, 50 * rng.normal(size=(cycles, n)), np.nan)
-    told = (np.arange(cycles) % 20 == 0) | (rng.random(cycles) < 0.1)
+    new = (np.arange(cycles) % 20 == 0) | (rng.random(cycles) < 0.1)
     begin = np.arange(cycles) % EPISODE == 0
     q[begin], dq[begin] = robot.q_home + rng.uniform(-0.1, 0.1, (begin.sum(), n)), 0.0  # else it is refused
     goal, which = task.goals(robot, rng, cycles // EPISODE + 1), np.arange(cycles) // EPISODE
-    motion = {"q": q, "dq": dq, "applied": applied, "target": target, "told": told, "begin": begin}
+    motion = {"q": q, "dq": dq, "applied": applied, "target": target, "new": new, "begin": begin}
     return motion | {"goal": goal, "which": which}
 
 
@@ -161,7 +161,7 @@ def driven(
         sent = tau[k - 1] if k and not motion["begin"][k] else np.zeros(robot.n)
         last[k] = np.where(np.isnan(motion["applied"][k]), sent, motion["applied"][k])
         state = ArmState(1e-3 * k, motion["q"][k], motion["dq"][k], np.zeros(robot.n), last[k])
-        tau[k] = driver(state, motion["target"][k] if motion["told"][k] else None)
+        tau[k] = driver(state, motion["target"][k] if motion["new"][k] else None)
     return motion | {"tau": tau, "last": last}
 
 
@@ -177,7 +177,7 @@ def by_law(contract: dict[str, Any], motion: dict[str, np.ndarray]) -> np.ndarra
     for k in range(len(out)):
         if motion["begin"][k]:
             driver.reset()
-        target = motion["target"][k] if motion["told"][k] else None
+        target = motion["target"][k] if motion["new"][k] else None
         with np.errstate(invalid="ignore"):
             out[k] = driver(motion["q"][k], motion["dq"][k], motion["last"][k], target)
     return out
@@ -259,11 +259,11 @@ def by_r2s(exported: Exported, motion: dict[str, np.ndarray]) -> dict[str, np.nd
         target = None
         if (k - since) % task.substeps == 0:
             share, changed = (driver.limited - changed) / task.substeps, driver.limited
-            told = as_state(kinematics, state, driver.effort, False, share)
+            seen = as_state(kinematics, state, driver.effort, False, share)
             goal = motion["goal"][motion["which"][k], None]
             with torch.no_grad():
-                action = exported.policy.action(torch.from_numpy(observe(task, control, told, goal, torque))).numpy()
-            target = control.command(action.astype(float), task, told.t, goal)[0]
+                action = exported.policy.action(torch.from_numpy(observe(task, control, seen, goal, torque))).numpy()
+            target = control.command(action.astype(float), task, seen.t, goal)[0]
         tau[k], stops[k] = driver(state, target), (driver.stopping is not None, driver.done)
     return motion | {"tau": tau, "last": last, "stops": stops}
 
@@ -329,7 +329,7 @@ def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
     command = [str(COMPILER), "-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
     command += ["-I", str(LIBFRANKA), "-I", str(exported.folder), "check.cpp", "-o", "check"]
     subprocess.run(command, cwd=tmp_path, check=True)
-    flags = np.column_stack([motion["told"], motion["begin"]])
+    flags = np.column_stack([motion["new"], motion["begin"]])
     rows = [motion["q"], motion["dq"], motion["last"], motion["target"], motion["goal"][motion["which"]], flags]
     sent = np.ascontiguousarray(np.concatenate(rows, 1), dtype=float)
     done = subprocess.run([tmp_path / "check"], input=sent.tobytes(), capture_output=True, check=True)
@@ -339,9 +339,9 @@ def test_the_law_in_cpp_is_that_of_r2s(exported, motion, tmp_path):
     kinematics, torque = Kinematics(exported.robot), exported.task.torque_limit(exported.robot)
     k = next(k for k in range(len(sent)) if motion["begin"][k] and np.isfinite(sent[k]).all())  # the effort is zero
     state = ArmState(0.0, motion["q"][k], motion["dq"][k], np.zeros(n), np.zeros(n))
-    told = as_state(kinematics, state, np.zeros(n), False, 0.0)
+    seen = as_state(kinematics, state, np.zeros(n), False, 0.0)
     assert np.allclose(
-        got[k, n:], exported.task.observe(told, motion["goal"][motion["which"][k], None], torque)[0], atol=1e-6
+        got[k, n:], exported.task.observe(seen, motion["goal"][motion["which"][k], None], torque)[0], atol=1e-6
     )
 
 
@@ -537,7 +537,7 @@ def test_a_contract_that_says_another_thing_is_refused(exported, runtime, tmp_pa
 
 
 def test_a_number_of_the_law_that_was_changed_is_refused(exported, runtime, tmp_path):
-    """What could be is told by the seal."""
+    """The seal shows what could be altered."""
     folder = edited(exported, tmp_path / "b", lambda c: c["law"]["joint"]["most"].__setitem__(0, 2.0), None)
     with pytest.raises(runtime.BundleError, match="its seal is another"):
         runtime.load(folder)

@@ -44,7 +44,7 @@ def simulated(exported: Exported) -> SimulatedArm:
 
 
 def hostile_stream(arm: SimulatedArm, torque: np.ndarray, seed: int) -> Iterator[tuple[ArmState, np.ndarray | None]]:
-    """Yield the state that a driver is told and the policy's torque (n,) Nm, None without a new one, cycle by cycle.
+    """Yield the state that a driver receives and the policy's torque (n,) Nm, None without a new one, cycle by cycle.
 
     The arm is commanded by the caller between two cycles. One fault of FAULTS, by the seed, begins between cycles
     BEGIN and END and lasts 1 to 80 cycles; in lost cycles the arm keeps its last command, and nothing is yielded.
@@ -52,14 +52,14 @@ def hostile_stream(arm: SimulatedArm, torque: np.ndarray, seed: int) -> Iterator
     rng, fault = np.random.default_rng(seed), FAULTS[seed % len(FAULTS)]
     n, first = len(torque), int(rng.integers(BEGIN, END))
     last, j = first + int(rng.integers(1, 80)), int(rng.integers(n))
-    wanted, told = np.zeros(n), arm.read()
+    wanted, state = np.zeros(n), arm.read()
     for k in range(LONGEST):
         faulty, real = first <= k < last, arm.read()
         if faulty and fault == "lost" and k < first + 19:  # with 20 lost cycles the arm stops itself
             arm.command(real.tau_J_d)
             continue
-        told = told if faulty and fault == "stale" else real
-        q, dq, applied, command = told.q.copy(), told.dq.copy(), told.tau_J_d.copy(), None
+        state = state if faulty and fault == "stale" else real
+        q, dq, applied, command = state.q.copy(), state.dq.copy(), state.tau_J_d.copy(), None
         if k % PERIOD == 0 and k < END + 100 and not (faulty and fault == "stall"):
             wanted = torque * rng.choice([-1.0, 0.3, 1.0], n)
             command = wanted
@@ -81,12 +81,12 @@ def obey(arm: SimulatedArm, exported: Exported, tau: np.ndarray) -> None:
     arm.command(last + np.clip(tau - last, -step, step))
 
 
-def check_rules(exported: Exported, told: ArmState, tau: np.ndarray) -> None:
-    """Assert that a command is finite, in range, and within a step of the torque that the driver was told."""
+def check_rules(exported: Exported, state: ArmState, tau: np.ndarray) -> None:
+    """Assert that a command is finite, in range, and within a step of the torque that the driver read."""
     robot = exported.robot
     assert np.isfinite(tau).all()
     assert (np.abs(tau) <= robot.tau_max + 1e-9).all()
-    assert (np.abs(tau - told.tau_J_d) <= 1e-3 * robot.dtau_max + 1e-9).all()
+    assert (np.abs(tau - state.tau_J_d) <= 1e-3 * robot.dtau_max + 1e-9).all()
 
 
 def check_end(exported: Exported, arm: SimulatedArm, stopped_at: int | None, k: int) -> None:
@@ -99,19 +99,19 @@ def check_end(exported: Exported, arm: SimulatedArm, stopped_at: int | None, k: 
 
 
 def campaign(exported: Exported) -> dict[str, np.ndarray]:
-    """Return what r2s's driver was told and sent, episode after episode, and how it ended; check its rules."""
+    """Return what r2s's driver received and sent, episode after episode, and how it ended; check its rules."""
     robot, task = as_driven(exported.robot), exported.task
     driver = episode_driver(robot, unfenced(robot, task), 0.0, exported.friction)
     rows: dict[str, list] = {name: [] for name in ("q", "dq", "last", "target", "flags", "tau", "ends")}
     for seed in range(EPISODES):
         driver.reset()
         arm, stopped_at, begin = simulated(exported), None, True
-        for k, (told, command) in enumerate(hostile_stream(arm, task.torque_limit(robot), seed)):
-            tau = driver(told, command)
-            check_rules(exported, told, tau)
+        for k, (state, command) in enumerate(hostile_stream(arm, task.torque_limit(robot), seed)):
+            tau = driver(state, command)
+            check_rules(exported, state, tau)
             target = np.zeros(robot.n) if command is None else command
             ends = [driver.stopping is not None, driver.done]
-            values = told.q, told.dq, told.tau_J_d, target, [command is not None, begin], tau, ends
+            values = state.q, state.dq, state.tau_J_d, target, [command is not None, begin], tau, ends
             for name, value in zip(rows, values, strict=True):
                 rows[name].append(np.array(value, dtype=float))
             begin, stopped_at = False, k if stopped_at is None and driver.stopping else stopped_at
@@ -132,11 +132,11 @@ def test_the_law_in_numpy_sends_what_r2s_sends(exported, stream):
     contract = json.loads((exported.folder / "contract.json").read_text())
     driver = Driver(contract["law"], Model(contract["model"]))
     for k in range(len(stream["q"])):
-        told, begin = stream["flags"][k]
+        new, begin = stream["flags"][k]
         if begin:
             driver.reset()
         with np.errstate(invalid="ignore", over="ignore"):
-            tau = driver(stream["q"][k], stream["dq"][k], stream["last"][k], stream["target"][k] if told else None)
+            tau = driver(stream["q"][k], stream["dq"][k], stream["last"][k], stream["target"][k] if new else None)
         assert np.abs(tau - stream["tau"][k]).max() < LAW_NM
         assert [driver.stopping is not None, driver.done] == stream["ends"][k].tolist()
 
@@ -184,20 +184,20 @@ def test_the_runtime_keeps_the_rules(exported):
         other.reset()
         other.act = act
         arm, stopped_at = simulated(exported), None
-        for k, (told, _) in enumerate(hostile_stream(arm, np.ones(exported.robot.n), seed)):
+        for k, (state, _) in enumerate(hostile_stream(arm, np.ones(exported.robot.n), seed)):
             if k == END + seed:
                 other.stop("asked for")
             if k == 300 and seed == 1:
                 other.act = lambda seen: 1 / 0
-            tau = other(told.q, told.dq, told.tau_J_d, goal + (k >= 300 and seed == 2))
-            check_rules(exported, told, tau)
+            tau = other(state.q, state.dq, state.tau_J_d, goal + (k >= 300 and seed == 2))
+            check_rules(exported, state, tau)
             stopped_at = k if stopped_at is None and other.driver.stopping else stopped_at
             if other.done:
                 break
             obey(arm, exported, tau)
         check_end(exported, arm, stopped_at, k)
         with pytest.raises(runtime.BundleError, match="the motion is over"):
-            other(told.q, told.dq, told.tau_J_d, goal)
+            other(state.q, state.dq, state.tau_J_d, goal)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"])
@@ -273,13 +273,13 @@ def test_the_loop_for_libfranka_ends_damped(exported, loop, script):
     done = loop(script)
     rows, text = done.stdout.rsplit(b"at rest after", 1)
     cycles = np.frombuffer(rows).reshape(-1, 2 + 3 * 7)
-    told, tau, dq = cycles[:, 2:9], cycles[:, 9:16], cycles[:, 16:]
+    state, tau, dq = cycles[:, 2:9], cycles[:, 9:16], cycles[:, 16:]
     assert done.returncode == 3, done.stderr
     assert done.stderr.decode().splitlines()[-1] == f"stopped: {SCRIPTS[script]}"
     assert b"mm from the goal" in text
     assert np.isfinite(tau).all()
     assert (np.abs(tau) <= exported.robot.tau_max).all()
-    assert (np.abs(tau - told) <= 1e-3 * exported.robot.dtau_max + 1e-9).all()
+    assert (np.abs(tau - state) <= 1e-3 * exported.robot.dtau_max + 1e-9).all()
     assert np.abs(tau).max() > 0.5
     assert cycles[:, 1].tolist() == [0.0] * (len(cycles) - 1) + [1.0]
     assert np.abs(dq[-1]).max() < 5 * STILL

@@ -170,7 +170,7 @@ def test_a_plan_is_made_of_joint_angles(planned, runtime):
 
 
 def test_a_plan_is_made_of_a_curve(planned):
-    """The hand begins at rest where it was told to and keeps to the curve; a curve out of reach is refused."""
+    """The hand begins at rest at its first point and keeps to the curve; a curve out of reach is refused."""
     robot, task = planned.robot, planned.task
 
     def line(u):

@@ -678,12 +678,12 @@ def test_rows_that_fill_a_window_up_make_nothing_surer():
 
 
 def test_what_trades_stays_known_together():
-    """Of two values only the sum is told, within 1e-3; draws of it are no wider, at a bound as well."""
+    """Of two values only the sum is identifiable, within 1e-3; draws of it are no wider, at a bound as well."""
     rng, windows, rows = np.random.default_rng(0), 40, 6
     r = 1e-3 * rng.standard_normal(windows * rows)
-    told = np.ones((windows * rows, 2)) / 1e-3 / np.sqrt(windows * rows)
+    weights = np.ones((windows * rows, 2)) / 1e-3 / np.sqrt(windows * rows)
     problem = SimpleNamespace(
-        linearize=lambda u: (np.append(r / 1e-3, 0 * u), np.concatenate([told, 10 * np.eye(2)])),
+        linearize=lambda u: (np.append(r / 1e-3, 0 * u), np.concatenate([weights, 10 * np.eye(2)])),
         clusters=np.repeat(np.arange(windows), rows),
     )
     for u in (np.full(2, 0.5), np.array([1.0, 0.5])):
@@ -694,10 +694,10 @@ def test_what_trades_stays_known_together():
 
 
 def test_of_two_values_that_are_both_out_one_comes_back():
-    """Only a difference is told; a draw that leaves the cube with both values stops one, and keeps the difference."""
-    told = np.array([1e3, -1e3])
+    """Only a difference is identifiable; a draw that leaves the cube with both values clips one and keeps it."""
+    weights = np.array([1e3, -1e3])
     u, step = np.array([1.0, 0.5]), np.array([0.7, 0.6])
-    kept = _inside(u, step[None], np.outer(told, told) + np.eye(2))[0]
+    kept = _inside(u, step[None], np.outer(weights, weights) + np.eye(2))[0]
     assert (np.abs(u + kept - 0.5) <= 0.5).all()
     assert kept[0] - kept[1] == pytest.approx(step[0] - step[1], abs=1e-5)
 
@@ -760,7 +760,7 @@ def test_what_is_left_out_is_not_fitted(clean):
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(arm, wrong, motion, change, message):
-    """Another arm, degrees, too little motion, and unknown names are told apart, each with the nearest match."""
+    """Another arm, degrees, too little motion, unknown names: each gives its own error with the nearest match."""
     joints, rows, scale = (change.get(k, v) for k, v in (("joints", 3), ("rows", 1500), ("scale", 1.0)))
     settings = {k: v for k, v in change.items() if k not in ("joints", "rows", "scale")}
     short = Recording(

@@ -1,4 +1,4 @@
-"""Motor torque: recordings of it and of currents, rotor inertia everywhere, and a payload told from the links."""
+"""Motor torque: recordings of it and of currents, rotor inertia everywhere, and a payload beside the links."""
 
 from dataclasses import replace
 
@@ -194,7 +194,7 @@ def test_the_jacobian_of_every_block_is_that_of_differences(arm, start, motion):
 
 
 @pytest.mark.parametrize("payload", [0.0, PAYLOAD])
-def test_a_payload_is_told_from_the_links(arm, start, truth, payload):
+def test_a_payload_is_distinguished_from_the_links(arm, start, truth, payload):
     """Of links and payload, both searched, only what motion left out needs is kept: a payload, or neither."""
     recording = recorded(arm, truth, 4.0, payload=payload)
     terms = ["offset", "link", "payload", "armature"]

@@ -72,7 +72,7 @@ def test_a_payload_is_there_from_on_to_off(panda):
         assert 0 < far["brief"] < far["always"]
 
 
-def test_training_physics_takes_a_payload_and_what_the_arm_was_told(panda):
+def test_training_physics_takes_a_payload_and_a_declared_one(panda):
     """A correctly declared payload leaves the arm at rest; a declared but missing payload accelerates it upwards."""
     nominal = nominal_dynamics(panda, **conf("friction/gaz2019"))
     free = replace(nominal, phi=np.zeros((7, 3)))

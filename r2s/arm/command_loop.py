@@ -13,7 +13,7 @@ from contextlib import suppress
 import numpy as np
 
 from r2s.adaptation.adapter import Adapter
-from r2s.arm.drive_cycle import ADDED, SPRING, turn_against
+from r2s.arm.drive_cycle import ADDED, SPRING, resist
 from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Holds, Operated, StopRequested
 from r2s.arm.stop_request import begin_ending, requested, serve
@@ -134,7 +134,7 @@ class CommandLoop:
             if np.abs(s.dq).max() < slow and (np.abs(s.tau_J_d - held) <= step).all():
                 return
             if hold is not None and not s.in_contact:
-                turn_against(s.dq, SPRING**2 * inertia, most, held)
+                resist(s.dq, SPRING**2 * inertia, most, held)
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:

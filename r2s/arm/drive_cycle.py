@@ -84,7 +84,7 @@ class Given(NamedTuple):
 class Bounds(NamedTuple):
     """Limits of an arm: target and adapter torque (n,) Nm, stop limits (n,) rad and rad/s, and three numbers.
 
-    spring: (n,) Nm/rad, see `turn_against`. deadline: s without a command. factor: of the low-pass. fade: cycles of
+    spring: (n,) Nm/rad, see `resist`. deadline: s without a command. factor: of the low-pass. fade: cycles of
     the soft start.
     """
 
@@ -131,7 +131,7 @@ def _watch(i, q, dq, given, bounds, memory):
 
 
 @njit(cache=True)
-def turn_against(dq, spring, most, held):
+def resist(dq, spring, most, held):
     """Move a held compensation (n,) Nm against joints at dq (n,) rad/s that should be at rest.
 
     What keeps them sliding is a load that the compensation does not know, or an estimate with the motion's friction.
@@ -150,7 +150,7 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
     adds = given.adds and np.isfinite(given.added[i]).all()
     faded = min(1.0, memory.cycle[i] / bounds.fade) if bounds.fade > 0 else 1.0
     if stopping and memory.share[i] == 0.0:
-        turn_against(dq, bounds.spring, bounds.added, memory.held[i])
+        resist(dq, bounds.spring, bounds.added, memory.held[i])
     for j in range(len(target)):
         most = bounds.added[j]
         if given.contact[i]:  # what an arm pushes against must not be pushed on

@@ -46,7 +46,7 @@ DQ_INSIDE = 0.95  # share of the velocity limits, where the arm is stopped
 
 
 def spring(robot: Robot) -> np.ndarray:
-    """Return the stiffness (n,) Nm/rad of `turn_against`, from the nominal inertia at home."""
+    """Return the stiffness (n,) Nm/rad of `resist`, from the nominal inertia at home."""
     return SPRING**2 / np.diag(InverseInertia(robot)(robot.q_home[None])[0])
 
 

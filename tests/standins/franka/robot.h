@@ -49,18 +49,18 @@ class Robot {
 
   void control(std::function<Torques(const RobotState&, Duration)> callback, bool, double) {
     auto next = std::chrono::steady_clock::now();
-    RobotState told = state_;
+    RobotState reported = state_;
     for (long cycle = 1;; ++cycle) {
       if (cycle == asked("signal_at")) std::raise(static_cast<int>(asked("signal")));
       const bool lost = asked("lost_at") > 0 && cycle >= asked("lost_at") && cycle < asked("lost_at") + asked("lost");
-      if (!lost) told = state_;  // else the arm moves on unseen
-      if (cycle == asked("nan_at")) told.q[2] = NAN;
-      if (cycle == asked("jump_at")) told.q[1] += 3.0;
-      if (cycle == asked("lie_at")) told.tau_J_d[3] += 5.0;
-      const Torques command = callback(told, {});
+      if (!lost) reported = state_;  // else the arm moves on unseen
+      if (cycle == asked("nan_at")) reported.q[2] = NAN;
+      if (cycle == asked("jump_at")) reported.q[1] += 3.0;
+      if (cycle == asked("lie_at")) reported.tau_J_d[3] += 5.0;
+      const Torques command = callback(reported, {});
       const double row[] = {static_cast<double>(cycle), static_cast<double>(command.motion_finished)};
       std::fwrite(row, sizeof *row, 2, stdout);
-      std::fwrite(told.tau_J_d.data(), sizeof *row, 7, stdout);
+      std::fwrite(reported.tau_J_d.data(), sizeof *row, 7, stdout);
       std::fwrite(command.tau_J.data(), sizeof *row, 7, stdout);
       std::fwrite(state_.dq.data(), sizeof *row, 7, stdout);
       if (command.motion_finished) return;
@@ -69,7 +69,9 @@ class Robot {
         state_.q[j] += 1e-3 * state_.dq[j];
         state_.tau_J_d[j] = command.tau_J[j];
       }
-      std::this_thread::sleep_until(next += std::chrono::milliseconds(1));
+      // after a stall of this computer no burst of cycles, in which no policy could answer
+      next = std::max(next + std::chrono::milliseconds(1), std::chrono::steady_clock::now());
+      std::this_thread::sleep_until(next);
     }
   }
 
