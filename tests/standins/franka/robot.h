@@ -1,6 +1,7 @@
 // What examples/libfranka/loop.cpp calls of libfranka, declared as there (0.10 and later). The arm behind it is seven
 // joints of 1 kg m^2 with viscous friction, at 1 kHz, with the faults of script.h; each command goes to stdout.
 #pragma once
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cmath>
