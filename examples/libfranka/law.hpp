@@ -160,8 +160,10 @@ class Driver {
       if (seen && damped_ == 1) share_ = std::min(1.0, fastest);
       share_ = std::max(0.0, share_ - c::cycle_s / c::brake_s);
       for (int j = 0; j < n && seen && share_ == 0.0; ++j)  // a spring against joints that a load moves on
-        if (std::abs(dq[j]) > c::still)
+        if (std::abs(dq[j]) > c::still) {
+          if (dq[j] * held_[j] > 0.0) held_[j] -= std::copysign(std::min(c::release[j], std::abs(held_[j])), dq[j]);
           held_[j] = std::clamp(held_[j] - c::cycle_s * c::spring[j] * dq[j], -c::held_most[j], c::held_most[j]);
+        }
     } else if (commanded_) {
       Joints wanted;
       c::control_law(q.data(), dq.data(), command_.data(), memory_.data(), wanted.data());

@@ -20,6 +20,7 @@ STILL = 0.02  # rad/s, below which a joint is at rest
 # rad/s: a joint that goes on sliding while it is brought to rest meets a spring of this frequency, as a change of the
 # held compensation. Our choice, half of the rate of the safety filter, which damps it.
 SPRING = 15.0
+RELEASE = 0.2  # 1/s, share of tau_max by which a held compensation falls while it pushes along a motion; our choice
 ADDED = 0.3  # share of tau_max that an adapter may add: on a Panda 1.5 kg anywhere within reach, and friction
 RUNS, SILENT, NOT_FINITE, OUTSIDE, LAW_NOT_FINITE, REQUESTED = range(6)  # values of `Memory.why`
 TOO_NEAR = 100  # and this value plus the number of a pair of `CollisionCheck`
@@ -141,6 +142,8 @@ def resist(dq, spring, most, held):
     """
     for j in range(len(held)):
         if abs(dq[j]) > STILL:
+            if dq[j] * held[j] > 0.0:
+                held[j] -= min(RELEASE * SIM_DT / ADDED * most[j], abs(held[j])) * np.sign(dq[j])
             held[j] = min(max(held[j] - SIM_DT * spring[j] * dq[j], -most[j]), most[j])
 
 

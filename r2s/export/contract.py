@@ -33,14 +33,8 @@ NEAR_RAD = 0.05  # rad, of an arm that was moved to a start posture; half of wha
 RESTING = 0.1  # rad/s, of a joint at rest: five times the driver's STILL, for noise of slower sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
-UNITS |= {
-    "asked": "Nm",
-    "q_stop_low": "rad",
-    "q_stop_high": "rad",
-    "dq_stop": "rad/s",
-    "spring": "Nm/rad",
-    "held_most": "Nm",
-}
+UNITS |= {"asked": "Nm", "q_stop_low": "rad", "q_stop_high": "rad", "dq_stop": "rad/s"}
+UNITS |= {"spring": "Nm/rad", "release": "Nm per cycle", "held_most": "Nm"}
 
 
 class DescribesObservation(Protocol):
@@ -256,7 +250,8 @@ def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[
     matrix = law.filter_limits(robot, task.torque_limit(robot))
     values = [matrix[:, k] for k in range(law.COLUMNS)]
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]
-    values += [driver.DQ_INSIDE * robot.dq_max, driver.spring(robot), drive_cycle.ADDED * robot.tau_max]
+    values += [driver.DQ_INSIDE * robot.dq_max, driver.spring(robot)]
+    values += [drive_cycle.RELEASE * SIM_DT * robot.tau_max, drive_cycle.ADDED * robot.tau_max]
     return {name: listed(row) for name, row in zip(LAW_JOINT, values, strict=True)}
 
 

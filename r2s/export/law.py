@@ -11,7 +11,7 @@ import numpy as np
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
 LAW_JOINT = (
     *("q_low", "q_high", "q_fade", "most", "slowing", "offset", "dq_max", "added", "tau_max", "step"),
-    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop", "spring", "held_most"),
+    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop", "spring", "release", "held_most"),
 )
 LAW_NUMBER = (
     *("cycle_s", "low_pass", "rate", "approach", "allowed", "nothing", "exact", "dry", "sure", "pivots", "rounds"),
@@ -177,7 +177,8 @@ class Driver:
             self._share = max(0.0, self._share - c["cycle_s"] / c["brake_s"])
             if seen and self._share == 0.0:  # a spring against joints that a load or a friction estimate moves on
                 slides = np.abs(dq) > c["still"]
-                turned = self._held - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
+                along = np.where(slides & (dq * self._held > 0), np.minimum(j["release"], np.abs(self._held)), 0.0)
+                turned = self._held - along * np.sign(dq) - c["cycle_s"] * j["spring"] * np.where(slides, dq, 0.0)
                 self._held = np.clip(turned, -j["held_most"], j["held_most"])
         elif self._command is not None:
             target = self._command if self._control is None else self._control(q, dq, self._command)
