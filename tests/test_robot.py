@@ -210,3 +210,20 @@ def test_a_missing_file_names_the_nearest(write, tmp_path):
         load_robot(str(tmp_path / "my_arn.xml"))
     with pytest.raises(UserError, match=r"^robot\.mjcf: no such file: .*nowhere/arm\.xml$"):
         load_robot(str(tmp_path / "nowhere" / "arm.xml"))
+
+
+def test_a_tool_is_read_with_the_robot(tmp_path):
+    """`tool` gives the robot its tip; a wrong file gets one line that names robot.tool."""
+    file = tmp_path / "tool.json"
+    file.write_text('{"tip_in_flange_m": [0.0, 0.01, 0.09], "radius_m": 0.01, "mass_kg": 0.2}')
+    tool = load_robot(tool=str(file)).tool
+    assert tool is not None
+    assert load_robot().tool is None
+    np.testing.assert_array_equal([*tool.tip, tool.radius, tool.mass], [0.0, 0.01, 0.09, 0.01, 0.2])
+    file.write_text('{"tip_in_flange_m": [0.0, 0.01], "radius_m": 0.01}')
+    with pytest.raises(UserError, match=r"^robot\.tool: tool\.json: tip_in_flange_m: expected 3 numbers"):
+        load_robot(tool=str(file))
+    with pytest.raises(UserError, match=r"^robot\.tool: no such file: .*tol\.json; did you mean 'tool\.json'"):
+        load_robot(tool=str(tmp_path / "tol.json"))
+    with pytest.raises(UserError, match=r"^robot\.tool: .*directory"):
+        load_robot(tool=str(tmp_path))

@@ -8,12 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from r2s.adaptation.adapter import Adapter
 from r2s.adaptation.arm_model import ArmModel, make_arm_model
+from r2s.adaptation.contact_gate import ContactGate, Holdable
 from r2s.adaptation.feedforward import Feedforward
 from r2s.adaptation.kalman import Noise
 from r2s.adaptation.model_correction import apply_correction
 from r2s.adaptation.observer import Observer
 from r2s.adaptation.offline_estimation import fit_correction
+from r2s.adaptation.wrench import WrenchObserver, contact_threshold
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -46,12 +49,21 @@ class AdapterContext:
         correction, noise = fit_correction(self.robot, self.dynamics, self.posterior, self.unloaded)
         return apply_correction(self.arm, correction), noise
 
+    def gated(self, adapter: Holdable) -> Adapter:
+        """Return the adapter, which stops in contact if the arm has a tool that touches."""
+        if self.robot.tool is None:
+            return adapter
+        wrench = WrenchObserver(self.robot, self.dynamics)
+        if self.unloaded is not None:
+            wrench.threshold = contact_threshold(self.robot, wrench, self.unloaded)
+        return ContactGate(adapter, wrench)
 
-def observer(context: AdapterContext, filter_s: float) -> Observer:
+
+def observer(context: AdapterContext, filter_s: float) -> Adapter:
     """Return a disturbance observer, `adapt=observer`; raises UserError if filter_s is not above 0."""
-    return Observer(context.arm, filter_s)
+    return context.gated(Observer(context.arm, filter_s))
 
 
-def rls(context: AdapterContext) -> Feedforward:
+def rls(context: AdapterContext) -> Adapter:
     """Return the feedforward of the recursive estimate, `adapt=rls`."""
-    return Feedforward(*context.corrected)
+    return context.gated(Feedforward(*context.corrected))

@@ -48,6 +48,7 @@ class Estimator:
 
     Attributes:
         changes: s, times of detected payload changes.
+        held: True keeps the estimate, because the arm touches something.
 
     Args:
         arm: model of the arm. noise: its uncertainty.
@@ -56,6 +57,7 @@ class Estimator:
     def __init__(self, arm: ArmModel, noise: Noise):
         self._arm, self._noise, self._n = arm, noise, len(arm.level)
         self.changes: list[float] = []
+        self.held = False
         self._filter = Filter.fresh(noise)
         self._cycle, self._changed = 0, False
         self._before = self._payload()
@@ -82,7 +84,7 @@ class Estimator:
         if not (np.isfinite(q).all() and np.isfinite(dq).all() and np.isfinite(tau).all()):
             self.begin()
             return False
-        if not update_residual(self._arm, self._state, q, dq, tau, self._residual):
+        if not update_residual(self._arm, self._state, q, dq, tau, self._residual) or self.held:
             return False
         update(self._filter, self._noise, self._residual)
         jumped, replaced = bool(self._filter.log_odds[MEAN] > THRESHOLD), self._replaced_at_rest()
@@ -120,6 +122,12 @@ class Estimator:
         if self._now is None:
             self._now = self._report(self._changed)
         return self._now
+
+    @property
+    def payload(self) -> np.ndarray:
+        """(10,), the payload's inertial parameters in the payload frame; zeros if the mass may as well be zero."""
+        x = self._filter.x[:BODY]
+        return x.copy() if x[0] > max(Z * np.sqrt(self._filter.P[0, 0]), LEAST_KG) else np.zeros(BODY)
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:

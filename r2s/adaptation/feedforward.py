@@ -46,6 +46,15 @@ class Feedforward:
         self._payload, self._weight, self._slow = np.zeros(BODY), np.zeros(n), np.zeros((n, BODY))
         self._torque, self._remaining = np.zeros(n), np.zeros(n)  # of the estimate; the part still to enter
 
+    @property
+    def held(self) -> bool:
+        """True keeps the estimate."""
+        return self.estimator.held
+
+    @held.setter
+    def held(self, held: bool) -> None:
+        self.estimator.held = held
+
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Process a cycle and return (n,) Nm to add; see `Adapter`."""
         new = self.estimator(q, dq, tau)

@@ -21,6 +21,9 @@ from r2s.physics.robot import SIM_DT
 class Observer:
     """The `Adapter` that adds the whole disturbance torque, whatever its cause.
 
+    Attributes:
+        held: True keeps the disturbance.
+
     Args:
         arm: identified model. filter_s: s, time constant of the low-pass.
 
@@ -31,6 +34,7 @@ class Observer:
     def __init__(self, arm: ArmModel, filter_s: float):
         check_number("filter_s", filter_s, "(0, inf)")
         self._arm, self._share = arm, -np.expm1(-SIM_DT / filter_s)
+        self.held = False
         self.begin()
 
     def begin(self) -> None:
@@ -41,7 +45,8 @@ class Observer:
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Process a cycle and return (n,) Nm to add; see `Adapter`."""
-        _observe(self._arm, self._state, self._residual, q, dq, tau, self._share, self._disturbance)
+        share = 0.0 if self.held else self._share
+        _observe(self._arm, self._state, self._residual, q, dq, tau, share, self._disturbance)
         return self._disturbance[1]
 
 

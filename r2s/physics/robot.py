@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import located
+from r2s.physics.surface import Tool, load_tool
 from r2s.physics.urdf import is_urdf, read_urdf
 
 PANDA = "r2s:models/panda.xml"
@@ -42,6 +43,7 @@ class Robot:
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
         velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
             deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
+        tool: the tip that touches; None: a bare end effector.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Robot:
     inertia: np.ndarray
     armature: np.ndarray
     velocity_envelope: tuple[np.ndarray, np.ndarray] | None = None
+    tool: Tool | None = None
 
     @property
     def n(self) -> int:
@@ -155,6 +158,7 @@ def load_robot(
     dtau_max: list[float] | float = 1000.0,
     gravity: list[float] | None = None,
     armature: list[float] | float | None = None,
+    tool: str | None = None,
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
@@ -167,6 +171,7 @@ def load_robot(
         q_home, q_min, q_max: rad. dq_max: rad/s. ddq_max: rad/s^2. tau_max: Nm. dtau_max: Nm/s.
         gravity: (3,) m/s^2 in the base frame; None: the file's; for a URDF, that of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's.
+        tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
@@ -209,6 +214,7 @@ def load_robot(
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=_tensors(model),
         armature=each("armature", armature, model.dof_armature),
+        tool=None if tool is None else load_tool(tool),
     )
 
 

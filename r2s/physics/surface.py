@@ -75,12 +75,16 @@ def load_tool(path: str | Path) -> Tool:
     Raises:
         UserError: no such file, no valid JSON, an unknown or missing key, a value out of range.
     """
+    if not isinstance(path, str | Path):
+        raise UserError(f"robot.tool: expected a JSON file, got {path!r}")
     file = located(path)
     try:
         values = json.loads(file.read_text())
     except FileNotFoundError:
         others = [p.name for p in file.parent.glob("*.json")]
         raise UserError(f"robot.tool: no such file: {file}{nearest(file.name, others)}") from None
+    except OSError as error:
+        raise UserError(f"robot.tool: {file}: {error.strerror}") from None
     except ValueError as error:
         raise UserError(f"robot.tool: {file} is not valid JSON: {error}") from None
     if not isinstance(values, dict):

@@ -28,6 +28,18 @@ def calibrated(calibration, robot, trust=()):
     return space.dynamics(x), posterior, unloaded
 
 
+def free_recordings(calibration):
+    """Return the recordings without contact that an identification was made from, as far as they still exist."""
+    from r2s.recordings.readers import read
+
+    folder = run_folder(calibration)
+    paths = [folder / name for name in RECORDINGS]
+    if not all(path.is_file() for path in paths):
+        data = loaded(folder / "config.yaml").get("data") or {} if (folder / "config.yaml").is_file() else {}
+        paths = [Path(data[key]) for key in ("path", "validation") if data.get(key) and data.get("torque") == TORQUE]
+    return [read(path, torque=TORQUE) for path in paths if path.is_file()]
+
+
 def with_declared_payload(cfg, robot, dynamics):
     """Return the dynamics with arm.declared_payload in the gravity compensation."""
     from r2s.physics.payload import mass_and_moment, payload_of

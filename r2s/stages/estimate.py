@@ -1,10 +1,10 @@
-"""stage=estimate: payload, friction and offsets of a working arm or of a recording, cycle by cycle."""
+"""stage=estimate: payload, friction, offsets and external wrench of a working arm or of a recording."""
 
 from dataclasses import replace
 
 from r2s.errors import Stopped, UserError, check_number
 from r2s.files import located
-from r2s.stages.adapter_factory import calibrated, with_declared_payload
+from r2s.stages.adapter_factory import calibrated, free_recordings, with_declared_payload
 from r2s.stages.build import (
     check_source,
     make_dynamics,
@@ -30,10 +30,12 @@ def reads(cfg):
 
 
 def estimate(cfg, overrides):
-    """Recording or arm -> estimate.csv, figures: payload, friction and offsets at every moment, with intervals."""
+    """Recording or arm -> estimate.csv, wrench.csv, figures: payload, friction, offsets, wrench, with intervals."""
     from r2s.adaptation.adapters import AdapterContext
     from r2s.adaptation.estimator import Estimator
-    from r2s.adaptation.offline_estimation import estimate_recording, format_estimate, table
+    from r2s.adaptation.offline_estimation import format_estimate, table
+    from r2s.adaptation.wrench import contacts, observe_recording
+    from r2s.physics.robot import SIM_DT
     from r2s.reporting.estimate_page import draw_estimate, write_estimate_recording
 
     check_number("estimate.every_s", cfg.estimate.every_s, "(0, inf)")
@@ -51,27 +53,58 @@ def estimate(cfg, overrides):
             recording = record_arm(cfg, robot)
             recording.save(run.folder / "recording.npz")
         estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
-        printed = -float("inf")
+        observer, threshold_from = wrench_observer(cfg, robot, dynamics)
+        printed, estimates = -float("inf"), []
 
         def report(now):
             nonlocal printed
+            estimates.append(now)
             if now.changed:
                 print(f"{now.t:7.2f} s  payload changed")
             if now.t - printed >= cfg.estimate.every_s:
                 print(format_estimate(now))
                 printed = now.t
 
-        estimates = estimate_recording(robot, estimator, recording, report)
+        wrench = observe_recording(robot, observer, recording, estimator, report)
+        wrench.to_csv(run.folder / "wrench.csv", index=False, float_format="%.6g")
         if not estimates:
             raise UserError(f"data: {recording.duration:g} s are too short for an estimate")
-        rows, last = table(estimates), estimates[-1]
+        rows, last, touched = table(estimates), estimates[-1], contacts(wrench)
+        at = (rows["t"] / SIM_DT).round().astype(int) - 1
+        rows = rows.join(wrench.drop(columns="t").iloc[at].reset_index(drop=True))
         rows.to_csv(run.folder / "estimate.csv", index=False, float_format="%.6g")
         source = "calibration" if unloaded else "priors"
-        run.summary({"seconds": recording.duration} | summary(last, estimator.changes) | {"noise_from": source})
+        run.summary(
+            {"seconds": recording.duration}
+            | summary(last, estimator.changes)
+            | {"noise_from": source}
+            | {"contacts": touched, "contact_threshold": observer.threshold, "threshold_from": threshold_from}
+        )
         draw_estimate(run.figure("payload"), run.figure("friction"), rows, estimator.changes)
         write_estimate_recording(run.folder / "recording.rrd", rows)
         print(format_estimate(last))
+        print(format_contacts(touched))
     print(f"written: {run.folder}")
+
+
+def wrench_observer(cfg, robot, dynamics):
+    """Return the wrench observer of the arm, and what its contact threshold comes from: "recordings" or "noise"."""
+    from r2s.adaptation.wrench import WrenchObserver, contact_threshold
+
+    observer = WrenchObserver(robot, dynamics)
+    free = free_recordings(cfg.calibration) if cfg.calibration else []
+    if free:
+        observer.threshold = contact_threshold(robot, observer, free)
+    return observer, "recordings" if free else "noise"
+
+
+def format_contacts(touched):
+    """Return the contacts in one line."""
+    if not touched:
+        return "no contact"
+    most = max(c["force_max_N"] for c in touched)
+    first = ", ".join(f"{c['begin_s']:.2f} to {c['end_s']:.2f} s" for c in touched[:3])
+    return f"{len(touched)} contacts, up to {most:.1f} N: {first}{' ...' if len(touched) > 3 else ''}"
 
 
 def given_recording(cfg, robot):

@@ -1,0 +1,212 @@
+"""External wrench of a working arm without a sensor, with a 95 % interval, and whether the arm touches something.
+
+    observer = WrenchObserver(robot, dynamics)
+    for each millisecond: observer(state.q, state.dq, command)
+    observer.force, observer.force_half, observer.in_contact
+
+The force acts at the tip of `robot.tool`; without a tool it acts at the end effector, with a moment. wrench_filter.py
+describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
+while two joints move.
+The threshold comes from motion without contact: the largest values of half seconds have an exponential tail (extreme
+values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3),
+which is continued to one false alarm an hour.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.stats import chi2
+
+from r2s.adaptation import tuning
+from r2s.adaptation.arm_model import make_arm_model
+from r2s.adaptation.estimator import Estimate, Estimator
+from r2s.adaptation.offline_estimation import at_rate
+from r2s.adaptation.wrench_filter import REST, SQUARE, TOUCHES, WrenchNoise, WrenchState, update_wrench
+from r2s.errors import UserError
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.payload import ee_pose
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import Recording
+
+Z = 1.96  # standard deviations of a 95 % interval
+
+
+class WrenchObserver:
+    """Wrench of one arm, cycle by cycle.
+
+    Attributes:
+        threshold: of the squared force in variances, above which the arm is in contact.
+        tool: the robot's, or None.
+
+    Args:
+        robot, dynamics: the identified arm. noise: its uncertainty; None: `default_wrench_noise`.
+        threshold: None: twice that of Gaussian noise.
+    """
+
+    def __init__(
+        self, robot: Robot, dynamics: Dynamics, noise: WrenchNoise | None = None, threshold: float | None = None
+    ):
+        self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
+        position, axes = ee_pose(robot)
+        self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
+        self._components = 6 if robot.tool is None else 3
+        self._noise = noise if noise is not None else default_wrench_noise(robot, dynamics)
+        gaussian = chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3)
+        self.threshold = float(tuning.UNCALIBRATED * gaussian if threshold is None else threshold)
+        self._q, self._dq, self._tau = np.zeros((3, robot.n))
+        self.begin()
+        zero = np.zeros(robot.n)
+        self(robot.q_home, zero, zero)  # compile before an arm waits
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a motion from rest, without contact, and with the payload of the model."""
+        self._state = WrenchState.fresh(len(self._arm.level), self._components)
+
+    def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
+        """Process a cycle's q, dq (n,) rad, rad/s and command (n,) Nm without gravity; return whether in contact.
+
+        A cycle with values that are not finite begins a motion anew.
+
+        Raises:
+            UserError: the arrays have another number of joints.
+        """
+        n = len(self._arm.level)
+        if q.shape != (n,) or dq.shape != (n,) or tau.shape != (n,):
+            raise UserError(f"expected q, dq and tau of {n} joints, got {q.shape}, {dq.shape} and {tau.shape}")
+        if not np.isfinite(q.sum() + dq.sum() + tau.sum()):
+            self.begin()
+            return False
+        self._q[:], self._dq[:], self._tau[:] = q, dq, tau  # one type of arrays, so that numba compiles once
+        update_wrench(self._arm, self._tip, self._noise, self.threshold, self._state, self._q, self._dq, self._tau)
+        return self.in_contact
+
+    def carry(self, payload: np.ndarray) -> None:
+        """Set the payload beyond the model's links: ten inertial parameters, payload frame (momentum.py)."""
+        n, state = len(self._arm.level), self._state
+        state.x[-n:] += state.terms.payload_p @ (payload - state.payload)  # the momentum it already has
+        state.payload[:] = payload
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether the arm touches something."""
+        return bool(self._state.contact[TOUCHES] > 0.0)
+
+    @property
+    def wrench(self) -> np.ndarray:
+        """(3,) N with a tool, else (6,) N and Nm: on the arm at the tip, base axes."""
+        return self._state.x[: self._components]
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of `wrench`."""
+        return self._state.P[: self._components, : self._components]
+
+    @property
+    def wrench_half(self) -> np.ndarray:
+        """Half widths of the 95 % intervals of `wrench`."""
+        return Z * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def force(self) -> np.ndarray:
+        """(3,) N on the arm at the tip, base axes."""
+        return self.wrench[:3]
+
+    @property
+    def force_half(self) -> np.ndarray:
+        """(3,) N, half widths of the 95 % intervals of `force`."""
+        return self.wrench_half[:3]
+
+    @property
+    def tip(self) -> np.ndarray:
+        """(3,) m, where the force acts, in the base frame."""
+        return self._state.place
+
+    @property
+    def square(self) -> float:
+        """The squared force in variances, which is compared with `threshold`."""
+        return float(self._state.contact[SQUARE])
+
+    @property
+    def rests(self) -> np.ndarray:
+        """(n,) whether each joint rests, where friction may hide a force."""
+        return self._state.joints[REST] > 0.0
+
+
+def default_wrench_noise(robot: Robot, dynamics: Dynamics, model: np.ndarray | None = None) -> WrenchNoise:
+    """Return the uncertainty of an identified arm; model: (n,) Nm, error of its friction, None: of a typical size."""
+    arm = make_arm_model(robot, dynamics)
+    floor = tuning.WRENCH_FRICTION_FLOOR * arm.level + 3e-3  # Nm: a wrist's
+    friction = floor if model is None else np.maximum(tuning.WRENCH_FRICTION * model, floor)
+    edges = np.array(dynamics.breakaway, dtype=float)
+    measured = np.abs(edges).max(1) > 0.0
+    edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
+    return WrenchNoise(friction, np.ascontiguousarray(edges), tuning.SPEED_NOISE, tuning.ANGLE_NOISE)
+
+
+def observe_recording(
+    robot: Robot,
+    observer: WrenchObserver,
+    recording: Recording,
+    estimator: Estimator | None = None,
+    report: Callable[[Estimate], None] | None = None,
+) -> pd.DataFrame:
+    """Return a row per millisecond: the wrench with half widths at 95 %, contact, and where the tip is.
+
+    Args:
+        estimator: estimates the payload beside it, which is subtracted; with a tool, not while it touches.
+        report: gets each estimate at once.
+    """
+    recording = at_rate(robot, recording)
+    rows = np.empty((len(recording.t), 2 * len(observer.wrench) + 6))
+    for stretch in recording.stretches:
+        observer.begin()
+        if estimator is not None:
+            estimator.begin()
+        for k in range(stretch.start, stretch.stop):
+            sample = recording.q[k], recording.dq[k], recording.tau[k]
+            touches = observer(*sample)
+            if estimator is not None:
+                estimator.held = touches and robot.tool is not None
+                if estimator(*sample):
+                    observer.carry(estimator.payload)
+                    if report is not None:
+                        report(estimator.now)
+            values = np.stack([observer.wrench, observer.wrench_half], -1).ravel()
+            rows[k] = np.concatenate([[recording.t[k]], values, [touches, observer.square], observer.tip])
+    names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
+    columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]
+    table = pd.DataFrame(rows, columns=["t", *columns, "in_contact", "square", "tip_x_m", "tip_y_m", "tip_z_m"])
+    return table.astype({"in_contact": int})
+
+
+def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
+    """Return begin and end, s, and the largest force, N, of each contact in the table of `observe_recording`."""
+    touches = np.diff(np.concatenate([[0], table["in_contact"].to_numpy(), [0]]))
+    force = np.linalg.norm(table[["force_x_N", "force_y_N", "force_z_N"]].to_numpy(), axis=1)
+    t = table["t"].to_numpy()
+    spans = zip(np.flatnonzero(touches > 0), np.flatnonzero(touches < 0), strict=True)
+    return [
+        {"begin_s": float(t[a]), "end_s": float(t[b - 1]), "force_max_N": float(force[a:b].max())} for a, b in spans
+    ]
+
+
+def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> float:
+    """Return the threshold for one false alarm an hour, from recordings without contact.
+
+    Raises:
+        UserError: the recordings are shorter than 5 s.
+    """
+    block = round(tuning.BLOCK_S / SIM_DT)
+    maxima = []
+    for recording in free:
+        squares = observe_recording(robot, observer, recording)["square"]
+        square = squares.rolling(tuning.CONFIRMED).min().fillna(0.0).to_numpy()
+        maxima += [square[k : k + block].max() for k in range(0, len(square) - block + 1, block)]
+    if len(maxima) < 10:
+        raise UserError(f"contact threshold: expected at least {10 * tuning.BLOCK_S:g} s of motion without contact")
+    level = np.quantile(maxima, 1.0 - tuning.TAIL)
+    excess = np.mean([m - level for m in maxima if m >= level])
+    blocks_per_hour = 3600.0 / tuning.BLOCK_S
+    return float(level + excess * np.log(tuning.TAIL * blocks_per_hour / tuning.ALARMS_PER_HOUR))

@@ -1,0 +1,248 @@
+"""External wrench without a sensor: what was applied is found within its interval, and friction hides what it can."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import conf
+
+from r2s.adaptation.adapters import AdapterContext, observer
+from r2s.adaptation.momentum import BODY
+from r2s.adaptation.wrench import WrenchObserver, contact_threshold, contacts
+from r2s.adaptation.wrench_fusion import TRUSTED, FusedWrench, SurfaceLaw, fuse
+from r2s.arm.command_loop import CommandLoop
+from r2s.arm.driver import Driver
+from r2s.arm.simulated import SimulatedArm
+from r2s.errors import UserError
+from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.kinematics import POSE, hand_kinematics
+from r2s.physics.payload import ee_pose, payload_of
+from r2s.physics.robot import SIM_DT, load_robot
+from r2s.physics.surface import Surface, Tool
+from r2s.recordings.recording import Recording
+
+DATA = Path(__file__).parents[2] / "shared/data/contact_arms"
+TOOL = Tool(np.array([0.0, 0.01, 0.09]), 0.01)
+ROBOT = replace(load_robot(**conf("robot/panda")), tool=TOOL)
+SPRING = np.array([60, 120, 60, 60, 10, 10, 5.0])
+BAND = np.array([0.9, 0.8, 0.7, 0.8, 0.6, 0.3, 0.3])  # Nm, of stiction in each direction
+NOISE = 3e-3  # rad/s, of speeds; a hundredth of it, rad, of angles
+CHI2_95 = 3.84  # square of 1.96
+
+
+@cache
+def truth():
+    """Return dynamics with friction, a delay, and no stiction that could hide a torque."""
+    found = nominal_dynamics(ROBOT, **conf("friction/paper"))
+    return replace(found, delay=3e-3, lag=1e-3, breakaway=np.zeros((7, 2)), offset=np.zeros(7))
+
+
+def jacobian(q, robot=ROBOT):
+    """Return the Jacobian (3, n) of the tool's tip."""
+    observer = WrenchObserver(robot, truth())
+    place, J, frames = np.empty(3), np.empty((3, 7)), np.empty((7, POSE))
+    position, axes = ee_pose(robot)
+    hand_kinematics(observer._arm.links, position + axes @ TOOL.tip, q, frames, place, J)
+    return J
+
+
+def swing(force, *, seconds=3.0, seed=0, payload=None, adapter=None):
+    """Return a recording of an arm under a spring to a swinging goal, with force(t) (3,) N at its tip."""
+    arm = SimulatedArm(ROBOT, truth(), position_noise=1e-2 * NOISE, velocity_noise=NOISE, payload=payload, seed=seed)
+    loop = CommandLoop(arm, Driver(ROBOT, 0.3 * ROBOT.tau_max, truth().level), adapter=adapter)
+    loop.place(ROBOT.q_home)
+    J, rows = jacobian(ROBOT.q_home), []
+    for k in range(round(seconds / SIM_DT)):
+        s, t = loop.state, k * SIM_DT
+        goal = ROBOT.q_home + 0.4 * np.sin(2.0 * t + np.arange(7.0) + seed) * np.sin(t) ** 2
+        if k % 20 == 0:
+            J = jacobian(s.q)
+        arm.external[:] = J.T @ force(t)
+        loop(SPRING * (goal - s.q) - 0.15 * SPRING * s.dq)
+        rows.append((s.q, s.dq, loop.sent))
+    q, dq, tau = (np.array(x) for x in zip(*rows, strict=True))
+    return Recording(np.arange(len(q)) * SIM_DT, q, dq, tau, "commanded")
+
+
+def run(observer, recording):
+    """Return force (T, 3) N, half widths (T, 3) N, and contact (T,)."""
+    observer.begin()
+    rows = []
+    for q, dq, tau in zip(recording.q, recording.dq, recording.tau, strict=True):
+        touches = observer(q, dq, tau)
+        rows.append((observer.force.copy(), observer.force_half, touches))
+    return (np.array(x) for x in zip(*rows, strict=True))
+
+
+@cache
+def free(seed):
+    return swing(lambda t: np.zeros(3), seed=seed)
+
+
+@cache
+def calibrated():
+    """Return an observer with the threshold of two motions without contact."""
+    observer = WrenchObserver(ROBOT, truth())
+    observer.threshold = contact_threshold(ROBOT, observer, [free(1), free(2)])
+    return observer
+
+
+def test_a_force_in_motion_is_found_within_its_interval():
+    """A force of 10 N that comes within 0.2 s: to 0.5 N RMS, in its interval, and a contact soon after its half."""
+    push = np.array([4.0, -3.0, 8.7])
+    force = lambda t: push * np.clip((t - 1.5) / 0.2, 0, 1)  # noqa: E731
+    found, half, touches = run(calibrated(), swing(force))
+    true = np.array([force(t) for t in np.arange(len(found)) * SIM_DT])
+    late = np.arange(len(found)) * SIM_DT > 1.8
+    assert np.sqrt(((found - true)[late] ** 2).mean()) < 0.5
+    assert (np.abs(found - true) < half)[late].mean() > 0.9
+    assert (half[late] < 3.0).all()
+    assert not touches[: round(1.5 / SIM_DT)].any()
+    begins = np.argmax(touches) * SIM_DT
+    assert 1.5 < begins < 1.65  # 5 N act at 1.6 s: within 50 ms
+
+
+def test_free_motion_is_no_contact():
+    """Motion that the threshold was not calibrated on: no false alarm."""
+    _, _, touches = run(calibrated(), free(3))
+    assert not touches.any()
+
+
+def test_friction_at_rest_hides_its_band_and_no_more():
+    """At rest the interval grows until the most sensitive joint's torque is as uncertain as its band, and stops."""
+    dynamics = replace(truth(), breakaway=np.column_stack([-BAND, BAND]))
+    observer, zero = WrenchObserver(ROBOT, dynamics), np.zeros(7)
+    for _ in range(round(20.0 / SIM_DT)):
+        observer(ROBOT.q_home, zero, zero)
+    J, P = jacobian(ROBOT.q_home), observer.covariance
+    torque = np.sqrt(np.einsum("cj,cd,dj->j", J, P, J))
+    hidden = BAND / np.sqrt(3.0)  # of a torque anywhere within +-BAND
+    assert observer.rests.all()
+    assert np.max(torque / hidden) == pytest.approx(1.0, abs=0.1)
+    for _ in range(round(5.0 / SIM_DT)):
+        observer(ROBOT.q_home, zero, zero)
+    np.testing.assert_allclose(observer.covariance, P, rtol=1e-2, atol=1e-3)
+
+
+def test_a_command_within_the_band_changes_no_force_at_rest():
+    """Friction balances it; beyond the band only a force can, which is then found to be the rest of it."""
+    dynamics = replace(truth(), breakaway=np.column_stack([-BAND, BAND]), delay=0.0, lag=0.0)
+    observer, zero, tau = WrenchObserver(ROBOT, dynamics), np.zeros(7), np.zeros(7)
+    J = jacobian(ROBOT.q_home)
+    for share in np.linspace(0.0, 0.95, 500):
+        observer(ROBOT.q_home, zero, share * BAND)
+    np.testing.assert_allclose(observer.force, 0.0, atol=1e-2)
+    for k in range(2000):
+        tau = BAND * 0.95 + J.T @ np.array([0.0, 0.0, -6.0]) * min(k / 1000, 1.0)
+        observer(ROBOT.q_home, zero, tau)
+    torque = J.T @ observer.force
+    net = tau + torque
+    assert (np.abs(net) < BAND + 0.05).all()  # what friction cannot hold, the force does
+    assert np.linalg.norm(observer.force) > 1.0
+
+
+def test_a_payload_is_no_contact_once_it_is_known():
+    """A payload pulls with its weight, wherever the arm moves; declared to the observer, no force remains."""
+    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03]})
+    recording = swing(lambda t: np.zeros(3), payload=load)
+    unknown, _, _ = run(WrenchObserver(ROBOT, truth()), recording)
+    settled = slice(1500, None)
+    np.testing.assert_allclose(unknown[settled].mean(0), [0.0, 0.0, -9.81], atol=1.0)
+    m, c, own = float(load.mass), load.centre, load.inertia
+    tensor = own + m * (c @ c * np.eye(3) - np.outer(c, c))
+    x = np.array([m, *m * c, *np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2]])
+    observer = WrenchObserver(ROBOT, truth())
+    assert x.shape == (BODY,)
+    observer.begin()
+    observer.carry(x)
+    forces = []
+    for q, dq, tau in zip(recording.q, recording.dq, recording.tau, strict=True):
+        observer(q, dq, tau)
+        forces.append(observer.force.copy())
+    assert np.sqrt((np.array(forces)[settled] ** 2).mean()) < 0.5
+
+
+def test_an_adapter_does_not_push_against_a_contact():
+    """The disturbance observer adds the push on a bare arm; with a tool it stops, with less than a tenth of it."""
+    push = lambda t: np.array([0.0, 0.0, 10.0 if t > 1.0 else 0.0])  # noqa: E731
+    added = {}
+    for robot in (ROBOT, replace(ROBOT, tool=None)):
+        adapter, torques = observer(AdapterContext(robot, truth()), 0.087), []
+
+        class Logged:
+            def begin(self, adapter=adapter):
+                adapter.begin()
+
+            def __call__(self, q, dq, tau, adapter=adapter, torques=torques):
+                torques.append(np.array(adapter(q, dq, tau)))
+                return torques[-1]
+
+        swing(push, seconds=2.0, adapter=Logged())
+        added[robot.tool is None] = np.abs(np.array(torques)[1800:]).mean(0).max()
+    assert added[True] > 3.0
+    assert added[False] < 0.1 * added[True]
+
+
+@pytest.mark.parametrize(("off", "trusted"), [(0.0, True), (5e-4, False)])
+def test_a_surface_sharpens_the_force_unless_it_errs(off, trusted):
+    """Force of 1 N error and a surface of 0.2 N: the right one leaves 0.1 N, one 0.5 mm off is refused."""
+    normal = np.array([0.0, 0.6, 0.8])
+    law = SurfaceLaw(off * normal, normal, 1e4, 1.0, 0.0, 0.01, 0.0, 0.2)
+    memory, fused, P = np.zeros(6), np.zeros(3), np.zeros((3, 3))
+    memory[TRUSTED] = 1.0
+    true, error = 10.0 * normal, 1.0 * normal * trusted
+    tip = (0.01 - 1e-3) * normal  # 1 mm deep: 10 N
+    for _ in range(500):
+        fuse(law, true + error, np.eye(3), tip, memory, fused, P)
+    assert bool(memory[TRUSTED]) == trusted
+    if trusted:
+        np.testing.assert_allclose(fused, true, atol=0.1)
+        assert normal @ P @ normal == pytest.approx(1 / (1 + 1 / 0.2**2))  # of two independent measurements
+    else:
+        np.testing.assert_array_equal(fused, true)
+        np.testing.assert_array_equal(P, np.eye(3))
+    with pytest.raises(UserError, match=r"^robot\.tool: a force from a surface needs the tip"):
+        FusedWrench(WrenchObserver(replace(ROBOT, tool=None), truth()), Surface(np.zeros(3), normal, 1e4))
+
+
+def test_the_same_motion_gives_the_same_numbers_and_wrong_input_one_line():
+    """`begin` forgets everything; a cycle that is not finite begins anew; too short recordings calibrate nothing."""
+    observer = calibrated()
+    first, second = (np.concatenate([x.ravel() for x in run(observer, free(3))]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    with pytest.raises(UserError, match=r"expected q, dq and tau of 7 joints, got \(6,\)"):
+        observer(np.zeros(6), np.zeros(6), np.zeros(6))
+    assert not observer(np.full(7, np.nan), np.zeros(7), np.zeros(7))
+    short = free(3)
+    short = Recording(short.t[:2000], short.q[:2000], short.dq[:2000], short.tau[:2000], "commanded")
+    with pytest.raises(UserError, match="expected at least 5 s of motion without contact"):
+        contact_threshold(ROBOT, observer, [short])
+
+
+def test_contacts_are_listed_with_their_largest_force():
+    table = pd.DataFrame({"t": np.arange(6.0), "in_contact": [0, 1, 1, 0, 0, 1]})
+    table[["force_x_N", "force_y_N", "force_z_N"]] = np.outer([9.0, 3.0, 5.0, 9.0, 9.0, 2.0], [0.6, 0.0, 0.8])
+    found = contacts(table)
+    assert [(c["begin_s"], c["end_s"]) for c in found] == [(1.0, 2.0), (5.0, 5.0)]
+    np.testing.assert_allclose([c["force_max_N"] for c in found], [5.0, 2.0])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no {DATA}")
+@pytest.mark.parametrize(
+    ("name", "moving", "rest"), [("sigmoid", 0.6, 0.7), ("coulomb", 0.6, 1.0), ("stribeck", 0.9, 1.6)]
+)
+def test_the_normal_force_on_independent_arms(name, moving, rest, tmp_path):
+    """From a model identified with defaults: RMSE in motion and at rest, and intervals of at least 90 %."""
+    import sys
+
+    sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+    from wrench import evaluate, identified
+
+    row = evaluate(DATA / name, identified(DATA / name, tmp_path))
+    assert row["moving"] <= moving
+    assert row["rest"] <= rest
+    assert min(row["moving inside"], row["rest inside"]) >= 90.0
