@@ -93,9 +93,11 @@ class SimulatedArm:
         carried, declared = (
             mass_and_moment(self.robot, x) for x in (self._payload if self._carries else None, self.declared_payload)
         )
+        external = self._load_torque(self._sim.q[0], carried - declared) - self.external
+        if self._dynamics[False].surface is not None:
+            external = external - self._sim.contact_torque()[0]
         self._state = ArmState(
             self._cycle * SIM_DT, q, dq, self._last.copy(), self._last.copy(),
-            tau_ext_hat_filtered=self._load_torque(self._sim.q[0], carried - declared) - self.external,
-            m_ee=0.0, m_load=float(declared[0]),
+            tau_ext_hat_filtered=external, m_ee=0.0, m_load=float(declared[0]),
         )  # fmt: skip
         return self._state

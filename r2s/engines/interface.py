@@ -1,7 +1,7 @@
 """The interface of a physics engine: set joint positions and velocities, apply one torque per millisecond, read them.
 
-An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway and offsets as one more joint
-torque per step, so that the same arm moves in every engine.
+An engine simulates rigid bodies only. `FrictionTorque` computes friction, breakaway, offsets and the contact with a
+surface as one more joint torque per step, so that the same arm moves and touches in every engine.
 """
 
 from typing import Protocol
@@ -9,6 +9,8 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
+from r2s.physics import mujoco_callback as native
+from r2s.physics.contact import contact_columns
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import single_arm
@@ -27,7 +29,7 @@ class Engine(Protocol):
 
 
 class FrictionTorque:
-    """The joint torque of r2s/physics/friction.py, for engines whose only input is torque.
+    """The joint torque of r2s/physics/friction.py and contact.py, for engines whose only input is torque.
 
     That friction is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
     (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias gives the same with F = P - h D a, where
@@ -35,6 +37,9 @@ class FrictionTorque:
 
     Args:
         robot, dynamics: the arm.
+
+    Attributes:
+        contact: (COLUMNS,) of r2s/physics/contact.py, with the force of the last step; None: no surface.
     """
 
     def __init__(self, robot: Robot, dynamics: Dynamics):
@@ -43,6 +48,11 @@ class FrictionTorque:
         self._file_damping = robot.model(gravity=False).dof_damping
         self._data = mujoco.MjData(self._model)
         self._mass = np.empty((robot.n, robot.n))
+        self.contact = None
+        if dynamics.surface is not None:
+            self._model.jnt_user[:, native.CONTACT] = at = native.KEPT * robot.n
+            self.contact = self._data.userdata[at:]
+            self.contact[:] = contact_columns(robot, dynamics.surface)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Return F (n,) Nm to add to the torque tau (n,) Nm of the next step from q, dq (n,)."""

@@ -9,6 +9,7 @@ from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.friction import SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
+from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: beyond the friction parameters of any arm
@@ -39,6 +40,7 @@ class Dynamics:
             the safety filter; otherwise `Motors` (r2s/physics/actuation.py) does.
         declared_payload: (..., 4) kg and kg m, mass and first moment, in the last link's frame, of the payload
             declared to gravity compensation (r2s/physics/payload.py); the real payload is part of the last link.
+        surface: what `Robot.tool` may touch (r2s/physics/contact.py), each field with any batch shape; None: nothing.
     """
 
     phi: np.ndarray
@@ -58,6 +60,7 @@ class Dynamics:
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
     declared_payload: np.ndarray = field(default_factory=lambda: np.zeros(4))
+    surface: Surface | None = None
 
     def __post_init__(self) -> None:
         if self.stiction_model not in STICTION_MODELS:
@@ -99,7 +102,8 @@ class Dynamics:
     def one(self, k: int) -> "Dynamics":
         """Return the k-th arm of a batch (m, ...); fields without a batch shape stay unchanged."""
         values = {name: (getattr(self, name), axes) for name, axes in AXES.items()}
-        return replace(self, **{name: v[k] for name, (v, axes) in values.items() if np.ndim(v) > axes})
+        single = {name: v[k] for name, (v, axes) in values.items() if np.ndim(v) > axes}
+        return replace(self, **single, surface=None if self.surface is None else self.surface.one(k))
 
 
 # Number of axes of each array for one arm.

@@ -3,8 +3,8 @@
 `install()` registers a native control callback that reads `jnt_user`. `mujoco.batch.Batch` can then simulate a
 different arm in each row at full speed. The callback contains the friction laws (friction.py), and with
 `Simulator.drive` also the control law (control_laws.py), the safety filter (safety_filter.py) and the delay of the
-motors (actuation.py), which need feedback every millisecond. Stiction (stick_slip.py) depends on all other forces, so
-this is the control callback, which MuJoCo calls last before it computes accelerations.
+motors (actuation.py), which need feedback every millisecond. Stiction (stick_slip.py) and contact (contact.py) depend
+on all other forces, so this is the control callback, which MuJoCo calls last before it computes accelerations.
 
 The friction force is linearly implicit. With D = d tau_f / dv >= 0 at the current velocity, the callback adds D v -
 tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M + h D. This is exact to first order,
@@ -25,6 +25,9 @@ from numba.extending import intrinsic, is_jitted
 
 from r2s.compiled import cfunc, njit
 from r2s.physics.actuation import SLOTS, condition_joint, motor_torque
+from r2s.physics.contact import COLUMNS as CONTACT_COLUMNS
+from r2s.physics.contact import ROWS as CONTACT_ROWS
+from r2s.physics.contact import contact_velocity, near
 from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
 from r2s.physics.control_laws import chain, control_law, registered
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
@@ -45,14 +48,15 @@ LIMITS = LEVEL + 1  # of the safety filter, COLUMNS wide; 0: no filter
 # The path of a command: number of the control law (NO_CONTROL: `rollout` gives efforts), cycles of the soft start,
 # factor of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
 CONTROL, FADE, LOW_PASS, TARGET_MAX, COMMANDS, MEMORIES, PARAMETERS = range(LIMITS + COLUMNS, LIMITS + COLUMNS + 7)
-WIDTH = PARAMETERS + 1
+CONTACT = PARAMETERS + 1  # where the contact (contact.py) begins in `userdata`; 0: nothing is touched
+WIDTH = CONTACT + 1
 NO_CONTROL = -1.0
 MARKER = 7_202_020.0
 # Rows of `joint`, which a step computes. REST and EDGES have two each, of the negative and the positive direction.
 SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
 # Rows of n in `userdata`: bristles, last command, motor state, cycle count (one number), number of cycles that the
 # safety filter changed (one number), low-pass state, effort, noise of the measured speeds, and SLOTS of commands.
-# Behind them: command, memory and parameters of the control law.
+# Behind them: command, memory and parameters of the control law, and the contact of a robot with a tool.
 BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
 KEPT = LINE + SLOTS
 USUAL = 7  # joints that the driver's part is compiled for; others run slower
@@ -211,6 +215,8 @@ def _friction(sizes, user, q, dq, forces, places):
     xpos, xmat = carray(_as_doubles(places[0]), (nbody, 3)), carray(_as_doubles(places[1]), (nbody, 9))
     anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))
     net, slow = user[0, NET] != 0.0, False  # net: stick_slip.py holds, all joints of an arm or none
+    at = int(user[0, CONTACT])
+    touch = at != 0
     joint = carray(_stack(ROWS * n), (ROWS, n))  # type: ignore[call-arg]
     # mass and first moment of everything beyond a joint: errors of the compensation, and nominal
     em, ex, ey, ez, lm, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -241,14 +247,24 @@ def _friction(sizes, user, q, dq, forces, places):
         drive = applied[j] + pull
         held = not net and abs(v) < user[j, DQ_MIN] and user[j, BREAK_NEG] < drive < user[j, BREAK_POS]
         passive[j] += force + (-applied[j] if held else pull)
-        if net:
+        if net or touch:
             joint[SPEED, j], joint[FRICTION, j], joint[LOADED, j] = v, friction, loaded
             joint[FORCE, j] = passive[j] + applied[j] - bias[j]
-            slow |= abs(v) <= user[j, DQ_MIN] or v == 0.0
-    if net:
-        work = carray(_stack(n * (n + 4)), (n + 4, n))  # type: ignore[call-arg]
-        if slow or any_reversal(mass, damping, user[0, STEP], joint[SPEED], joint[FORCE], work):
-            _hold((mass, damping, bias, applied, passive), dq, user, joint, work)
+            slow |= net and (abs(v) <= user[j, DQ_MIN] or v == 0.0)
+    if net or touch:
+        work = carray(_stack(n * (2 * n + 6)), (2 * n + 6, n))  # type: ignore[call-arg]
+        jacobian = carray(_stack(CONTACT_ROWS * n), (CONTACT_ROWS, n))  # type: ignore[call-arg]
+        contact = carray(_as_doubles(forces[5]), (at + CONTACT_COLUMNS,))[at:]  # type: ignore[call-arg]
+        if touch:
+            body = int(user[n - 1, BODY])
+            place = xpos[body], xmat[body]
+            touch = near(contact, place, anchor, axis, joint[SPEED], user[0, STEP], jacobian)
+        reverses = slow or touch
+        if net and not reverses:
+            reverses = any_reversal(mass, damping, user[0, STEP], joint[SPEED], joint[FORCE], work)
+        if reverses:
+            loads = mass, damping, bias, applied, passive
+            _hold(loads, dq, user, joint, work, (contact, jacobian), touch)
 
 
 @njit(error_model="numpy", forceinline=True)
@@ -290,23 +306,28 @@ def _drive(n, user, fields):
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(forces, dq, user, joint, work):
-    """Change the passive force of a step so that the step ends with the velocities of stick_slip.py.
+def _hold(forces, dq, user, joint, work, touch, touches):
+    """Change the passive force of a step so that the step ends with the velocities of stick_slip.py or contact.py.
 
     Args:
         forces: M, damping, bias, applied, passive of MuJoCo. dq: (n,). user: (n, WIDTH). joint: (ROWS, n), output of
-            `_friction`. work: (n + 4, n), any content.
+            `_friction`. work: (2 n + 6, n), any content.
+        touch: contact and Jacobian of `near`. touches: what it returned.
     """
     mass, damping, bias, applied, passive = forces
     n, h = len(dq), user[0, STEP]
     coming, rest, edges = joint[COMING], joint[REST : REST + 2], joint[EDGES : EDGES + 2]
-    for j in range(n):
+    if user[0, NET] == 0.0:  # friction is part of the force, and no joint has edges
+        joint[FRICTION], joint[REST : EDGES + 2] = 0.0, 0.0
+    for j in range(n if user[0, NET] != 0.0 else 0):
         joint[FORCE, j] += joint[FRICTION, j]
         rest[0, j], rest[1, j] = user[j, REST_NEG] - joint[LOADED, j], user[j, REST_POS] + joint[LOADED, j]
         edges[0, j], edges[1, j] = min(user[j, BREAK_NEG], rest[0, j]), max(user[j, BREAK_POS], rest[1, j])
     dq_min = max(user[0, DQ_MIN], TINY)
     loads = JointForces(joint[SPEED], joint[FORCE], joint[FRICTION], rest, edges)
-    if not coming_velocity(mass, damping, h, loads, dq_min, work, coming):
+    if touches:
+        contact_velocity(touch, mass, damping, h, loads, dq_min, work, coming)
+    elif not coming_velocity(mass, damping, h, loads, dq_min, work, coming):
         return
     for j in range(n):
         passive[j] = bias[j] - applied[j] + damping[j] * (coming[j] - dq[j])

@@ -14,6 +14,7 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics import mujoco_callback as native
 from r2s.physics.actuation import low_pass_factor, steps_late
+from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, TIP, contact_columns
 from r2s.physics.control_laws import ControlLaw, law_number
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import principal_axes, set_links
@@ -27,6 +28,7 @@ class Simulator:
 
     Args:
         robot, dynamics: the arm; dynamics of one arm or of `nsim`. nsim: arms. nthread: threads.
+            With `robot.tool`, each arm may have a surface (`Dynamics.surface`).
         dt: s, of a physics step.
         control: law that turns commands into torques; None: `rollout` gives torques.
     """
@@ -41,12 +43,15 @@ class Simulator:
         control: ControlLaw | None = None,
     ):
         self._control, self._kept = control, native.KEPT * robot.n
+        self._touching = 0 if robot.tool is None else COLUMNS
         self._law_number = native.NO_CONTROL if control is None else float(law_number(control.law))
         native.install()
         self.robot = robot
         sizes = (0, 0, 0) if control is None else (control.command_size, control.memory_size, len(control.parameters))
         self._sizes = sizes
-        self.model = robot.model(gravity=False, user=native.WIDTH, memory=self._kept + sum(sizes), dt=dt)
+        self._contact_at = self._kept + sum(sizes)
+        memory = self._contact_at + self._touching
+        self.model = robot.model(gravity=False, user=native.WIDTH, memory=memory, dt=dt)
         self.batch = mujoco.batch.Batch(self.model, nsim, nthread)
         self.nsim = nsim
         self._bodies = self.model.jnt_bodyid
@@ -61,8 +66,11 @@ class Simulator:
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
-        self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] :]
+        self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] : self._contact_at]
+        self._contact = self._memory[:, self._contact_at :]
+        self._surfaces = np.zeros((nsim, self._touching))  # what `reset` puts into the memory
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
+        self._xpos, self._xmat = self.batch.bind("xpos"), self.batch.bind("xmat")
         self._site_xpos = self.batch.bind("site_xpos")
         self.set_dynamics(dynamics)
 
@@ -86,6 +94,10 @@ class Simulator:
         self._iquat[at] = spread(axes, 2)
         self._mass[at] = spread(dynamics.mass, 1)
         self._com[at] = spread(dynamics.com, 2)
+        self._user[arms, :, native.CONTACT] = 0.0 if dynamics.surface is None else self._contact_at
+        if dynamics.surface is not None:
+            self._surfaces[arms] = spread(contact_columns(self.robot, dynamics.surface), 1)
+            self._contact[arms, :DEFLECTION] = self._surfaces[arms, :DEFLECTION]
         self.batch.set_const(ids)
 
     def drive(
@@ -140,6 +152,7 @@ class Simulator:
         self._memory[at, : self.robot.n] = bristle
         if self._control is not None:
             self._parameters[at] = self._control.parameters
+        self._contact[at] = self._surfaces[at]
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 
@@ -149,7 +162,7 @@ class Simulator:
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore what `state` returned; the same torques then give the same motion, bit for bit."""
-        for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset"):
+        for name in ("_user", "_armature", "_inertia", "_iquat", "_mass", "_com", "_offset", "_surfaces"):
             self._arrays()[name][:] = state[name]
         self.batch.set_const()
         self.batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -159,7 +172,7 @@ class Simulator:
 
     def _arrays(self) -> dict[str, np.ndarray]:
         names = ("q", "dq", "_memory", "_damping", "_user", "_armature", "_inertia", "_iquat", "_mass", "_com")
-        return {name: getattr(self, name) for name in (*names, "_offset")}
+        return {name: getattr(self, name) for name in (*names, "_offset", "_surfaces")}
 
     def rollout(self, tau: np.ndarray, record: tuple[str, ...] = ("qpos",), ids: np.ndarray | None = None) -> dict:
         """Apply torques tau (m, nstep, n) Nm, one per step; return {"qpos": (m, nstep, n), ...} after each step."""
@@ -188,6 +201,24 @@ class Simulator:
         return self._memory[:, native.LIMITED * self.robot.n]
 
     @property
+    def contact_force(self) -> np.ndarray:
+        """(nsim, 3) N on the tool in the base frame, mean of the last step; only of a robot with a tool."""
+        return self._contact[:, FORCE : FORCE + 3]
+
+    @property
+    def depth(self) -> np.ndarray:
+        """(nsim,) m, penetration of the tool at the beginning of the last step; negative: its distance."""
+        return self._contact[:, DEPTH]
+
+    def contact_torque(self) -> np.ndarray:
+        """Return (nsim, n) Nm, the joint torques of `contact_force`; only of a robot with a tool."""
+        c, last = self._contact, self._bodies[-1]
+        axes = self._xmat[:, last].reshape(-1, 3, 3)
+        point = self._xpos[:, last] + (axes @ c[:, TIP : TIP + 3, None])[..., 0]
+        point = point - c[:, RADIUS, None] * c[:, NORMAL : NORMAL + 3]
+        return (self._xaxis * np.cross(point[:, None] - self._xanchor, self.contact_force[:, None])).sum(-1)
+
+    @property
     def ee(self) -> np.ndarray:
         """(nsim, 3) m, the end effector in the base frame."""
         return self._site_xpos[:, self._site]
@@ -210,9 +241,10 @@ def _jacobian(axis, anchor, ee):
 
 
 def single_arm(robot: Robot, dynamics: Dynamics) -> mujoco.MjModel:
-    """Return one arm's model without gravity: its links and rotors, and its friction law."""
+    """Return one arm's model without gravity: its links and rotors, and its friction law; it touches nothing."""
     native.install()
-    model = robot.model(gravity=False, user=native.WIDTH, memory=native.KEPT * robot.n)
+    memory = native.KEPT * robot.n + (0 if robot.tool is None else COLUMNS)
+    model = robot.model(gravity=False, user=native.WIDTH, memory=memory)
     model.jnt_user[:, : native.LIMITS] = _law_columns(robot, model, dynamics)
     set_links(model, dynamics.mass, dynamics.com, dynamics.inertia, dynamics.armature)
     return model

@@ -6,7 +6,7 @@ sliding, against the velocity.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from r2s.compiled import njit
 from r2s.errors import UserError, nearest
 from r2s.files import located
 
+TINY = np.finfo(float).tiny
 UNIT_DEPTH = 1e-3  # m, the penetration at which stiffness is stated
 TOOL_KEYS = ("tip_in_flange_m", "radius_m", "mass_kg", "frame")
 
@@ -25,7 +26,7 @@ class Tool:
 
     Attributes:
         tip: (3,) m, centre of the sphere in the frame of the end effector's site.
-        radius: m. mass: kg, at the centre.
+        radius: m. mass: kg, at the centre; its inertia counts if it is a payload as well (r2s/physics/payload.py).
     """
 
     tip: np.ndarray
@@ -35,30 +36,65 @@ class Tool:
 
 @dataclass(frozen=True)
 class Surface:
-    """A compliant plane in the base frame.
+    """A compliant plane or box in the base frame; for many arms at once, each field with any batch shape.
 
     Attributes:
-        point: (3,) m, on the plane. normal: (3,) unit vector, out of the material.
+        point: (3,) m, on the plane, or the centre of the box.
+        normal: (3,) unit vector, out of the material; of a box, its third axis.
         stiffness: N/m, k: force per penetration at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
         damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction reaches mu F; 0: rigid.
+        half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
     """
 
     point: np.ndarray
     normal: np.ndarray
-    stiffness: float
-    exponent: float = 1.5
-    damping: float = 0.0
-    friction: float = 0.3
-    bristle: float = 0.0
+    stiffness: np.ndarray | float
+    exponent: np.ndarray | float = 1.5
+    damping: np.ndarray | float = 0.0
+    friction: np.ndarray | float = 0.3
+    bristle: np.ndarray | float = 0.0
+    half: np.ndarray | None = None
+    axes: np.ndarray | None = None
 
     @property
-    def coefficient(self) -> float:
+    def coefficient(self) -> np.ndarray | float:
         """K, N/m^e, factor of the normal force."""
         return self.stiffness / UNIT_DEPTH ** (self.exponent - 1.0)
 
     def depth(self, centre: np.ndarray, radius: float) -> np.ndarray:
         """Return the penetration (...,) m of a sphere at centre (..., 3) m; negative: its distance."""
-        return radius - (centre - self.point) @ self.normal
+        if self.half is None:
+            return radius - ((centre - self.point) * self.normal).sum(-1)
+        beyond = np.abs(((centre - self.point)[..., None] * self.axes).sum(-2)) - self.half
+        return radius - np.linalg.norm(beyond.clip(0.0), axis=-1) - np.minimum(beyond.max(-1), 0.0)
+
+    def one(self, k: int) -> "Surface":
+        """Return the k-th surface of a batch (m, ...); fields without a batch shape stay unchanged."""
+        values = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        one = {"point": 1, "normal": 1, "half": 1, "axes": 2}  # number of axes for one arm
+        return replace(self, **{name: v[k] for name, v in values.items() if v.ndim > one.get(name, 0)})
+
+    def check(self) -> None:
+        """Raise UserError unless all values are in their ranges."""
+        for name, low, high in (
+            ("stiffness", TINY, np.inf), ("exponent", 1.0, 2.0), ("damping", 0.0, np.inf), ("friction", 0.0, np.inf),
+            ("bristle", 0.0, np.inf),
+        ):  # fmt: skip
+            value = np.asarray(getattr(self, name), dtype=float)
+            if not ((value >= low) & (value <= high) & np.isfinite(value)).all():
+                allowed = {"stiffness": "above 0 N/m", "exponent": "from 1 to 2"}.get(name, "of 0 or more")
+                raise UserError(f"surface.{name}: expected a value {allowed}, got {value.min():g} to {value.max():g}")
+        if not np.isfinite(self.point).all() or np.abs(np.linalg.norm(self.normal, axis=-1) - 1.0).max() > 1e-6:
+            raise UserError(
+                f"surface: expected a finite point and a normal of length 1, got {self.point}, {self.normal}"
+            )
+        if self.half is not None:
+            half, axes = np.asarray(self.half), np.asarray(self.axes)
+            if not (np.isfinite(half) & (half > 0)).all():
+                raise UserError(f"surface.half: expected 3 half edges above 0 m, got {half.tolist()}")
+            gram = np.swapaxes(axes, -1, -2) @ axes if axes.shape[-2:] == (3, 3) else np.zeros((3, 3))
+            if np.abs(gram - np.eye(3)).max() > 1e-6 or np.abs(axes[..., 2] - self.normal).max() > 1e-6:
+                raise UserError("surface.axes: expected 3 perpendicular unit vectors, the third of them the normal")
 
 
 @njit(cache=True, error_model="numpy")

@@ -27,6 +27,7 @@ def emulated_arm(
     noise: int = 0,
     payload: Any = 0.0,
     declared_payload: Any = None,
+    surface: Any = False,
     operator: Operator | str | None = "terminal",
     collision_torque: Sequence[float] = CAUTIOUS.torque,
     collision_force: Sequence[float] = CAUTIOUS.force,
@@ -37,7 +38,7 @@ def emulated_arm(
 
     Args:
         robot: nominal model. client: 'panda' or 'fr3'.
-        seed: of the rigid twin. noise, payload, declared_payload: see `TwinBase`.
+        seed: of the rigid twin. noise, payload, declared_payload, surface: see `TwinBase`.
         realtime: 1 kHz instead of lock-step. operator, collision_torque, collision_force, speed_share, moves: see
             `Panda`.
     """
@@ -49,7 +50,8 @@ def emulated_arm(
     settings: dict[str, Any] = {"collision_torque": collision_torque, "collision_force": collision_force}
     settings |= {"declared_payload": declared_payload, "moves": moves, "speed_share": speed_share}
     arm = partial(make, robot, operator=find_operator(operator), **settings)
-    twin = partial(RigidTwin, robot, seed, payload=payload, noise=noise, declared_payload=declared_payload)
+    own: dict[str, Any] = {"payload": payload, "declared_payload": declared_payload, "surface": surface}
+    twin = partial(RigidTwin, robot, seed, noise=noise, **own)
     return _opened(arm, Emulator(twin, version=version, realtime=realtime), realtime)
 
 

@@ -124,6 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--version", type=int, default=5, choices=fci.VERSIONS, help="5: Panda (default), 10: FR3")
     parser.add_argument("--robot", type=Path, help="YAML with the arguments of load_robot: conf/robot/panda.yaml")
     parser.add_argument("--seed", type=int, default=0, help="of the rigid twin")
+    parser.add_argument("--surface", action="store_true", help="a table below the tip of the robot's tool")
     parser.add_argument("--address", help="a loopback address; default: the first free one")
     parser.add_argument("--realtime", action="store_true", help="1 kHz instead of lock-step")
     parser.add_argument("--fault", nargs="+", action="append", default=[], metavar="X",
@@ -134,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         robot = load_robot(**_read_robot(options.robot))
         faults = [_parse_fault(fault) for fault in options.fault]
-        twin = partial(RigidTwin, robot, options.seed)
+        twin = partial(RigidTwin, robot, options.seed, surface=options.surface)
         server = _server(twin, options.version, options.address, options.realtime, faults)
     except UserError as error:
         print(error, file=sys.stderr)

@@ -1,9 +1,10 @@
 """Joints with elastic gears and dry friction that warms up, compiled: one 1 ms cycle of the elastic twin.
 
 Per joint, theta and w = dtheta/dt of the motor (at the joint's side of the gear), q and v of the link:
-    rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v
+    rotor dw/dt = motor torque + offset - s - L (w - v) - f,   M(q) dv/dt + c(q, v) + g(q) = s + drag(q) - d v + J'F
     s = K (theta - q) + D (w - v)
     f = sign(w) warm ripple (c (1 + (b - 1) / (1 + |w / vs|^a)) + mu |s| + r |w|^e),  c one value per direction
+F is the contact with a surface (r2s/physics/contact.py).
 L (w - v) is the damping of the gear by the drive's torque loop. A motor at rest stays exactly at rest while the net
 torque on it is within f at w = 0; friction then balances that torque.
 warm = 1 - fall (1 - exp(-heat / 0.6)). ripple is 1 plus a sine of theta each per revolution of the joint, of the
@@ -19,6 +20,8 @@ import numpy as np
 
 from r2s.arm.twins.draws import ENCODER, drag
 from r2s.compiled import njit
+from r2s.physics.contact import contact_torque, explicit_contact, near
+from r2s.physics.kinematics import link_frames
 from r2s.physics.linear_algebra import factor, solve
 from r2s.physics.newton_euler import WORK, equations
 from r2s.physics.robot import SIM_DT
@@ -35,7 +38,7 @@ LINK_Q, LINK_V, THETA, W, MOTOR, HEAT, Q_MEASURED, DQ_MEASURED, TAU_MEASURED, TH
     range(14)
 )
 # ... and of the forces within a step (FORCES, n); the velocities are those at its middle
-F_DRIVE, F_FACTOR, F_SPRING, F_LINK_V, F_W, F_POWER, FORCES = range(7)
+F_DRIVE, F_FACTOR, F_SPRING, F_LINK_V, F_W, F_POWER, F_TOUCH, FORCES = range(8)
 HALF_WARM = 0.6  # heat scale of warming; heat is 1 at a quarter of the speed limit
 
 
@@ -115,23 +118,28 @@ def compensate(p, s, gravity):
 
 
 @njit(cache=True)
-def advance(p, s, links, gravity, line, cycle, steps, age):
+def advance(p, s, arm, line, cycle, steps, age):
     """Advance the arm by one cycle in `steps` steps; keep its motion at `age` cycles before the end for the sensors.
 
     Args:
-        p, s: parameters, and the state, which changes. links, gravity: of the true arm.
+        p, s: parameters, and the state, which changes.
+        arm: links and gravity of the true arm, and contact, Jacobian, frames and axes of its `Touch` with whether
+            there is a surface.
         line: (slots, n + 1), the last commands, Nm, and when each arrived, cycles. cycle: its number.
     """
+    links, gravity, touch = arm
     n, h = s.shape[1], SIM_DT / steps
     mass, root, bias, work = np.empty((n, n)), np.empty((n, n)), np.empty(n), np.empty((n, WORK))
     f, before = np.empty((FORCES, n)), np.empty((3, n))
-    f[F_POWER] = 0.0
+    f[F_POWER], f[F_TOUCH] = 0.0, 0.0
     for step in range(steps):
         for i in range(n):
             before[0, i], before[1, i] = s[THETA, i], s[W, i]
             before[2, i] = _gear_torque(p, s, i)
         _move(s, 0.5 * h)
         _external_forces(p, s, f, line, cycle, cycle + step / steps, cycle + (step + 1) / steps, h)
+        if touch[4]:
+            _touch(s, links, touch, h, f[F_TOUCH])
         for correction in range(2):
             equations(links, gravity, s[LINK_Q], f[F_LINK_V], mass, bias, work)
             if correction == 0:
@@ -161,6 +169,18 @@ def _move(s, h):
 
 
 @njit(cache=True)
+def _touch(s, links, touch, h, out):
+    """Write the torque (n,) Nm of the contact at the middle of a step of h s."""
+    contact, jacobian, frames, axes, _ = touch
+    link_frames(links, s[LINK_Q], frames, axes)
+    place = frames[-1, :3], frames[-1, 3:]
+    out[:] = 0.0
+    if near(contact, place, frames[:, :3], axes, s[LINK_V], h, jacobian):
+        explicit_contact(contact, jacobian, s[LINK_V], h)
+        contact_torque(contact, jacobian, out)
+
+
+@njit(cache=True)
 def _external_forces(p, s, f, line, cycle, begin, end, h):
     """Write the motors' torque, friction factors and spring torques of a step from `begin` to `end`, cycles."""
     for i in range(s.shape[1]):
@@ -180,7 +200,7 @@ def _accelerate(p, s, f, bias, root, h, last):
     for i in range(n):
         gear = f[F_SPRING, i] + p[GEAR, i] * (f[F_W, i] - f[F_LINK_V, i])
         pull = drag(p[DRAG_OWN, i], p[DRAG_NEXT, i], p[DRAG_WAVES, i], p[DRAG_PHASE, i], q[i], q[(i + 1) % n])
-        bias[i] = gear + pull - p[DAMPING, i] * f[F_LINK_V, i] - bias[i]
+        bias[i] = gear + pull - p[DAMPING, i] * f[F_LINK_V, i] - bias[i] + f[F_TOUCH, i]
         push = f[F_DRIVE, i] - gear - p[LOOP, i] * (f[F_W, i] - f[F_LINK_V, i])
         after = _next_velocity(p, s[W, i], f[F_W, i], push, gear, f[F_FACTOR, i], h, i)
         if last:

@@ -105,9 +105,9 @@ class ElasticTwin(TwinBase):
         slot = self._cycle % SLOTS
         self._line[slot, :-1], self._line[slot, -1] = self._tau_J_d, self._cycle + self._jitter * late
         ej.compensate(self._hidden, s, self._gravity(self._nominal, s[ej.Q_MEASURED]))
-        ej.advance(
-            self._hidden, s, self._links, robot.gravity, self._line, self._cycle, self._steps, self._jitter * age
-        )
+        t = self._touch
+        arm = self._links, robot.gravity, (t.contact, t.jacobian, t.frames, t.axes, t.there)
+        ej.advance(self._hidden, s, arm, self._line, self._cycle, self._steps, self._jitter * age)
         self._cycle += 1
         self._sense()
 
@@ -117,6 +117,10 @@ class ElasticTwin(TwinBase):
             self._noise = self._rng.standard_normal((NOISE_BLOCK, 3, self.robot.n))
             self._clock = self._rng.uniform(size=(NOISE_BLOCK, 3))
         ej.sense(self._hidden, self._state, self._noise[row], self._dq_filter)
+
+    @property
+    def _link_q(self) -> np.ndarray:
+        return self._state[ej.LINK_Q]
 
     def _sensors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s = self._state

@@ -9,6 +9,8 @@ import numpy as np
 
 from r2s.arm.twins.draws import ENCODER, drag
 from r2s.compiled import njit
+from r2s.physics.contact import GUESS, ROUNDS, add_contact, contact_torque, finish_contact, next_guess, start_guess
+from r2s.physics.linear_algebra import packed_element
 from r2s.physics.robot import SIM_DT
 
 # Rows of the parameters (ROWS, n) ...
@@ -17,7 +19,7 @@ DRAG_OWN, DRAG_NEXT, DRAG_WAVES, DRAG_PHASE, NOISE_Q, NOISE_DQ, NOISE_TAU, ARMAT
 DELAY, LAG, DQ_FILTER, ROWS = range(18, 22)  # cycles; gains per cycle of torque lag and speed filter
 # ... and of the state (STATES, n)
 Z, MOTOR, DRIVE, V_GUESS, LEVEL, FRICTION, SLOPE, BIAS, DQ_MEASURED, Q_MEASURED, TAU_MEASURED, BENT = range(12)
-Q, V, V_BEFORE, STATES = range(12, 16)
+Q, V, V_BEFORE, TOUCH, STATES = range(12, 17)  # TOUCH: Nm, of the contact with a surface
 
 DQ_BRISTLE = 0.02  # rad/s, vd: bristle damping fades with speed, otherwise each reversal would cause a torque pulse
 SWEEPS, CONVERGED = 50, 1e-9  # most Gauss-Seidel sweeps, and the change, rad/s, at which they end
@@ -55,7 +57,7 @@ def rest(p, s, q, compensation, gravity):
 
 
 @njit(cache=True)
-def drive(p, s, line, cycle, tau, compensation, mass):
+def drive(p, s, line, cycle, tau, compensation, mass, touch):
     """Apply a command; return passive torque and implicit damping (n,) for the engine's step.
 
     The coupled implicit equation of the step, mass (w - v) / h + bias + f(w) = drive, is solved for the next velocity
@@ -65,6 +67,7 @@ def drive(p, s, line, cycle, tau, compensation, mass):
     Args:
         p, s: parameters and state. line: (slots, n) Nm, the last commands. cycle: its number.
         tau, compensation: (n,) Nm, command and gravity compensation. mass: (n, n) kg m^2.
+        touch: contact and Jacobian of r2s/physics/contact.py, and whether the tip may touch.
     """
     n, slots, h = len(tau), len(line), SIM_DT
     q, v, w = s[Q], s[V], s[V_GUESS]
@@ -83,9 +86,11 @@ def drive(p, s, line, cycle, tau, compensation, mass):
         limit = s[LEVEL, i] / p[S0, i]
         s[Z, i] = min(max(s[Z, i], -limit), limit)
         damping[i] = p[S1, i] * np.exp(-((v[i] / DQ_BRISTLE) ** 2)) / h  # s1 / h until the end of this function
-    for _ in range(SWEEPS):
-        if _sweep(p, s, damping, mass) < CONVERGED:
-            break
+    if touch[2]:
+        _solve_touch(p, s, damping, mass, touch[0], touch[1])
+    else:
+        s[TOUCH] = 0.0
+        _solve(p, s, damping, mass)
     for i in range(n):
         stiff, z, k = p[S0, i] + damping[i], s[Z, i], h * p[S0, i] / s[LEVEL, i]
         grow = 1 + k * abs(w[i])
@@ -95,7 +100,34 @@ def drive(p, s, line, cycle, tau, compensation, mass):
         s[FRICTION, i], s[SLOPE, i] = friction, slope
         damping[i] = slope
         passive[i] -= friction - slope * w[i]
+        passive[i] += s[TOUCH, i]
     return passive, damping
+
+
+@njit(cache=True)
+def _solve(p, s, damping, mass):
+    for _ in range(SWEEPS):
+        if _sweep(p, s, damping, mass) < CONVERGED:
+            break
+
+
+@njit(cache=True)
+def _solve_touch(p, s, damping, mass, contact, jacobian):
+    """Solve the step together with the contact, which adds to mass and drive; leave its torque in TOUCH."""
+    n, h = len(damping), SIM_DT
+    added, soft, guess = np.empty(n * (n + 1) // 2), np.empty((n, n)), np.empty(GUESS)
+    start_guess(contact, jacobian, s[V], h, guess)
+    for _ in range(ROUNDS):
+        added[:], s[TOUCH] = 0.0, 0.0
+        add_contact(contact, jacobian, h, guess, added, s[TOUCH])
+        for i in range(n):
+            for j in range(n):
+                soft[i, j] = mass[i, j] + packed_element(added, i, j)
+        _solve(p, s, damping, soft)
+        if next_guess(contact, jacobian, h, s[V_GUESS], guess):
+            break
+    finish_contact(contact, h, guess)
+    contact_torque(contact, jacobian, s[TOUCH])
 
 
 @njit(cache=True)
@@ -103,7 +135,7 @@ def _sweep(p, s, damping, mass):
     """Solve each joint's equation once for its next velocity; return the largest change, rad/s."""
     n, h, v, w, change = len(damping), SIM_DT, s[V], s[V_GUESS], 0.0
     for i in range(n):
-        free = s[DRIVE, i] - s[BIAS, i] + mass[i, i] / h * v[i]
+        free = s[DRIVE, i] + s[TOUCH, i] - s[BIAS, i] + mass[i, i] / h * v[i]
         for j in range(n):
             if j != i:
                 free -= mass[i, j] / h * (w[j] - v[j])
@@ -135,7 +167,7 @@ def sense(p, s, mass, noise):
         inertial = 0.0
         for j in range(n):
             inertial += mass[i, j] * (v[j] - before[j]) / h
-        s[BIAS, i] = link - inertial
+        s[BIAS, i] = link + s[TOUCH, i] - inertial
         rotor = p[ARMATURE, i] * (v[i] - before[i]) / h  # on the motor's side of gear and sensor
         bent = p[COMPLIANCE, i] * (link - rotor)
         motor_q, motor_v = s[Q, i] + bent, v[i] + (bent - s[BENT, i]) / h

@@ -22,6 +22,7 @@ def make_twin(
     noise: int = 0,
     friction_scale: float = 1.0,
     extra_delay_s: float = 0.0,
+    surface: Any = False,
 ) -> TwinBase:
     """Return a hidden twin. These are the keys of conf/arm/twin.yaml; see `TwinBase`.
 
@@ -44,4 +45,5 @@ def make_twin(
         noise=noise,
         friction_scale=friction_scale,
         extra_delay_s=extra_delay_s,
+        surface=surface,
     )

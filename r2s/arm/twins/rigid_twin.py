@@ -6,8 +6,8 @@ nominal ones, torque delay and lag, cable drag, sensor noise and quantisation. `
 reads the drawn parameters. Seeds 0-9 are for development; seeds of 100 and above are for judging.
 
 One cycle: the command passes delay and lag; lugre_joints.py solves the friction of the next step implicitly, together
-with the coupled joint velocities; DART takes the step with that friction linearised about the solution; then the
-sensors are read.
+with the coupled joint velocities and the contact with a surface; DART takes the step with that friction linearised
+about the solution and that contact force; then the sensors are read.
 """
 
 from typing import Any
@@ -81,10 +81,12 @@ class RigidTwin(TwinBase):
         self._mass = self._engine.mass_matrix(self._q)
 
     def _advance(self, tau: np.ndarray) -> None:
-        if self._cycle % MASS_EVERY == 0:
+        touches = self._touch.near(self._q, self._dq)
+        if touches or self._cycle % MASS_EVERY == 0:
             self._mass = self._engine.mass_matrix(self._q)
         s, compensation = self._state, self._nominal.gravity_torque_there(self._q)
-        passive, damping = lj.drive(self._hidden, s, self._line, self._cycle, tau, compensation, self._mass)
+        touch = self._touch.contact, self._touch.jacobian, touches
+        passive, damping = lj.drive(self._hidden, s, self._line, self._cycle, tau, compensation, self._mass, touch)
         self._q, self._dq = self._engine.step(s[lj.MOTOR], passive, damping)
         s[lj.V_BEFORE], s[lj.Q], s[lj.V] = s[lj.V], self._q, self._dq
         self._tau_J_d = tau

@@ -1,4 +1,4 @@
-"""What both variants of hidden twin have in common: settings, reflexes, payload, extra delay, episodes.
+"""What both variants of hidden twin have in common: settings, reflexes, payload, surface, extra delay, episodes.
 
 A variant (rigid_twin.py, elastic_twin.py) draws a robot around the nominal one from its seed, and has drives and
 friction of its own. Only the variant's own code reads the drawn parameters.
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from r2s.arm.interface import ArmState, ArmStopped, Reflexes
+from r2s.arm.twins.touch import Touch, draw_surface
 from r2s.errors import UserError, check_number
 from r2s.physics.payload import LoadTorque, Payload, mass_and_moment, payload_of
 from r2s.physics.robot import SIM_DT, Robot
@@ -26,7 +27,8 @@ class TwinBase:
 
     A variant implements `_start(q)`, which places the arm, `_advance(tau)`, one cycle under a command,
     `_attach(payload)`, which changes the payload now, and `_sensors()`, which returns q, dq and tau_J. It sets `_q`
-    and `_dq`, which the reflexes check, `_cycle` and `_tau_J_d`, and multiplies its friction by `_friction_scale`.
+    and `_dq`, which the reflexes check, `_cycle` and `_tau_J_d`, multiplies its friction by `_friction_scale`, and
+    adds the contact `_touch` to the forces on its links, which are at `_link_q`.
 
     Attributes:
         robot, declared_payload: see below.
@@ -40,6 +42,8 @@ class TwinBase:
         noise: number of the sensor noise stream; two recordings of one robot need different ones.
         friction_scale: factor of the drawn friction, except of its load-dependent part; below 1 for a warm arm.
         extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
+        surface: what the robot's tool may touch, drawn from the seed: False: nothing. True: a table below the tip at
+            home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of that place, in the base frame.
 
     Raises:
         UserError: an argument is out of its range.
@@ -56,6 +60,7 @@ class TwinBase:
         noise: int = 0,
         friction_scale: float = 1.0,
         extra_delay_s: float = 0.0,
+        surface: Any = False,
     ):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
         self._payload = payload_of(payload)
@@ -70,6 +75,7 @@ class TwinBase:
         self._extra_delay = _delay_cycles(extra_delay_s)
         self.robot = robot
         self._seed, self._stream = int(seed), int(noise)
+        self._touch = Touch(robot, draw_surface(robot, surface, np.random.default_rng([self._seed, 4])))
         self._reflexes = Reflexes(robot)
         self._episode = 0
         self._stopped: str | None = "no motion was started; call move_to first"
@@ -84,6 +90,8 @@ class TwinBase:
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
+        if (depth := self._touch.start(q)) > 0:
+            raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
         self._update_payload()
         self._start(q)
@@ -93,12 +101,16 @@ class TwinBase:
         return self.read()
 
     def read(self) -> ArmState:
-        """Return the sensors' values of the current cycle, and the torque of the payload beyond the declared one."""
+        """Return the sensors' values of the current cycle; external torque: undeclared payload and contact, exact."""
         q, dq, tau_J = self._sensors()
         load = mass_and_moment(self.robot, self._payload if self._carries else None) - self._declared
+        external, wrench = self._load_torque(self._q, load), None
+        if self._touch.there:
+            torque, wrench = self._touch.wrench(self._link_q)
+            external = external + torque
         return ArmState(
             self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._last_command.copy(),
-            tau_ext_hat_filtered=self._load_torque(self._q, load), m_ee=0.0, m_load=float(self._declared[0]),
+            tau_ext_hat_filtered=external, O_F_ext_hat_K=wrench, m_ee=0.0, m_load=float(self._declared[0]),
         )  # fmt: skip
 
     def command(self, tau: np.ndarray) -> None:
@@ -125,6 +137,11 @@ class TwinBase:
         self._payload = payload
         self._attach(payload if payload is not None and payload.attached(self._cycle * SIM_DT) else None)
         self._carries = payload is not None and bool(payload.attached(self._cycle * SIM_DT))
+
+    @property
+    def _link_q(self) -> np.ndarray:
+        """(n,) rad, of the links; with elastic gears it is not that of the motors."""
+        return self._q
 
     @property
     def _last_command(self) -> np.ndarray:

@@ -1,0 +1,118 @@
+"""The surface of a twin: drawn from its seed around the place where one expects it, and touched in every cycle."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from r2s.errors import UserError, nearest
+from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, ROWS, TIP, contact_columns, near
+from r2s.physics.description import chain
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.kinematics import POSE, link_frames
+from r2s.physics.newton_euler import links_of
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.surface import Surface
+
+BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the expected surface
+PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than expected
+STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
+
+
+class Touch:
+    """A tool's tip and a surface, as a twin's compiled cycle takes them; without a surface nothing ever touches.
+
+    Attributes:
+        contact: (COLUMNS,) of r2s/physics/contact.py; jacobian: (ROWS, n); frames: (n, POSE); axes: (n, 3).
+        links: of `links_of`. there: whether there is a surface.
+
+    Args:
+        robot: the arm. surface: None: no surface.
+    """
+
+    def __init__(self, robot: Robot, surface: Surface | None):
+        n = robot.n
+        self.there, self.contact = surface is not None, np.zeros(COLUMNS)
+        self.jacobian, self.frames, self.axes = np.zeros((ROWS, n)), np.zeros((n, POSE)), np.zeros((n, 3))
+        self.links = links_of(robot, robot.mass, robot.com, robot.inertia)
+        self._ee = chain(robot, Dynamics.of(robot, np.zeros((n, 3))), friction=False)[1]
+        if surface is not None:
+            self.contact[:] = contact_columns(robot, surface)
+            self.contact[TIP : TIP + 3] = self._ee[:3, :3] @ robot.tool.tip + self._ee[:3, 3]  # type: ignore[union-attr]
+
+    def start(self, q: np.ndarray) -> float:
+        """Return the depth, m, of the tip at rest at q (n,) rad; it has not slid there."""
+        self.contact[DEFLECTION:] = 0.0
+        return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
+
+    def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
+        """Return whether the tip may touch within a cycle from q, dq (n,); update `jacobian`."""
+        if not self.there:
+            return False
+        link_frames(self.links, q, self.frames, self.axes)
+        last = self.frames[-1]
+        return near(self.contact, (last[:3], last[3:]), self.frames[:, :3], self.axes, dq, SIM_DT, self.jacobian)
+
+    def wrench(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the arm exerts on the surface: joint torque (n,) Nm, wrench (6,) N, Nm at the end effector."""
+        link_frames(self.links, q, self.frames, self.axes)
+        last, force = self.frames[-1], -self.contact[FORCE : FORCE + 3]
+        R, normal = last[3:].reshape(3, 3), self.contact[NORMAL : NORMAL + 3]
+        place = last[:3] + R @ self.contact[TIP : TIP + 3] - self.contact[RADIUS] * normal
+        torque = (self.axes * np.cross(place - self.frames[:, :3], force)).sum(1)
+        arm = place - last[:3] - R @ self._ee[:3, 3]
+        return torque, np.concatenate([force, np.cross(arm, force)])
+
+
+def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | None:
+    """Return a twin's surface near the place where one expects it; U: uniform.
+
+    surface: False: none. True: a table below the tip at home. {point: m, normal}: that place.
+
+    Raises:
+        UserError: another value, or a robot without a tool.
+    """
+    if surface is False or surface is None:
+        return None
+    if robot.tool is None:
+        raise UserError(f"arm.surface: {robot.name} has no tool that could touch it; give robot.tool=FILE")
+    point, normal = _expected(robot, surface)
+    # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    across /= np.linalg.norm(across)
+    about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
+    aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)
+    return Surface(
+        point=point + rng.uniform(-PLACE, PLACE) * normal,
+        normal=np.cos(tilt) * normal + np.sin(tilt) * aside,
+        stiffness=float(np.exp(rng.uniform(*np.log(STIFFNESS)))),
+        exponent=float(rng.choice([1.0, 1.5])),
+        damping=float(rng.uniform(0.5, 3.0)),  # s/m
+        friction=float(rng.uniform(0.1, 0.5)),
+        bristle=float(rng.uniform(1e-4, 3e-4)),  # m
+    )
+
+
+def _expected(robot: Robot, surface: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return point, m, and normal of the place where one expects the surface."""
+    if surface is True:
+        down = robot.gravity / np.linalg.norm(robot.gravity) if robot.gravity.any() else np.array([0.0, 0.0, -1.0])
+        probe = Touch(robot, None)
+        link_frames(probe.links, robot.q_home, probe.frames, probe.axes)
+        last, tool = probe.frames[-1], robot.tool
+        ee = last[3:].reshape(3, 3) @ probe._ee[:3, 3] + last[:3]
+        tip = ee + last[3:].reshape(3, 3) @ probe._ee[:3, :3] @ tool.tip  # type: ignore[union-attr]
+        return tip + (tool.radius + BELOW * np.linalg.norm(ee)) * down, -down  # type: ignore[union-attr]
+    if not isinstance(surface, Mapping):
+        raise UserError(f"arm.surface: expected false, true or {{point: [3], normal: [3]}}, got {surface!r}")
+    for key in (values := dict(surface)):
+        if key not in ("point", "normal"):
+            raise UserError(f"arm.surface: unknown key '{key}'{nearest(str(key), ('point', 'normal'))}")
+    try:
+        point, normal = (np.array(values[key], dtype=float).reshape(3) for key in ("point", "normal"))
+        length = float(np.linalg.norm(normal))
+    except (KeyError, TypeError, ValueError):
+        length = 0.0
+    if not 0 < length < np.inf or not np.isfinite(point).all():
+        raise UserError(f"arm.surface: expected {{point: 3 numbers in m, normal: 3 numbers}}, got {values}")
+    return point, normal / length
