@@ -1,14 +1,25 @@
 """Posterior of an identification: a normal approximation about the fit, drawn inside the bounds."""
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from r2s.identification.problem import Problem
-
 DRAWS = 512  # of the joint distribution
 LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
+
+
+class Linearized(Protocol):
+    """A least-squares problem on the unit cube, such as `Problem`; see there."""
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(R,) block of each data row."""
+        ...
+
+    def linearize(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual (R + B,) and Jacobian (R + B, P) at u (P,)."""
+        ...
 
 
 class Posterior(NamedTuple):
@@ -19,7 +30,7 @@ class Posterior(NamedTuple):
     information: np.ndarray
 
 
-def posterior(problem: Problem, u: np.ndarray, seed: int) -> Posterior:
+def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     """Return draws of the joint distribution about the fit u (P,), normal with a cluster-robust covariance.
 
     Errors within a block are correlated, so the scatter of block scores s, a block's part of the gradient, sets the

@@ -2,7 +2,7 @@
 
 import os
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number
@@ -85,6 +85,8 @@ class FileData:
     columns: dict[str, str | None]
     topic: str | None
     joints: list[str] | None
+    contact: str | None = None
+    contact_validation: str | None = None
 
     def __post_init__(self):
         check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
@@ -100,18 +102,27 @@ class FileData:
         return [*motion, *([self.ramps] if self.ramps else [])]
 
 
-def file_data(cfg):
-    """Return the `FileData` of a config; keys that only other kinds of data have are ignored."""
+def file_data(cfg, path=None):
+    """Return the `FileData` of a config; keys that only other kinds of data have are ignored.
+
+    path: instead of data.path, which may be missing then.
+    """
+    from omegaconf import OmegaConf
+
     own = {f.name for f in fields(FileData)}
-    given = {k: v for k, v in plain(cfg.data).items() if k in own}
+    node = cfg.data if path is None else OmegaConf.merge(cfg.data, {"path": path})
+    given = {k: v for k, v in plain(node).items() if k in own}
     given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
+    if given.get("contact") and given["torque"] is None:
+        given["torque"] = "commanded"
     return called(FileData, "data", given)
 
 
-def read_file(robot, file, path):
-    """Return the recording at `path`, with the columns of a `FileData`."""
+def read_file(robot, file, path, torque=None):
+    """Return the recording at `path`, with the columns of a `FileData`; `torque`: its kind, if not data.torque."""
     from r2s.recordings.readers import read
 
+    file = file if torque is None else replace(file, torque=torque)
     keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     how = {k: getattr(file, k) for k in keys}

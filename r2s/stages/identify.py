@@ -6,6 +6,7 @@ from typing import Any
 
 from r2s.errors import check_number
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
+from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration, only_contact
 from r2s.stages.data import check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
 from r2s.stages.parts import called, part, plain
 
@@ -50,6 +51,7 @@ class Parts:
     train: Any = None
     validation: Any = None
     ramps: Any = None
+    contact: Any = None
 
 
 def make_parts(cfg):
@@ -68,9 +70,11 @@ def make_parts(cfg):
         make_settings(cfg, cfg.data.torque)
     if cfg.data.kind == "recording":
         file = file_data(cfg)
+        contact = contact_data(cfg, robot, file)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         ramps = read_user_ramps(robot, file)
-        return Parts(robot, nominal, searches, file.files, None, train, validation, ramps)
+        files = [*file.files, *(contact.files if contact else [])]
+        return Parts(robot, nominal, searches, files, None, train, validation, ramps, contact)
     check_data(cfg)
     ramp_poses(cfg, robot)
     check_source(cfg, robot)
@@ -79,8 +83,24 @@ def make_parts(cfg):
     return Parts(robot, nominal, searches, [cfg.data.excitation], load(cfg.data.excitation, robot))
 
 
+def identify_only_contact(cfg, overrides):
+    """Presses -> contact.yaml, on top of the arm of `calibration=`."""
+    robot = make_robot(cfg)
+    data = contact_data(cfg, robot, file_data(cfg, cfg.data.contact))
+    arm = calibrated_arm(cfg, robot)
+    with open_run(cfg, overrides, data.files, parents=[str(cfg.calibration)]) as run:
+        entry = identify_surface(cfg, run, arm, data)
+        keep_calibration(cfg, run)
+        run.summary({"contact": entry})
+    print(f"written: {run.folder}")
+
+
 def identify(cfg, overrides):
     """Recording -> parameters.yaml, errors on training and validation motion, figures."""
+    if only_contact(cfg):
+        identify_only_contact(cfg, overrides)
+        return
+    from r2s.identification.contact.estimate import Arm
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
     from r2s.identification.prediction import prediction_errors
@@ -122,4 +142,7 @@ def identify(cfg, overrides):
         run.summary(summary)
         identification_page(run, robot, nominal, found, validation, summary, **how)
         identification_table(console(), robot, found, summary)
+        if made.contact:
+            arm = Arm(found.space, found.x, found.found.samples)
+            run.summary(summary | {"contact": identify_surface(cfg, run, arm, made.contact)})
     print(f"written: {run.folder}")

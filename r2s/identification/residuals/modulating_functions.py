@@ -41,6 +41,7 @@ class SlidingMotion:
         noise: (T, n) 1/s^2, standard deviation of the mean acceleration per rad of white encoder noise.
         encoder: (n,) rad, standard deviation of the encoder noise.
         delayed: (T, L, n) Nm, mean of the command 1 ms after the moment, at it, and each ms before.
+        instants: (F,) s. starts: (F,) bool, first instants of trajectories.
     """
 
     t: np.ndarray
@@ -53,6 +54,8 @@ class SlidingMotion:
     noise: np.ndarray
     encoder: np.ndarray
     delayed: np.ndarray
+    instants: np.ndarray
+    starts: np.ndarray
 
     @staticmethod
     def of(
@@ -106,7 +109,7 @@ class SlidingMotion:
         delayed = np.stack([_averaged(means, smooth.tau[rows]) for rows in ago], 1)
         return SlidingMotion(
             smooth.t[kept], q, dq[own], ddq[own], np.concatenate(bristle),
-            means, half > 0, gain[half], encoder, delayed,
+            means, half > 0, gain[half], encoder, delayed, smooth.t[own], own == began,
         )  # fmt: skip
 
     @property

@@ -78,7 +78,7 @@ class TorqueResidual:
         self._mean_sign = {memory: m.filtered(sign) for memory, sign in self._sign.items()}
         block = (m.t / BLOCK_S).astype(int)
         self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
-        self.lead_s = 0.0
+        self.lead_s, self._external = 0.0, np.zeros(1)
         self._weights = self._weights_at(space.start, fitted=False)
 
     def _with(self, **changes: Any) -> "TorqueResidual":
@@ -93,6 +93,14 @@ class TorqueResidual:
     def with_lead(self, lead_s: float) -> "TorqueResidual":
         """Return this residual with friction evaluated `lead_s` ahead, see `implicit_friction` in problem.py."""
         return self._with(lead_s=lead_s)
+
+    def within(self, kept: np.ndarray) -> "TorqueResidual":
+        """Return this residual without the moments that are not `kept` (T,) bool."""
+        return self._with(seen=self.seen & kept[:, None])
+
+    def with_external(self, tau: np.ndarray) -> "TorqueResidual":
+        """Return this residual for an arm on which its environment exerts the joint torque tau (T, n) Nm."""
+        return self._with(_external=tau)
 
     def predict(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm: torque of rigid bodies, rotors and friction minus offset, at the measured motion."""
@@ -124,9 +132,8 @@ class TorqueResidual:
 
     def error(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
-        if not self.commanded:
-            return self.predict(dynamics) - self.motion.tau
-        return self.predict(dynamics) - self.motion.command(float(dynamics.delay), float(dynamics.lag))
+        m, free = self.motion, self.predict(dynamics) - self._external
+        return free - (m.command(float(dynamics.delay), float(dynamics.lag)) if self.commanded else m.tau)
 
     def errors(self, x: np.ndarray) -> np.ndarray:
         """Return `error` (C, T, n) for candidates x (C, P)."""

@@ -1,0 +1,129 @@
+"""contact.yaml and contact_posterior.npz: an identified surface as other stages and other programs read it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from r2s.errors import UserError, nearest
+from r2s.files import DAMAGED, atomic_write
+from r2s.identification.contact.estimate import ContactEstimate
+from r2s.identification.contact.exchange import inverse_mass, mujoco_contact, sdf_surface
+from r2s.identification.contact.surface_space import LOAD
+from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface
+
+UNITS = {"stiffness": "N/m", "exponent": "1", "damping": "s/m", "friction": "1", "bristle": "m"}
+LAWS = {
+    "normal": "F = k 1mm (d / 1mm)^exponent (1 + damping d') >= 0 of the penetration d, k the stiffness at 1 mm",
+    "tangential": "friction F in sliding, reached over a deflection of about `bristle`",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedSurface:
+    """A surface of contact.yaml with 95 % intervals and draws.
+
+    Attributes:
+        surface: the estimate. interval: {name: (low, high)} of stiffness, exponent, damping, friction, bristle, slope
+            (N/m at 10 N), height (m along the normal) and tilt_deg (about it).
+        identifiable: {name: whether the recording determines it}, with plane and slope.
+        draws: surfaces of the posterior.
+    """
+
+    surface: Surface
+    interval: dict[str, tuple[float, float]]
+    identifiable: dict[str, bool]
+    draws: list[Surface]
+
+
+def save_contact(path: Path, robot: Robot, found: ContactEstimate, source: Mapping[str, Any]) -> None:
+    """Write contact.yaml, and contact_posterior.npz beside it.
+
+    Args:
+        path: of contact.yaml. robot: with its tool. source: origin of the estimate (recording, calibration, run).
+    """
+
+    def number(value: float) -> float:
+        return float(f"{value:.6g}")
+
+    def entry(value: float, unit: str, ends: tuple[float, float], name: str) -> dict[str, Any]:
+        out = {"unit": unit, "value": number(value)}
+        out |= {"interval95_low": number(ends[0]), "interval95_high": number(ends[1])}
+        return out | {"identifiable": found.identifiable[name]}
+
+    surface, tool = found.surface, robot.tool
+    assert tool is not None
+    parameters = {n: entry(getattr(surface, n), unit, found.interval(n), n) for n, unit in UNITS.items()}
+    slope = f"slope_at_{LOAD:g}N"
+    parameters[slope] = entry(found.slope, "N/m", found.interval("slope"), "slope")
+    low, high = found.height
+    document: dict[str, Any] = {"robot": robot.name, "source": dict(source), "law": LAWS}
+    document["tool"] = {"tip_in_flange_m": tool.tip.tolist(), "radius_m": tool.radius}
+    document["parameters"] = parameters
+    document["plane"] = {
+        "point_m": [float(f"{v:.9g}") for v in surface.point],
+        "height_interval95_m": [number(low), number(high)],
+        "normal": [float(f"{v:.9g}") for v in surface.normal],
+        "tilt95_deg": number(found.tilt_deg),
+        "identifiable": found.identifiable["plane"],
+    }
+    document["penetration_m"] = [number(v) for v in found.penetration]
+    document["mujoco"] = mujoco_contact(surface, inverse_mass(robot))
+    document["sdf"] = sdf_surface(surface)
+    with atomic_write(path.with_name("contact_posterior.npz")) as part:  # first: contact.yaml must not exist alone
+        np.savez_compressed(part, **found.draws)  # type: ignore[arg-type]
+    with atomic_write(path) as part:
+        part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
+
+
+def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurface:
+    """Return the surface of a run folder of stage=identify (or of a contact.yaml).
+
+    where: the option that names the folder, for error messages.
+
+    Raises:
+        UserError: no such file, or a damaged one.
+    """
+    path = Path(folder)
+    path = path / "contact.yaml" if path.is_dir() else path
+    if not path.is_file():
+        siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
+        raise UserError(f"{where}: no contact.yaml at {folder}{nearest(Path(folder).name, siblings)}")
+    try:
+        document = yaml.safe_load(path.read_text())
+        with np.load(path.with_name("contact_posterior.npz"), allow_pickle=False) as file:
+            draws = {name: file[name] for name in (*UNITS, "point", "normal")}
+        return _parse(document, draws)
+    except (*DAMAGED, AttributeError, IndexError, yaml.YAMLError) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"{where}: {path} is not a contact.yaml of r2s ({seen})") from None
+
+
+def _parse(document: dict[str, Any], draws: dict[str, np.ndarray]) -> IdentifiedSurface:
+    """Parse the document for `load_contact`; a malformed one raises KeyError, ValueError and the like."""
+    found, plane = document["parameters"], document["plane"]
+    interval = {n: (float(v["interval95_low"]), float(v["interval95_high"])) for n, v in found.items()}
+    interval["slope"] = interval.pop(f"slope_at_{LOAD:g}N")
+    low, high = map(float, plane["height_interval95_m"])
+    interval |= {"height": (low, high), "tilt_deg": (0.0, float(plane["tilt95_deg"]))}
+    identifiable = {n: bool(v["identifiable"]) for n, v in found.items()}
+    identifiable["slope"] = identifiable.pop(f"slope_at_{LOAD:g}N")
+    identifiable["plane"] = bool(plane["identifiable"])
+    values = {n: float(found[n]["value"]) for n in UNITS}
+    surface = _surface(values, np.array(plane["point_m"], dtype=float), np.array(plane["normal"], dtype=float))
+    rows = zip(draws["point"], draws["normal"], *(draws[n] for n in UNITS), strict=True)
+    each = [_surface(dict(zip(UNITS, map(float, row[2:]), strict=True)), row[0], row[1]) for row in rows]
+    return IdentifiedSurface(surface, interval, identifiable, each)
+
+
+def _surface(values: Mapping[str, float], point: np.ndarray, normal: np.ndarray) -> Surface:
+    if point.shape != (3,) or normal.shape != (3,) or not np.isfinite([*values.values(), *point, *normal]).all():
+        raise ValueError(f"expected a finite point and normal of 3 numbers, got {point.tolist()}, {normal.tolist()}")
+    if values["stiffness"] <= 0 or values["exponent"] <= 0 or not np.isclose(np.linalg.norm(normal), 1.0, atol=1e-6):
+        raise ValueError("expected a positive stiffness and exponent, and a unit normal")
+    v = values
+    return Surface(point, normal, v["stiffness"], v["exponent"], v["damping"], v["friction"], v["bristle"])

@@ -1,0 +1,182 @@
+"""Identify the surface that an arm pressed on: stiffness, exponent, damping, friction and plane, with intervals."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.identification.contact.problem import SLOWEST, ContactProblem, contact_problem
+from r2s.identification.contact.start import LEAST_S, first_guesses
+from r2s.identification.contact.surface_space import LOWER, NAMES, UPPER, WIDTH
+from r2s.identification.contact.validation import ROWS_HZ, Press, press_errors, presses
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.posterior import posterior
+from r2s.identification.result import SHARPER
+from r2s.physics.robot import Robot
+from r2s.physics.surface import UNIT_DEPTH, Surface
+from r2s.recordings.recording import Recording
+
+STEPS, ROUNDS = 25, 4  # Jacobians of a search, and searches with weights from the one before
+AT_BOUND = 0.02  # of the range of the stiffness' logarithm
+COVERED = (2.5, 97.5)  # %, of a 95 % interval
+# Errors that more data do not lower (laws of friction, time steps), standard deviations: slope relative, damping s/m,
+# height m, tilt rad. They are those of simulated arms on exact surfaces (benchmarks/contact_identification.py).
+SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
+SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An identified arm: its parameters' space and values (P,), and draws of their posterior (S, P) or None."""
+
+    space: ParameterSpace
+    x: np.ndarray
+    samples: np.ndarray | None
+
+    @property
+    def robot(self) -> Robot:
+        """The arm's kinematics, limits and tool."""
+        return self.space.robot
+
+
+@dataclass(frozen=True, eq=False)
+class ContactEstimate:
+    """An identified surface.
+
+    Attributes:
+        surface: the estimate. point is the place on the plane next to the mean contact.
+        draws: {name: (S, ...)} of the posterior: the numbers of a `Surface`, its point and normal, and `slope`, N/m,
+            of the force at LOAD.
+        identifiable: {name: whether the data determine it}.
+        penetration: (2,) m, range of the recording.
+        training, validation: its force on fitted presses and on others; None: there were no others.
+    """
+
+    surface: Surface
+    draws: dict[str, np.ndarray]
+    identifiable: dict[str, bool]
+    penetration: tuple[float, float]
+    training: Press
+    validation: Press | None
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """Return the 95 % interval of a number."""
+        low, high = np.percentile(self.draws[name], COVERED)
+        return float(low), float(high)
+
+    @property
+    def slope(self) -> float:
+        """N/m, slope of the force at LOAD, the mean over the posterior: the exponent is seldom certain."""
+        return float(self.draws["slope"].mean())
+
+    @property
+    def height(self) -> tuple[float, float]:
+        """m, 95 % interval of the plane's place along its normal, at `surface.point`, about the estimate."""
+        along = (self.draws["point"] - self.surface.point) @ self.surface.normal
+        low, high = np.percentile(along, COVERED)
+        return float(low), float(high)
+
+    @property
+    def tilt_deg(self) -> float:
+        """Degrees, angle about the normal that contains 95 % of the posterior."""
+        across = self.draws["normal"] - self.surface.normal
+        return float(np.degrees(np.percentile(np.linalg.norm(across, axis=1), 95)))
+
+
+def identify_contact(
+    arm: Arm,
+    recording: Recording,
+    held_out: Recording | None = None,
+    *,
+    seed: int = 0,
+    report: Callable[[float, str], None] = lambda share, what: None,
+) -> ContactEstimate:
+    """Estimate the surface of a recording with contact.
+
+    Args:
+        arm: with a tool. recording: free motion, presses and slides, with commanded torque.
+        held_out: presses on the same surface for validation; None: a fit without the last press predicts that press.
+        seed: of the posterior's draws. report: called with the share that is done, and what is next.
+
+    Raises:
+        UserError: no contact, or a stiffness that the recording does not bound.
+    """
+    report(0.0, "forces of the arm")
+    surfaces, starts = first_guesses(arm.space, arm.x, recording)
+    problem = contact_problem(arm.space, arm.x, arm.samples, recording, surfaces)
+    report(0.4, "surface")
+    u = min((problem.minimized(u, STEPS) for u in starts), key=lambda found: found[1])[0]
+    problem, u = refined(problem, u)
+    _check(problem, u)
+    report(0.7, "validation")
+    touched = presses(problem, u)
+    if held_out is not None:
+        other = contact_problem(arm.space, arm.x, arm.samples, held_out, surfaces)
+        validation = press_errors(other, u, presses(other, u))
+    elif len(touched) > 1:
+        rest, without = refined(problem.within(~touched[-1]), u)
+        validation = press_errors(replace(rest, torque=problem.torque), without, touched[-1:])
+    else:
+        validation = None
+    report(0.9, "intervals")
+    return _concluded(problem, u, press_errors(problem, u, touched), validation, seed)
+
+
+def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.ndarray]:
+    """Return the problem with weights from its residual, and its solution (8,), from a start u (8,)."""
+    for _ in range(ROUNDS):
+        problem = problem.reweighted(u)
+        u = problem.minimized(u, STEPS)[0]
+    return problem, u
+
+
+def _check(problem: ContactProblem, u: np.ndarray) -> None:
+    """Raise UserError if no joint slides in contact, or the surface is as stiff or soft as the bounds allow."""
+    touched = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum() / ROWS_HZ
+    if touched < LEAST_S:
+        raise UserError(
+            f"data.contact: joints slide faster than {SLOWEST:g} rad/s for {touched:.2f} s in contact, at least "
+            f"{LEAST_S:g} s are needed: friction hides the force on an arm at rest"
+        )
+    if not AT_BOUND < u[3] < 1 - AT_BOUND:
+        low, high, seen = np.exp([LOWER[3], UPPER[3], LOWER[3] + u[3] * WIDTH[3]])
+        raise UserError(
+            f"data.contact: the stiffness is at its bound, {seen:.3g} N/m of {low:g} to {high:g}: the recording does "
+            "not determine it; press with several forces, or check robot.tool"
+        )
+
+
+def _concluded(
+    problem: ContactProblem, u: np.ndarray, training: Press, validation: Press | None, seed: int
+) -> ContactEstimate:
+    """Return the estimate at u (8,) with the draws of its posterior."""
+    whole = problem.whole(u)
+    steps = posterior(problem, whole, seed).steps[:, : len(u)]
+    draws = np.clip(u + steps + _systematic(np.random.default_rng(seed), len(steps)), 0.0, 1.0)
+    surface, space = problem.space.surface(u), problem.space
+    depth = problem.tip.contact(surface)[2]
+    point, normal = space.plane(draws)
+    K, exponent, damping, friction, bristle = space.law(draws).T
+    named = {"exponent": exponent, "damping": damping, "friction": friction, "bristle": bristle}
+    named |= {"stiffness": K * UNIT_DEPTH ** (exponent - 1.0), "slope": np.exp(LOWER[3] + draws[:, 3] * WIDTH[3])}
+    half = np.percentile(draws, COVERED[1], axis=0) - np.percentile(draws, COVERED[0], axis=0)
+    known = half / 2 < 1 / np.sqrt(12.0) / SHARPER
+    identifiable = dict(zip(NAMES[3:], known[3:].tolist(), strict=True))
+    identifiable |= {"plane": bool(known[:3].all()), "stiffness": identifiable["slope"] and identifiable["exponent"]}
+    touched = problem.tip.centre[depth > 0].mean(0)
+    at = touched - ((touched - surface.point) @ surface.normal) * surface.normal
+    point = at + ((point - at) * normal).sum(-1, keepdims=True) * normal
+    return ContactEstimate(
+        surface=replace(surface, point=at),
+        draws=named | {"point": point, "normal": normal},
+        identifiable=identifiable,
+        penetration=(float(depth[depth > 0].min()), float(depth.max())),
+        training=training,
+        validation=validation,
+    )
+
+
+def _systematic(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return steps (S, 8) of u by the SYSTEMATIC errors."""
+    return rng.standard_normal((count, 8)) * [SYSTEMATIC[name] for name in NAMES] / WIDTH

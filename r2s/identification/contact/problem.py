@@ -1,0 +1,173 @@
+"""Joint-torque residual of an arm that touches a surface: an unknown surface, an arm known up to its posterior."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from r2s.identification.contact.surface_space import SurfaceSpace
+from r2s.identification.contact.tip import TipMotion
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.residuals.modulating_functions import CUTOFF_HZ, RATE_HZ, SlidingMotion
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.search.levenberg_marquardt import minimize
+from r2s.physics.robot import SIM_DT
+from r2s.recordings.recording import Recording
+
+SLOWEST = 0.01  # rad/s, below it residuals rise, because a joint that seems to slide may stick and slip
+DRIFT = 0.02  # of each joint's friction: change of friction and offset since the calibration, standard deviation
+EXACT = 1e-4  # of a joint's friction: no residual counts as smaller, not even that of a noise-free simulation
+SEEN = 0.03  # standard deviations: a direction of the arm's posterior with less effect on all rows does not count
+FTOL = 1e-6  # relative gain at the end of a search
+STEP = 1e-5  # of the unit cube, finite differences
+REACH = 10.0  # standard deviations of an arm direction within the unit cube
+PLAY = 3.0  # standard deviations of the tip's encoder noise below 40 Hz
+FLAT = np.sqrt(12.0)  # 1 / standard deviation of a flat prior on the unit cube
+
+
+@dataclass(frozen=True, eq=False)
+class ContactProblem:
+    """Least squares over a surface u (8,) and the arm w (r,), standard normal.
+
+    Rows are the R windows in which a joint slides one way, as in `TorqueResidual`: friction of a resting joint may be
+    anything within its breakaway torques. The arm's part is linear, so it is eliminated in closed form (variable
+    projection: Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973).
+
+    Attributes:
+        torque: residual of the arm without contact. x: (P,) the arm's parameters. tip: the tip at F instants.
+        error: (T, n) Nm, the residual at x.
+        directions: (T, n, r) Nm, its change along the principal directions of the arm's posterior.
+        sigma: (T, n) Nm, standard deviation of an independent row.
+        space: the surfaces.
+    """
+
+    torque: TorqueResidual
+    x: np.ndarray
+    tip: TipMotion
+    error: np.ndarray
+    directions: np.ndarray
+    sigma: np.ndarray
+    space: SurfaceSpace
+
+    @property
+    def motion(self) -> SlidingMotion:
+        """The recording as windows."""
+        assert isinstance(self.torque.motion, SlidingMotion)
+        return self.torque.motion
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(T, n) bool, windows that count."""
+        return self.torque.seen
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(R,) block of each row; errors of different blocks are independent."""
+        return np.unique(self.torque.clusters[self.rows.ravel()], return_inverse=True)[1]
+
+    def contact_torque(self, u: np.ndarray) -> np.ndarray:
+        """Return (T, n) Nm: the mean torque of a surface u (8,) over each window."""
+        return self.motion.filtered(self.tip.contact_of(*self.space.plane(u), self.space.law(u))[0])
+
+    def data(self, u: np.ndarray) -> np.ndarray:
+        """Return (R,) in standard deviations: residual of a surface u (8,) and the arm x."""
+        return ((self.error - self.contact_torque(u)) / self.sigma)[self.rows]
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """Return (R, 8), the derivative of `data`."""
+        h, here = np.where(u > 0.5, -STEP, STEP), self.data(u)
+        return np.stack([(self.data(stepped) - here) / s for stepped, s in zip(u + np.diag(h), h, strict=True)], 1)
+
+    @cached_property
+    def arm(self) -> np.ndarray:
+        """(R, r), the derivative of `data` with respect to w."""
+        return (self.directions / self.sigma[..., None])[self.rows]
+
+    @cached_property
+    def _gain(self) -> np.ndarray:
+        return -np.linalg.solve(self.arm.T @ self.arm + np.eye(self.arm.shape[1]), self.arm.T)
+
+    def best_arm(self, u: np.ndarray) -> np.ndarray:
+        """Return w (r,) of the least sum of squares for a surface u (8,)."""
+        return self._gain @ self.data(u)
+
+    def _projected(self, rows: np.ndarray) -> np.ndarray:
+        w = self._gain @ rows
+        return np.concatenate([rows + self.arm @ w, w])
+
+    def residual(self, trials: np.ndarray) -> np.ndarray:
+        """Return (C, R + r + 8) for trials (C, 8) with the best w; the flat prior of u counts as a normal one."""
+        return np.stack([np.concatenate([self._projected(self.data(u)), FLAT * (u - 0.5)]) for u in trials])
+
+    def jacobian(self, u: np.ndarray) -> np.ndarray:
+        """Return the derivative of `residual` at u (8,)."""
+        return np.concatenate([self._projected(self.slope(u)), FLAT * np.eye(len(u))])
+
+    def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
+        """Return u (8,) at a minimum near u, and the sum of squares there."""
+        u = minimize(self.residual, self.jacobian, u, steps, FTOL)
+        return u, float((self.residual(u[None]) ** 2).sum())
+
+    def reweighted(self, u: np.ndarray) -> "ContactProblem":
+        """Return the problem with rows weighted by their residual at u (8,) and its correlation."""
+        explained = self.contact_torque(u) - self.directions @ self.best_arm(u)
+        own = self.torque.with_external(explained).reweighted(self.x, fitted=True)
+        return replace(self, sigma=_sigma(own, self.x))
+
+    def within(self, kept: np.ndarray) -> "ContactProblem":
+        """Return the problem of the moments `kept` (T,) bool."""
+        return replace(self, torque=self.torque.within(kept))
+
+    def whole(self, u: np.ndarray) -> np.ndarray:
+        """Return (8 + r,) on the unit cube: u (8,) and its best w, for `linearize`."""
+        return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
+
+    def linearize(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual (R + 8 + r,) and derivative at (8 + r,), surface and arm together."""
+        u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
+        prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
+        r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
+        return r, np.concatenate([np.concatenate([self.slope(u), 2 * REACH * self.arm], 1), np.diag(prior)])
+
+
+def contact_problem(
+    space: ParameterSpace, x: np.ndarray, samples: np.ndarray | None, recording: Recording, surfaces: SurfaceSpace
+) -> ContactProblem:
+    """Return the problem of a recording with contact.
+
+    Args:
+        space, x: the arm's parameters, (P,); its robot has the tool.
+        samples: (S, P), draws of their posterior; None: the arm counts as known up to DRIFT.
+        recording: of commanded torque. surfaces: the unknown.
+    """
+    torque = TorqueResidual(space, recording, slowest=SLOWEST)
+    motion = torque.motion
+    assert isinstance(motion, SlidingMotion)
+    tip = TipMotion.of(space.robot, motion.q, motion.dq, 1 / RATE_HZ, motion.starts, 0.0)
+    lever = np.linalg.norm(np.cross(tip.axes, tip.centre[:, None] - tip.origins), axis=-1).max(0)
+    noise = np.sqrt(2 * CUTOFF_HZ * SIM_DT) * np.linalg.norm(lever * motion.encoder)
+    tip = replace(tip, play=PLAY * float(noise))
+    own = torque.reweighted(x, fitted=True)
+    directions = _arm_directions(own, x, samples)
+    effect = np.linalg.norm((directions / own.scale[..., None])[own.seen], axis=0)
+    error = own.error(space.dynamics(x))
+    return ContactProblem(own, x, tip, error, directions[..., effect > SEEN], _sigma(own, x), surfaces)
+
+
+def _sigma(torque: TorqueResidual, x: np.ndarray) -> np.ndarray:
+    """Return (T, n) Nm, standard deviation of an independent row."""
+    return np.maximum(torque.scale, EXACT * torque.space.dynamics(x).level)
+
+
+def _arm_directions(torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None) -> np.ndarray:
+    """Return (T, n, r) Nm: changes of the residual along independent directions of the arm's uncertainty."""
+    d, n = torque.space.dynamics(x), torque.space.n
+    friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, np.sign(torque.motion.friction_dq)))
+    parts = [DRIFT * friction[..., None] * np.eye(n), DRIFT * np.broadcast_to(np.diag(d.level), (*friction.shape, n))]
+    if samples is not None and len(x):
+        sd = samples.std(0)
+        some = sd > 1e-9 * np.abs(x)
+        change = (torque.change(x, x + sd) * torque.scale.reshape(-1, 1))[:, some].reshape(*friction.shape, -1)
+        size, axes = np.linalg.eigh(np.atleast_2d(np.corrcoef(samples[:, some].T)))
+        parts.append(change @ (axes * np.sqrt(np.maximum(size, 0.0))))
+    return np.concatenate(parts, -1)

@@ -1,0 +1,85 @@
+"""First guess of an unknown surface: where forces appear, which way they point, and how they grow."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.identification.contact.surface_space import LOAD, SurfaceSpace
+from r2s.identification.contact.tip import TipMotion
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.recordings.recording import Recording
+
+MOVING = 0.02  # rad/s, below which friction of a joint counts as unknown
+KNOWN = 0.1  # standard error of known friction, as a share of the joint's friction
+SURE = 4.0  # standard deviations of a force that counts as contact
+LEAST_S = 0.2  # s of contact, at least
+STIFFNESS = (5e2, 2e5)  # N/m, of first guesses
+FLAT = 3.0  # spread within a plane over that across it, from which positions tell the normal
+
+
+def first_guesses(
+    space: ParameterSpace, x: np.ndarray, recording: Recording
+) -> tuple[SurfaceSpace, list[np.ndarray]]:
+    """Return surfaces about a first plane, and starts u (8,) among them.
+
+    Args:
+        space, x: the arm's parameters (P,); its robot has the tool. recording: of commanded torque.
+
+    Raises:
+        UserError: the recording shows no contact.
+    """
+    tool = space.robot.tool
+    assert tool is not None
+    centre, force, sure = external_force(space, x, recording)
+    if sure.sum() < LEAST_S * 100:
+        raise UserError(
+            f"data.contact: no contact found: {sure.sum() / 100:.2f} s with a force that friction cannot explain, at "
+            f"least {LEAST_S:g} s are needed; does the tool of robot.tool, {1e3 * tool.radius:g} mm in radius, reach "
+            "the surface?"
+        )
+    centre, force = centre[sure], force[sure]
+    normal = force.sum(0) / np.linalg.norm(force.sum(0))
+    origin = centre.mean(0)
+    _, spread, axes = np.linalg.svd(centre - origin, full_matrices=False)
+    normals = [normal]
+    if spread[1] > FLAT * spread[2]:
+        normals.insert(0, axes[2] * np.sign(axes[2] @ normal))
+    surfaces = SurfaceSpace(origin - tool.radius * normals[0], normals[0])
+    return surfaces, list(_starts(surfaces, normals, centre - tool.radius * normals[0], force))
+
+
+def _starts(
+    surfaces: SurfaceSpace, normals: list[np.ndarray], points: np.ndarray, force: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield starts for each normal (3,) and two exponents; a line through the forces gives stiffness and height."""
+    for normal in normals:
+        height, load = (points - surfaces.origin) @ normal, np.maximum(force @ normal, 0.0)
+        slope = np.polyfit(load, height, 1)[0] if np.ptp(load) > 0 else 0.0
+        stiffness = float(np.clip(-1.0 / slope if slope < 0 else STIFFNESS[1], *STIFFNESS))
+        above = float(np.median(height + (load - LOAD) / stiffness))
+        for exponent in (1.1, 1.5):
+            u = surfaces.unit(above, stiffness, exponent, 0.3)
+            u[:2] += surfaces.tilt_of(normal)
+            yield np.clip(u, 0.0, 1.0)
+
+
+def external_force(
+    space: ParameterSpace, x: np.ndarray, recording: Recording
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return centre (T, 3) m, force on it (T, 3) N, and whether it is certain (T,), at 100 Hz.
+
+    Least squares over the joints, below 10 Hz; friction of a resting joint counts as unknown.
+    """
+    torque = TorqueResidual(space, recording)
+    motion, d = torque.motion, space.dynamics(x)
+    still = np.zeros(len(motion.q), dtype=bool)
+    tip = TipMotion.of(space.robot, motion.q, motion.dq, 0.01, still, 0.0)
+    jacobian = tip.jacobian(np.arange(len(motion.q)), np.zeros(3))
+    sigma = np.where(np.abs(motion.dq) < MOVING, 1.0, KNOWN) * np.maximum(d.level, 1e-3 * space.robot.tau_max)
+    weighted = jacobian / sigma[:, None] ** 2
+    information = weighted @ jacobian.swapaxes(1, 2)
+    force = np.linalg.solve(information, (weighted @ torque.error(d)[..., None]))[..., 0]
+    certain = np.einsum("ti,tij,tj->t", force, information, force) > SURE**2
+    return tip.centre, force, certain

@@ -1,0 +1,136 @@
+"""Motion of a tool's tip in a recording, and the joint torque of its contact with a surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.kinematics import POSE, link_frames
+from r2s.physics.newton_euler import links_of
+from r2s.physics.payload import ee_pose
+from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface, normal_force
+
+RIGID = 1e-6  # m, deflection of a surface whose bristles are stiffer than encoders resolve
+
+
+@dataclass(frozen=True)
+class TipMotion:
+    """A spherical tip at F instants of an arm with n joints.
+
+    Attributes:
+        step: s, between instants. starts: (F,) bool, first instants of stretches.
+        centre: (F, 3) m, of the tip. radius: m.
+        axes, origins: (F, n, 3), of the joints in the base frame. dq: (F, n) rad/s.
+        play: m, tip motion that encoder noise may imitate; it bends no bristles permanently.
+    """
+
+    step: float
+    starts: np.ndarray
+    centre: np.ndarray
+    radius: float
+    axes: np.ndarray
+    origins: np.ndarray
+    dq: np.ndarray
+    play: float = 0.0
+
+    @staticmethod
+    def of(robot: Robot, q: np.ndarray, dq: np.ndarray, step: float, starts: np.ndarray, play: float) -> "TipMotion":
+        """Return the motion of the tip of `robot.tool` at q, dq (F, n) rad, rad/s."""
+        assert robot.tool is not None
+        links = links_of(robot, robot.mass, robot.com, robot.inertia)
+        place, axes_of_site = ee_pose(robot)
+        frames, axes = np.empty((*q.shape, POSE)), np.empty((*q.shape, 3))
+        _frames(links, np.ascontiguousarray(q), frames, axes)
+        rotation = frames[:, -1, 3:].reshape(-1, 3, 3)
+        centre = frames[:, -1, :3] + rotation @ (place + axes_of_site @ robot.tool.tip)
+        origins = np.ascontiguousarray(frames[..., :3])
+        return TipMotion(step, starts, centre, robot.tool.radius, axes, origins, np.ascontiguousarray(dq), play)
+
+    def jacobian(self, at: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Return the Jacobians (A, 3, n) m/rad of the deepest point at the instants `at` (A,)."""
+        point = self.centre[at] - self.radius * normal
+        return np.cross(self.axes[at], point[:, None] - self.origins[at]).swapaxes(1, 2)
+
+    def contact(self, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return joint torque (F, n) Nm, normal force (F,) N, penetration (F,) m and its rate (F,) m/s."""
+        return self.contact_of(surface.point, surface.normal, contact_law(surface))
+
+    def contact_of(
+        self, point: np.ndarray, normal: np.ndarray, law: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return `contact` of a plane with the laws of `contact_law`."""
+        tau, out = np.empty_like(self.dq), np.empty((3, len(self.dq)))
+        motion = self.centre, self.axes, self.origins, self.dq, self.starts
+        _contact(motion, (self.radius, self.step, self.play), point, normal, law, tau, out)
+        return tau, out[0], out[1], out[2]
+
+
+def contact_law(surface: Surface) -> np.ndarray:
+    """Return (5,): K, exponent, damping, friction and bristle of a surface."""
+    s = surface
+    return np.array([s.coefficient, s.exponent, s.damping, s.friction, max(s.bristle, RIGID)])
+
+
+@njit(cache=True, error_model="numpy")
+def _frames(links, q, frames, axes):
+    for t in range(len(q)):
+        link_frames(links, q[t], frames[t], axes[t])
+
+
+@njit(cache=True, error_model="numpy")
+def _contact(motion, settings, point, normal, law, tau, out):
+    """Write joint torque (F, n) and normal force, penetration and its rate (3, F).
+
+    Friction is mu F z with z the deflection of the bristles (Dahl 1968 in two dimensions): dz = (dx - |dx| z) /
+    bristle along the path x of the deepest point over the surface. Noise would lengthen the path of a resting tip and
+    relax z, so a path within `play` bends bristles elastically only.
+    """
+    centre, axes, origins, dq, starts = motion
+    radius, step, play = settings
+    K, exponent, damping, friction, bristle = law
+    z, lead, n = np.zeros(3), np.zeros(3), dq.shape[1]
+    arm, v, f = np.empty((n, 3)), np.empty(3), np.empty(3)
+    for t in range(len(dq)):
+        depth, rate = radius, 0.0
+        for k in range(3):
+            depth -= normal[k] * (centre[t, k] - point[k])
+            v[k] = 0.0
+        for j in range(n):
+            x = centre[t, 0] - radius * normal[0] - origins[t, j, 0]
+            y = centre[t, 1] - radius * normal[1] - origins[t, j, 1]
+            w = centre[t, 2] - radius * normal[2] - origins[t, j, 2]
+            a, b, c = axes[t, j]
+            arm[j, 0], arm[j, 1], arm[j, 2] = b * w - c * y, c * x - a * w, a * y - b * x
+            for k in range(3):
+                v[k] += arm[j, k] * dq[t, j]
+        for k in range(3):
+            rate -= normal[k] * v[k]
+        force = normal_force(K, exponent, damping, depth, rate)
+        if depth <= 0.0 or starts[t]:
+            z[:], lead[:] = 0.0, 0.0
+        else:
+            far, along = 0.0, 0.0
+            for k in range(3):
+                lead[k] += step * (v[k] + rate * normal[k])
+                far += lead[k] ** 2
+            far = np.sqrt(far)
+            path = max(far - play, 0.0)
+            keep = np.exp(-path / bristle)
+            for k in range(3):
+                z[k] = keep * z[k] + (1.0 - keep) * (lead[k] / far if path > 0.0 else 0.0)
+                lead[k] *= (far - path) / far if path > 0.0 else 1.0
+                along += normal[k] * z[k]
+            for k in range(3):
+                z[k] -= along * normal[k]
+        bent = 0.0
+        ahead = np.sqrt(lead[0] ** 2 + lead[1] ** 2 + lead[2] ** 2)
+        for k in range(3):
+            f[k] = z[k] + (lead[k] - ahead * z[k]) / max(bristle, ahead)
+            bent += f[k] ** 2
+        share = friction / max(np.sqrt(bent), 1.0)
+        for k in range(3):
+            f[k] = force * (normal[k] - share * f[k])
+        out[0, t], out[1, t], out[2, t] = force, depth, rate
+        for j in range(n):
+            tau[t, j] = arm[j, 0] * f[0] + arm[j, 1] * f[1] + arm[j, 2] * f[2]

@@ -1,0 +1,76 @@
+"""How well an identified surface predicts the normal force of presses, against the arm's own torques."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.identification.contact.problem import ContactProblem
+
+PAUSE_S = 1.0  # s without contact between two presses; a slide may lose contact for a moment
+GUARD_S = 0.2  # s around a press, longer than a window
+ROWS_HZ = 100.0  # of the torque residual
+KNOWN_N = 1.0  # N, largest standard error of a force from torques that counts
+
+
+@dataclass(frozen=True)
+class Press:
+    """Normal force of the surface against the one that joint torques show, where joints slide.
+
+    Attributes:
+        t: (M,) s. force, seen: (M,) N, of the surface and of the torques.
+        depth, rate: (M,) m, m/s, penetration and its rate.
+        error: (M,) N, standard error of `seen`.
+    """
+
+    t: np.ndarray
+    force: np.ndarray
+    seen: np.ndarray
+    depth: np.ndarray
+    rate: np.ndarray
+    error: np.ndarray
+
+    def summary(self) -> dict[str, float]:
+        """Return the entry of summary.json: seconds of force, and its error, N RMS, loading and unloading apart."""
+        sides = {"loading": 1.0, "unloading": -1.0}
+        errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
+        return {"seconds": len(self.t) / ROWS_HZ, "force_rmse_N": self.rmse(), **errors}
+
+    def rmse(self, side: float = 0.0) -> float:
+        """Return the error, N RMS: of loading (1), unloading (-1) or all (0); nan without such moments."""
+        some = self.rate * side > 0 if side else np.ones(len(self.t), dtype=bool)
+        return float(np.sqrt(np.mean((self.force - self.seen)[some] ** 2))) if some.any() else float("nan")
+
+
+def presses(problem: ContactProblem, u: np.ndarray) -> list[np.ndarray]:
+    """Return masks (T,) of the moments of each press of a surface u (8,), in time, with a guard around it."""
+    motion = problem.motion
+    at = motion.instants[_depth(problem, u) > 0]
+    if not len(at):
+        return []
+    ends = np.flatnonzero(np.diff(at) > PAUSE_S)
+    spans = zip(at[np.append(0, ends + 1)], at[np.append(ends, len(at) - 1)], strict=True)
+    return [(motion.t > first - GUARD_S) & (motion.t < last + GUARD_S) for first, last in spans]
+
+
+def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]) -> Press:
+    """Return the forces of a surface u (8,) and of the torques in the moments of `parts`.
+
+    The joints that slide give the factor by which the force of the surface has to be multiplied (weighted least
+    squares), in the direction that the surface gives.
+    """
+    motion = problem.motion
+    tau, force, depth, rate = problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))
+    at = np.searchsorted(motion.instants, motion.t - 1e-6).clip(max=len(motion.instants) - 1)
+    force, depth, rate, tau = force[at], depth[at], rate[at], motion.filtered(tau)
+    error = problem.error + problem.directions @ problem.best_arm(u)
+    weight = np.where(problem.rows, 1 / np.where(problem.rows, problem.sigma, 1.0) ** 2, 0.0)
+    known = (weight * tau**2).sum(1)
+    inside = np.any(parts, axis=0) if parts else np.zeros(len(force), dtype=bool)
+    some = inside & (force > 0) & (force < KNOWN_N * np.sqrt(known))
+    factor = (weight * tau * error).sum(1)[some] / known[some]
+    seen, spread = factor * force[some], force[some] / np.sqrt(known[some])
+    return Press(motion.t[some], force[some], seen, depth[some], rate[some], spread)
+
+
+def _depth(problem: ContactProblem, u: np.ndarray) -> np.ndarray:
+    return problem.tip.contact_of(*problem.space.plane(u), problem.space.law(u))[2]

@@ -1,0 +1,97 @@
+"""stage=identify data.contact=FILE: presses on a surface -> contact.yaml, its table and figure."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError
+from r2s.files import located
+from r2s.stages.build import console
+from r2s.stages.data import read_file
+
+ARM = ("parameters.yaml", "posterior.npz")
+
+
+@dataclass(frozen=True)
+class ContactData:
+    """Recordings with contact: to fit, and to validate or None. `files`: their paths."""
+
+    recording: Any
+    held_out: Any
+    files: list[Path]
+
+
+def only_contact(cfg):
+    """Return whether the config asks for a surface on top of an arm that `calibration=` gives."""
+    from omegaconf import OmegaConf
+
+    return bool(cfg.data.get("contact")) and OmegaConf.is_missing(cfg.data, "path")
+
+
+def contact_data(cfg, robot, file):
+    """Return the `ContactData` of data.contact and data.contact_validation; None without data.contact.
+
+    file: `FileData` of the config, for the columns.
+
+    Raises:
+        UserError: no tool, no commanded torque, no free motion that says what the arm is, or a wrong file.
+    """
+    from r2s.identification.checks import check_recording
+
+    if not file.contact:
+        if file.contact_validation:
+            raise UserError("data.contact_validation: there is no data.contact= to validate")
+        return None
+    if robot.tool is None:
+        raise UserError("robot.tool: data.contact needs the tip that touches: robot.tool=TOOL.json")
+    if file.torque not in (None, "commanded"):
+        raise UserError(f"data.contact: a surface is identified from commanded torque, not data.torque={file.torque}")
+    if only_contact(cfg) and not cfg.calibration:
+        raise UserError("data.contact: give the arm by calibration=RUN_FOLDER, or its free motion by data.path=FILE")
+    files = [located(path) for path in (file.contact, file.contact_validation) if path]
+    recordings = [read_file(robot, file, path, torque="commanded") for path in files]
+    for recording in recordings:
+        check_recording(robot, recording)
+    return ContactData(recordings[0], recordings[1] if len(recordings) > 1 else None, files)
+
+
+def calibrated_arm(cfg, robot):
+    """Return the `Arm` of `calibration=`."""
+    from r2s.identification.contact.estimate import Arm
+    from r2s.identification.parameter_file import load_parameters, load_posterior
+    from r2s.stages.run_config import modules
+
+    space, x = load_parameters(cfg.calibration, robot, modules(cfg.get("trust")))
+    return Arm(space, x, load_posterior(cfg.calibration, space))
+
+
+def identify_surface(cfg, run, arm, data):
+    """Write contact.yaml and figure of a surface; return its entry of summary.json and print its table."""
+    from r2s.identification.contact.contact_file import save_contact
+    from r2s.identification.contact.estimate import identify_contact
+    from r2s.identification.contact.surface_space import LOAD
+    from r2s.progress import Progress
+    from r2s.reporting.identification.contact import contact_figure, contact_table, press_table
+    from r2s.reporting.tables import print_table
+
+    progress = Progress("contact")
+    found = identify_contact(arm, data.recording, data.held_out, seed=cfg.seed, report=progress)
+    progress.close()
+    source = {"recording": data.recording.name, "calibration": cfg.calibration or str(run.folder)}
+    save_contact(run.folder / "contact.yaml", arm.robot, found, source | {"run": str(run.folder)})
+    contact_figure(run.figure("contact"), found)
+    print_table(console(), contact_table(found), "surface, 95 % intervals")
+    print_table(console(), press_table(found), "surface against joint torques")
+    low, high = found.interval("slope")
+    entry = {"slope_N_per_m": found.slope, "slope_interval95_N_per_m": [low, high], "at_N": LOAD}
+    entry |= {"friction": found.surface.friction, "train": found.training.summary()}
+    return entry | ({} if found.validation is None else {"validation": found.validation.summary()})
+
+
+def keep_calibration(cfg, run):
+    """Copy the arm of `calibration=` into the run folder, so that calibration=RUN gives arm and surface."""
+    folder = Path(cfg.calibration)
+    folder = folder if folder.is_dir() else folder.parent
+    for name in ARM:
+        shutil.copy2(folder / name, run.folder / name)
