@@ -17,7 +17,7 @@ using Vec = std::array<double, 3>;
 using Mat = std::array<double, 9>;  // row by row
 using Joints = std::array<double, n>;
 using Square = std::array<Joints, n>;
-using Command = std::array<double, c::actions>;
+using Command = std::array<double, c::actions + c::setpoints>;  // action, then the goal where the law needs it
 
 inline Vec operator+(const Vec& a, const Vec& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
 inline Vec operator-(const Vec& a, const Vec& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }

@@ -172,6 +172,7 @@ int run(char** argv) {
     if (cycle % every == 0) policy.give(law::observe(driver, state.q, state.dq, goal));
     ++cycle;
     const bool asked = policy.newest(command);
+    std::copy_n(goal.begin(), contract::setpoints, command.begin() + contract::actions);
     const law::Joints tau = driver(state.q, state.dq, state.tau_J_d, asked ? &command : nullptr);
     return driver.done() ? franka::MotionFinished(franka::Torques(tau)) : franka::Torques(tau);
   };

@@ -39,6 +39,7 @@ class Controller:
         law: compiled; see r2s/physics/control_laws.py.
         action_scale, action_offset: (a,) in `unit`. action: name of the commanded quantity, for tables and contracts.
         parameters: (p,) of the law. memory_size: numbers that the law keeps from cycle to cycle.
+        torque_limit: (n,) Nm, the largest target torque; None: the task's.
         cpp: body of the same law in C++17, for contract.hpp; "": a bundle has no header.
     """
 
@@ -51,6 +52,7 @@ class Controller:
     parameters: np.ndarray = field(default_factory=lambda: np.zeros(0))
     memory_size: int = 0
     cpp: str = ""
+    torque_limit: np.ndarray | None = None
 
     @property
     def action_dim(self) -> int:

@@ -21,10 +21,10 @@ from r2s.control.controller import Controller
 from r2s.errors import UserError
 from r2s.export.card import card
 from r2s.export.contract import make_contract
+from r2s.export.control import LAWS
 from r2s.export.header import header
 from r2s.export.runtime import BundleError, agree, seal_of
 from r2s.learning.networks import Policy
-from r2s.physics.control_laws import BUILT_IN
 from r2s.physics.description import write_description
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -146,12 +146,11 @@ def one_file(control: Controller) -> str:
         body = "".join(text.splitlines(keepends=True)[imports(text)[-1].end_lineno :]).strip()
         return f"{laws}\n\n\n{body}\n\n\n{extra}".strip() if name == "control" else body
 
-    laws = "\n\n\n".join(law_source(law) for law in BUILT_IN)
-    extra = (
-        ""
-        if control.law in BUILT_IN
-        else law_source(control.law) + f"\n\n\nLAWS[{control.name!r}] = {law_name(control.law)}"
-    )
+    laws = "\n\n\n".join(law_source(law)[1] for law in LAWS.values())
+    extra = ""
+    if control.law not in LAWS.values():
+        name, source = law_source(control.law)
+        extra = f"{source}\n\n\nLAWS[{control.name!r}] = {name}"
     text = (here / "runtime.py").read_text()
     lines = text.splitlines(keepends=True)
     ours = [node for node in imports(text) if isinstance(node, ast.ImportFrom) and f"{node.module}".startswith(HERE)]
@@ -163,24 +162,40 @@ def one_file(control: Controller) -> str:
     return "".join(lines)
 
 
-def law_name(law: Any) -> str:
-    """Return the name of a control law's function."""
-    return getattr(law, "py_func", law).__name__
+def law_source(law: Any) -> tuple[str, str]:
+    """Return name and source of a control law as plain Python, without decorators.
 
-
-def law_source(law: Any) -> str:
-    """Return the source of a control law as plain Python, without its decorator.
+    Functions and numbers that it uses lie beside it in a function that returns the law: so their names are its own.
 
     Raises:
-        UserError: it uses names other than its own, NumPy's `np` and builtins.
+        UserError: it uses names other than functions, numbers, NumPy's `np` and builtins.
     """
     function = getattr(law, "py_func", law)
+    sources: dict[str, str] = {}
+    _collect(function, function.__name__, sources)
+    own = sources.pop(function.__name__)
+    if not sources:
+        return function.__name__, own
+    name = f"_{function.__name__}"
+    body = textwrap.indent("\n\n".join([*sources.values(), own, f"return {function.__name__}"]), "    ")
+    return f"{name}()", f"def {name}():\n{body}"
+
+
+def _collect(function: Any, law: str, sources: dict[str, str]) -> None:
+    """Add the source of a function, and before it all that it uses, to `sources`, by name."""
     node = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(node, ast.FunctionDef)
     node.decorator_list = []
-    foreign = set(function.__code__.co_names) & set(function.__globals__) - {"np", *dir(builtins)}
+    used = set(function.__code__.co_names) & set(function.__globals__) - {"np", *dir(builtins)}
+    foreign = []
+    for name in sorted(used - set(sources)):
+        value = getattr(function.__globals__[name], "py_func", function.__globals__[name])
+        if isinstance(value, int | float):
+            sources[name] = f"{name} = {value!r}"
+        elif inspect.isfunction(value):
+            _collect(value, law, sources)
+        else:
+            foreign.append(name)
     if foreign:
-        raise UserError(
-            f"export: control law {function.__name__} uses {', '.join(sorted(foreign))}; a bundle has np alone"
-        )
-    return ast.unparse(node)
+        raise UserError(f"export: control law {law} uses {', '.join(foreign)}; a bundle has np alone")
+    sources[function.__name__] = ast.unparse(node)

@@ -13,6 +13,7 @@ from r2s.arm import drive_cycle, driver
 from r2s.arm.clients.fr3 import as_driven
 from r2s.control.computed_torque import ComputedTorque
 from r2s.control.controller import Controller
+from r2s.control.impedance import Impedance
 from r2s.errors import UserError
 from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import LAW_JOINT, Model
@@ -108,10 +109,13 @@ def check_exportable(robot: Robot, task: Task) -> None:
             f"export: the runtime of a bundle has no friction of family '{control.model.dynamics.family.name}'; "
             f"allowed: {', '.join(FRICTION)}"
         )
-    if control.setpoint_size and not (isinstance(control, ComputedTorque) and isinstance(task, TrackTask)):
+    follows = isinstance(control, ComputedTorque) and isinstance(task, TrackTask)
+    to_goal = isinstance(control, Impedance) and control.setpoint_size == 3 and not isinstance(task, TrackTask)
+    if control.setpoint_size and not (follows or to_goal):
         raise UserError(
             f"export: control={control.name} takes setpoints, which the runtime of a bundle has for task=track under "
-            "control=computed_torque alone; stage=transfer runs it"
+            "control=computed_torque, and for goals that are points under control=cartesian_impedance; "
+            "stage=transfer runs it"
         )
     goals = task.goals(robot, np.random.default_rng(0), 1)
     if not isinstance(task, TrackTask) and goals.shape != (1, 3):
@@ -132,7 +136,7 @@ def controller(control: Controller) -> dict[str, Any]:
         "action_offset": listed(control.action_offset),
         "parameters": listed(control.parameters),
         "memory_size": control.memory_size,
-        "setpoint": "plan" if control.setpoint_size else None,
+        "setpoint": None if not control.setpoint_size else "plan" if isinstance(control, ComputedTorque) else "goal",
         "model": computed_torque_model(control) if isinstance(control, ComputedTorque) else None,
     }
 

@@ -70,7 +70,10 @@ def check_control(contract: dict[str, Any]) -> None:
         raise BundleError(f"contract.json: an action of 1 is {scale} Nm, the torque limit is {limit}")
     if name == "computed_torque" and any(x > most for x, most in zip(scale, limit, strict=True)):
         raise BundleError(f"contract.json: an action of 1 is {scale} Nm, the torque limit is {limit}")
-    if (control["model"] is None) != (control["setpoint"] is None):
-        raise BundleError("contract.json: control.model and control.setpoint go together; one of them is null")
-    if control["setpoint"] is not None and contract["goal"]["kind"] != "plan":
-        raise BundleError("contract.json: control.setpoint needs goals that are plans; goals are points")
+    setpoint, goals = control["setpoint"], contract["goal"]["kind"]
+    if setpoint not in (None, "plan", "goal"):
+        raise BundleError(f"contract.json: control.setpoint is '{setpoint}'; allowed: plan, goal")
+    if (control["model"] is None) != (setpoint != "plan"):
+        raise BundleError("contract.json: control.model and control.setpoint go together: a plan needs a model")
+    if setpoint is not None and goals != {"plan": "plan", "goal": "point"}[setpoint]:
+        raise BundleError(f"contract.json: control.setpoint is the {setpoint}, goals are {goals}s")

@@ -34,8 +34,10 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
         none = "-INFINITY" if name in LOWEST else "INFINITY"
         lines.append(f"constexpr double {name}[n] = {_braced(values, none)};  // {filter_['units'][name]}")
     lines += [f"constexpr double {name} = {value!r};" for name, value in filter_["number"].items()]
-    sizes = {"actions": len(control["action_scale"]), "memories": control["memory_size"]}
-    lines += ["", f"// control={control['name']}: the command is the policy's action in {control['unit']}"]
+    setpoints = 3 if control["setpoint"] == "goal" else 0
+    sizes = {"actions": len(control["action_scale"]), "setpoints": setpoints, "memories": control["memory_size"]}
+    goal = ", then the goal in m" if setpoints else ""
+    lines += ["", f"// control={control['name']}: the command is the policy's action in {control['unit']}{goal}"]
     lines += [f"constexpr int {name} = {size};" for name, size in sizes.items()]
     parameters = control["parameters"] or [0.0]  # C++ has no empty array
     lines += [f"constexpr double parameters[{len(parameters)}] = {_braced(parameters)};"]

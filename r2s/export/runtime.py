@@ -325,6 +325,7 @@ class Runtime:
             made |= self._follower(self._cycle // self._every, q, dq, ee, changed)
         elif goal is not None:
             made["goal"] = goal
+            made["setpoint"] = goal if self.contract["control"]["setpoint"] == "goal" else np.zeros(0)
         made["error"] = made["goal"] - ee
         return made | {"pull": jacobian.T @ made["error"]}
 

@@ -23,6 +23,7 @@ import numpy as np
 from numba.extending import is_jitted
 
 from r2s.compiled import njit
+from r2s.physics.impedance_laws import cartesian_impedance_law, joint_impedance_law
 
 
 class ControlLaw(Protocol):
@@ -72,7 +73,7 @@ def computed_torque_law(q, dq, command, parameters, memory, out):
     memory[0] = (memory[0] + 1.0) % parameters[1]
 
 
-BUILT_IN = (torque_law, computed_torque_law)
+BUILT_IN = (torque_law, computed_torque_law, joint_impedance_law, cartesian_impedance_law)
 _laws: list[Callable] = [*BUILT_IN]
 
 

@@ -62,7 +62,7 @@ def equations(links, gravity, q, dq, mass, bias, work):
         tx, ty, tz = _cross(ex, ey, ez, rx, ry, rz)
         fx, fy, fz = m * (ax + tx + ux), m * (ay + ty + uy), m * (az + tz + uz)
         gx, gy, gz = px + rx, py + ry, pz + rz
-        xx, xy, xz, yy, yz, zz_ = _tensor(R, k)
+        xx, xy, xz, yy, yz, zz_ = base_tensor(R, k)
         hx, hy, hz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz_ * wz
         cx, cy, cz = _cross(wx, wy, wz, hx, hy, hz)
         tx, ty, tz = _cross(gx, gy, gz, fx, fy, fz)
@@ -166,7 +166,7 @@ def rotate_about(R, x, y, z, angle):
 
 
 @njit(cache=True, inline="always")
-def _tensor(R, k):
+def base_tensor(R, k):
     """Return xx, xy, xz, yy, yz, zz of a link's tensor in base axes."""
     A = product(R, k, TENSOR)
     return (

@@ -83,6 +83,7 @@ class ReachTask(BaseTask):
     azimuth: float = 1.57
     speed_noise: float | None = None
     measure_table: ClassVar[MeasureTable] = REACH
+    target_size: ClassVar[int] = 3
 
     def __post_init__(self):
         cycles = round(1 / SIM_DT)
@@ -101,7 +102,9 @@ class ReachTask(BaseTask):
         return replace(self, speed_noise=SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0)
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the torque of an action of 1."""
+        """Return (n,) Nm, the torque of an action of 1, or the controller's limit."""
+        if self.controller is not None and self.controller.torque_limit is not None:
+            return self.controller.torque_limit
         share = np.array(self.torque_fraction, dtype=float)
         if share.ndim and share.shape != (robot.n,):
             raise UserError(
@@ -151,6 +154,10 @@ class ReachTask(BaseTask):
             f"task.reach {reach[0]:g} to {reach[1]:g} m, task.height {self.height:g} m: {robot.name} "
             "hardly ever gets there; widen them"
         )
+
+    def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the target (m, 3) m of an impedance: the goals."""
+        return goals
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (6 n + 12,) to normalise `observe` by: the task's own scales.

@@ -88,6 +88,7 @@ class TrackTask(BaseTask):
     pool: int = 256
     model: Dynamics | None = field(default=None, repr=False)
     measure_table: ClassVar[MeasureTable] = TRACK
+    target_size: ClassVar[int] = 6
 
     def __post_init__(self):
         cycles = round(1 / SIM_DT)
@@ -136,6 +137,8 @@ class TrackTask(BaseTask):
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
         """Return (n,) Nm, the largest target torque."""
+        if self.controller is not None and self.controller.torque_limit is not None:
+            return self.controller.torque_limit
         fraction = ReachTask(torque_fraction=self.torque_fraction).torque_limit(robot)
         return np.minimum(self.boost * fraction, robot.tau_max)
 
@@ -262,6 +265,11 @@ class TrackTask(BaseTask):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return q, dq, ddq (m, n) of the plans `goals` at t (m,) s plus ahead_s."""
         return at_time(goals, self._at(t), ahead_s, self.ctrl_hz)
+
+    def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the target (m, 6) of an impedance, m and m/s: position and velocity of the plans at t (m,) s."""
+        now = goals[np.arange(len(goals)), self._at(t)]
+        return np.concatenate([now[:, X], now[:, V]], axis=1)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m,) ones: the reward takes distances in m."""

@@ -1,0 +1,323 @@
+"""`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs about a target, which actions move or stiffen.
+
+The laws are in r2s/physics/impedance_laws.py; this module makes their parameters of arm, task and identified model.
+Defaults scale with the arm: forces are torques over the lever at home, stiffnesses are forces over a distance, and no
+spring is faster than the latency of the loop allows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from r2s.control.computed_torque import BANDWIDTH_LATENCY, LATENCY
+from r2s.control.controller import ControlledTask, Controller
+from r2s.control.impedance_cpp import CARTESIAN, JOINT
+from r2s.errors import UserError, check_number, choices, nearest
+from r2s.physics import impedance as law
+from r2s.physics.description import chain
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.impedance_laws import cartesian_impedance_law, joint_impedance_law
+from r2s.physics.inverse_dynamics import InverseDynamics
+from r2s.physics.kinematics import POSE
+from r2s.physics.newton_euler import COM, LINK, MASS, links_of
+from r2s.physics.robot import SIM_DT, Robot, per_joint
+
+ACTIONS = ("target", "stiffness", "both")
+# shares of the force that the torque limit allows in every direction at home: the rest is for damping and feedforward
+CLIP = 0.7
+CLIP_M = 0.05  # m, error at which the default spring saturates
+
+
+@dataclass(frozen=True)
+class Impedance(Controller):
+    """An impedance law; see `Controller`.
+
+    Attributes:
+        model: the identified arm. target_size: numbers of the target that the task gives.
+        contact: (4,) normal and force N against it, of hybrid control; None: the task's. hybrid: whether it is that.
+    """
+
+    model: InverseDynamics = field(default=None, repr=False)  # type: ignore[assignment]
+    target_size: int = 0
+    contact: np.ndarray | None = None
+    hybrid: bool = False
+
+    @property
+    def setpoint_size(self) -> int:
+        """Target, and for hybrid control normal (3), force, measured force, and whether it is measured."""
+        return self.target_size + 6 * self.hybrid
+
+    def holding_torque(self, q: np.ndarray) -> np.ndarray:
+        """Return the model's torque (n,) Nm at rest at q (n,) rad."""
+        still = np.zeros((1, len(q)))
+        return self.model(q[None], still, still, still)[0]
+
+    def setpoint(self, task: Any, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, s): the task's target, and for hybrid control its contact, without a measured force."""
+        if not self.target_size:
+            return np.empty((len(t), 0))
+        if self.law is joint_impedance_law:
+            return np.concatenate(task.trajectory(t, goals, 0.0)[:2], axis=1)
+        target = task.target(t, goals)
+        if not self.hybrid:
+            return target
+        contact = task.contact(t, goals) if self.contact is None else np.tile(self.contact, (len(t), 1))
+        return np.concatenate([target, contact, np.zeros((len(t), 2))], axis=1)
+
+    def with_force(self, command: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """Return the commands (m, c) of hybrid control with the measured force (m,) N against the normal."""
+        out = command.copy()
+        out[:, -2], out[:, -1] = force, 1.0
+        return out
+
+
+def joint_impedance(
+    robot: Robot,
+    task: ControlledTask,
+    dynamics: Dynamics,
+    *,
+    action: str = "target",
+    torque_fraction: Sequence[float] | float = 0.5,
+    displacement: float = 0.5,
+    stiffness: Sequence[float] | float | None = None,
+    softest: float = 0.1,
+    damping: float = 1.0,
+    tank: Sequence[float] = (1.0, 2.0),
+) -> Impedance:
+    """Return the joint impedance about a task's trajectory, or about home if the task has none.
+
+    Args:
+        robot, task: the arm and its task. dynamics: the arm's model, for damping and feedforward.
+        action: what an action sets: target, stiffness, or both.
+        torque_fraction: share of tau_max, the largest torque. displacement: rad, of the target, by an action of 1.
+        stiffness: Nm/rad, the highest; None: CLIP times the largest torque over displacement, or what latency allows.
+        softest: lowest stiffness of an action, share of the highest. damping: ratio of all modes.
+        tank: J, first level and size of the energy tank.
+
+    Raises:
+        UserError: a setting is out of its range.
+    """
+    limit, moves = _torque(robot, torque_fraction), hasattr(task, "trajectory")
+    p, rows = _parameters(robot, task, dynamics, damping, tank)
+    _check(action, softest, displacement)
+    if action == "stiffness" and not moves:
+        raise UserError(f"action: the target of {type(task).__name__} is home at all times; allowed: target, both")
+    if stiffness is None:
+        K = np.minimum(CLIP * limit / displacement, _fastest(task) ** 2 / np.diag(_at_home(p, robot)[1]))
+    else:
+        K = per_joint("stiffness", stiffness, robot.n, f"the {robot.n} joints of {robot.name}")
+        if not (np.isfinite(K).all() and (K > 0).all()):
+            raise UserError(f"stiffness: expected numbers above 0 Nm/rad, got {K.min():g}")
+    rows[:, law.K_JOINT : law.K_JOINT + 3] = np.stack([K, softest * K, K], -1)
+    rows[:, law.JOINT_LIMIT] = (CLIP * limit) ** 2 / (2 * K)
+    scale, offset = _action(action, np.full(robot.n, displacement), softest * K, K, p)
+    p[law.TARGET_AT] = len(scale) if moves else -1
+    unit = {"target": "rad", "stiffness": "Nm/rad", "both": "rad, Nm/rad"}[action]
+    return Impedance(
+        "joint_impedance",
+        joint_impedance_law,
+        scale,
+        offset,
+        action,
+        unit,
+        parameters=p,
+        memory_size=law.STIFFNESS + 4 * robot.n + robot.n**2,
+        cpp=JOINT,
+        torque_limit=limit,
+        model=InverseDynamics(robot, dynamics),
+        target_size=2 * robot.n if moves else 0,
+    )
+
+
+def cartesian_impedance(
+    robot: Robot,
+    task: Any,
+    dynamics: Dynamics,
+    *,
+    action: str = "target",
+    torque_fraction: Sequence[float] | float = 0.5,
+    displacement: float = 0.1,
+    rotation: float = 0.3,
+    stiffness: float | None = None,
+    rotational_stiffness: float = 0.0,
+    softest: float = 0.1,
+    damping: float = 1.0,
+    force_clip: float | None = None,
+    moment_clip: float | None = None,
+    null_stiffness: float = 0.2,
+    tank: Sequence[float] = (1.0, 2.0),
+    hybrid: bool = False,
+    normal: Sequence[float] | None = None,
+    force: float | None = None,
+    integral_rate: float = 2.0,
+    integral_max: float = 0.3,
+) -> Impedance:
+    """Return the impedance of the end effector, or of the tool's tip, about the task's target.
+
+    Args:
+        robot, task, dynamics, action, torque_fraction, softest, damping, tank: see `joint_impedance`.
+        displacement: m, of the target, by an action of 1. rotation: rad, the same for the orientation.
+        stiffness: N/m, the highest; None: force_clip over CLIP_M, or what latency allows.
+        rotational_stiffness: Nm/rad, the highest; 0: the orientation is free and follows the null space.
+        force_clip: N, largest force of the spring at the highest stiffness, at most what the torque limit allows in
+            every direction at home; None: CLIP times that. moment_clip: Nm, likewise.
+        null_stiffness: 1/rad, stiffness towards home in the null space, per torque limit of each joint.
+        hybrid: whether a force acts along a normal, and the impedance across it only. A displacement against the
+            normal then adds its stiffness times as much force.
+        normal: (3,) in the base frame, out of the surface. force: N, against it. None: the task's contact.
+        integral_rate: 1/s, of the force error, where a force is measured. integral_max: its share of force_clip.
+
+    Raises:
+        UserError: the task has no target or contact, or a setting is out of its range.
+    """
+    name = "hybrid" if hybrid else "cartesian_impedance"
+    if not hasattr(task, "target"):
+        raise UserError(f"control: {name} needs a task with a target; {type(task).__name__} has none, reach has one")
+    limit, rotates = _torque(robot, torque_fraction), rotational_stiffness > 0
+    p, rows = _parameters(robot, task, dynamics, damping, tank)
+    _check(action, softest, displacement)
+    for key, value in (("rotational_stiffness", rotational_stiffness), ("integral_rate", integral_rate)):
+        check_number(key, value, "[0, inf)")
+    check_number("null_stiffness", null_stiffness, "(0, inf)")
+    check_number("integral_max", integral_max, "[0, 1]")
+    check_number("rotation", rotation, "(0, inf)")
+    jacobian, mobility = _at_home(p, robot)
+    force_clip = _clip("force_clip", "N", force_clip, limit, jacobian[:3])
+    moment_clip = _clip("moment_clip", "Nm", moment_clip, limit, jacobian[3:])
+    if stiffness is None:
+        slow = np.linalg.eigvalsh(jacobian[:3] @ mobility @ jacobian[:3].T)[-1]
+        stiffness = min(force_clip / CLIP_M, _fastest(task) ** 2 / slow)
+    check_number("stiffness", stiffness, "(0, inf)")
+    K = np.array([stiffness] * 3 + [rotational_stiffness])
+    p[law.K_DEFAULT : law.K_HIGH + 4] = np.concatenate([K, softest * K, K])
+    p[law.FORCE_LIMIT] = force_clip**2 / (2 * stiffness)
+    p[law.MOMENT_LIMIT] = moment_clip**2 / (2 * rotational_stiffness) if rotates else 0.0
+    p[law.HYBRID], p[law.RATE] = hybrid, integral_rate
+    p[law.FORCE_MAX], p[law.INTEGRAL_MAX] = force_clip, integral_max * force_clip
+    p[law.TASK_AXES], p[law.TARGET_SIZE] = 6 if rotates else 3, task.target_size
+    rows[:, law.K_JOINT] = null_stiffness * limit
+    moves, set_K = np.array([displacement] * 3 + [rotation] * 3), K[: 4 if rotates else 3]
+    scale, offset = _action(action, moves[: 6 if rotates else 3], softest * set_K, set_K, p)
+    p[law.TARGET_AT] = len(scale)
+    unit = {"target": "m", "stiffness": "N/m", "both": "m, N/m"}[action] + (
+        "; rotation: rad, Nm/rad" if rotates else ""
+    )
+    return Impedance(
+        name,
+        cartesian_impedance_law,
+        scale,
+        offset,
+        action,
+        unit,
+        parameters=p,
+        memory_size=law.STIFFNESS + law.SPRINGS + 3 * robot.n + 2 * robot.n**2,
+        cpp=CARTESIAN,
+        torque_limit=limit,
+        model=InverseDynamics(robot, dynamics),
+        target_size=task.target_size,
+        contact=_contact(task, normal, force, force_clip) if hybrid else None,
+        hybrid=hybrid,
+    )
+
+
+def _check(action: str, softest: float, displacement: float) -> None:
+    """Raise UserError for settings that both impedances share."""
+    if action not in ACTIONS:
+        raise UserError(f"action: '{action}'; allowed: {choices(ACTIONS)}{nearest(str(action), ACTIONS)}")
+    check_number("softest", softest, "(0, 1]")
+    check_number("displacement", displacement, "(0, inf)")
+
+
+def _torque(robot: Robot, fraction: Sequence[float] | float) -> np.ndarray:
+    """Return the largest torque (n,) Nm."""
+    share = per_joint("torque_fraction", fraction, robot.n, f"the {robot.n} joints of {robot.name}")
+    if not ((share > 0) & (share <= 1)).all():
+        raise UserError(f"torque_fraction: expected numbers in (0, 1], got {share.tolist()}")
+    return share * robot.tau_max
+
+
+def _contact(task: Any, normal: Sequence[float] | None, force: float | None, most: float) -> np.ndarray | None:
+    """Return normal and force (4,) of the settings; None: the task has them."""
+    if normal is None and force is None and hasattr(task, "contact"):
+        return None
+    if normal is None or force is None:
+        raise UserError(
+            f"normal: {type(task).__name__} has no contact; hybrid needs control.normal and control.force"
+        )
+    check_number("force", force, f"[0, {most:.6g}]")
+    n = np.array(normal, dtype=float)
+    if n.shape != (3,) or not np.isfinite(n).all() or not np.linalg.norm(n) > 0:
+        raise UserError(f"normal: expected three numbers, not all 0, got {list(normal)}")
+    return np.array([*(n / np.linalg.norm(n)), force])
+
+
+def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian: np.ndarray) -> float:
+    """Return the largest force or moment, by default CLIP of what the torque limit (n,) Nm allows at home."""
+    most = float((limit / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)).min())
+    if value is None:
+        return CLIP * most
+    check_number(name, value, "(0, inf)")
+    if value > most:
+        raise UserError(f"{name}: expected at most {most:.3g} {unit}, which the torque limit allows, got {value:g}")
+    return float(value)
+
+
+def _fastest(task: ControlledTask) -> float:
+    """Return the highest frequency w of a spring, rad/s: critically damped, its loop has the rate 2 w."""
+    return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
+
+
+def _at_home(parameters: np.ndarray, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Jacobian (6, n) of the tip and the inverse mass matrix (n, n) at home."""
+    n = robot.n
+    frames, jacobian, mass = np.empty((n, POSE)), np.empty((6, n)), np.empty((n, n))
+    law.arm_pose(robot.q_home, parameters, frames, jacobian, np.empty(3))
+    law.mass_matrix(parameters, frames, jacobian, mass)
+    return jacobian, np.linalg.inv(mass)
+
+
+def _action(
+    action: str, moves: np.ndarray, low: np.ndarray, high: np.ndarray, parameters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return scale and offset of an action, and write its places in the command into the parameters."""
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    parameters[law.DISPLACED] = -1 if action == "stiffness" else 0
+    parameters[law.STIFFNESS_AT] = {"target": -1, "stiffness": 0, "both": len(moves)}[action]
+    scale = {"target": moves, "stiffness": half, "both": np.concatenate([moves, half])}[action]
+    offset = {"target": 0 * moves, "stiffness": middle, "both": np.concatenate([0 * moves, middle])}[action]
+    return scale, offset
+
+
+def _parameters(
+    robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parameters (p,) with all but springs and action, and a view (n, ROW) of the joints' rows."""
+    check_number("damping", damping, "(0, 10]")
+    if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
+        raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")
+    d, n = dynamics, robot.n
+    own, nominal = links_of(robot, d.mass, d.com, d.inertia), links_of(robot, robot.mass, robot.com, robot.inertia)
+    p = np.zeros(law.HEAD + n * law.ROW)
+    rows = p[law.HEAD :].reshape(n, law.ROW)
+    p[law.HOLD], p[law.RATIO], p[law.CYCLE_S] = round(1 / (task.ctrl_hz * SIM_DT)), 2 * damping, SIM_DT
+    p[law.FILL], p[law.TANK] = tank
+    hand = chain(robot, Dynamics.of(robot, np.zeros((n, 3))), friction=False)[1]
+    tool = getattr(robot, "tool", None)
+    p[law.TIP : law.TIP + 3] = hand[:3, 3] if tool is None else hand[:3, :3] @ tool.tip + hand[:3, 3]
+    p[law.GRAVITY : law.GRAVITY + 3] = robot.gravity
+    rows[:, :LINK], rows[:, law.ROTOR] = own, d.armature
+    moment = [links[:, MASS, None] * links[:, COM : COM + 3] for links in (own, nominal)]
+    rows[:, law.MASS_ERROR] = own[:, MASS] - nominal[:, MASS]
+    rows[:, law.MOMENT_ERROR : law.MOMENT_ERROR + 3] = moment[0] - moment[1]
+    rows[:, law.OFFSET], rows[:, law.DRAG : law.DRAG + 2], rows[:, law.HOME] = d.offset, d.drag, robot.q_home
+    still, model = np.zeros((1, n)), InverseDynamics(robot, d)
+    rest = model(robot.q_home[None], still, still, still)[0]
+    for k in range(2 * law.NODES):  # at home, load-dependent friction included
+        v = law.FIRST_DQ * 4.0 ** (k % law.NODES) * (1 if k < law.NODES else -1)
+        rows[:, law.FRICTION + k] = model(robot.q_home[None], still, still, np.full((1, n), v))[0] - rest
+    frames = np.empty((n, POSE))
+    law.arm_pose(robot.q_home, p, frames, np.empty((6, n)), np.empty(3))
+    p[law.HOME_AXES : law.HOME_AXES + 9] = frames[-1, 3:]
+    return p, rows

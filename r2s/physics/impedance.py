@@ -1,0 +1,200 @@
+"""Parts of the compiled impedance laws (impedance_laws.py), and the layout of their parameters and memory.
+
+    tau = J^T (K e) - D (dq - dq_r) + N^T K_n (q_home - q) + feedforward
+
+The damping D = 2 zeta (M # K_q) is the geometric mean of mass matrix and joint stiffness K_q = J^T K J + N^T K_n N:
+M (M^-1 K_q)^(1/2) gives every mode of M and K_q the ratio zeta. It is the double diagonalization of Albu-Schaeffer,
+Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. N is dynamically consistent (Khatib, IEEE J. Robotics and
+Automation 1987). Every spring has a potential, also where its force is clipped, so its energy is known. An energy
+tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) pays for what a rising stiffness adds to that energy; damping refills
+it. The work of a moving target and of the null space is not in the tank (Dietrich, Ott and Stramigioli, RA-L 2016).
+Feedforward: friction at the reference speed dq_r, and errors of the arm's gravity compensation.
+"""
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.kinematics import pose_axes, write_pose
+from r2s.physics.newton_euler import (
+    COM,
+    LINK,
+    MASS,
+    base_tensor,
+    joint_frame,
+    rotate,
+)
+
+# Parameters: cycles between two updates of D and N, 2 zeta, energies J at which force and moment saturate, first
+# level and size of the tank J, cycle s; places in the command (-1: none), size of the target, number of the task's
+# axes (3 or 6); whether the law is hybrid, rate of its integral 1/s, largest force and integral N
+HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
+DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
+K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
+TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip in the last link, that link's axes at home, m/s^2
+HEAD = 43
+# Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
+# friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
+# saturates, home
+ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
+K_JOINT, JOINT_LIMIT, HOME, ROW = 44, 47, 48, 49
+# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; then the stiffnesses,
+# and rows of n: dq_r, the last damping torque, the last q; matrices D and N^T
+SINCE, BEGUN, LEVEL, INTEGRAL, STIFFNESS = range(5)
+SPRINGS = 4  # stiffnesses in the task's axes
+ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
+FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
+NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
+SMALLEST = 0.01  # share of a rise of the stiffness below which it stays
+MOBILITY = 1e-3  # 1/kg and 1/(kg m^2): directions with less, near a singularity, count as blocked
+
+
+@njit(cache=True, error_model="numpy")
+def arm_pose(q, parameters, frames, jacobian, place):
+    """Write link poses (n, POSE), the tip's Jacobian (6, n), translation first, and its place (3,) m."""
+    n = len(q)
+    R = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(n):
+        (dx, dy, dz), (a, b, c), R = joint_frame(R, parameters[HEAD + i * ROW : HEAD + i * ROW + LINK], q[i])
+        x, y, z = x + dx, y + dy, z + dz
+        jacobian[3, i], jacobian[4, i], jacobian[5, i] = a, b, c
+        write_pose(frames[i], x, y, z, R)
+    dx, dy, dz = rotate(R, parameters[TIP], parameters[TIP + 1], parameters[TIP + 2])
+    place[0], place[1], place[2] = x + dx, y + dy, z + dz
+    for i in range(n):
+        x, y, z = place[0] - frames[i, 0], place[1] - frames[i, 1], place[2] - frames[i, 2]
+        a, b, c = jacobian[3, i], jacobian[4, i], jacobian[5, i]
+        jacobian[0, i], jacobian[1, i], jacobian[2, i] = b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@njit(cache=True, error_model="numpy")
+def mass_matrix(parameters, frames, jacobian, mass):
+    """Write the mass matrix (n, n) kg m^2, rotors included: the sum of m J_v^T J_v + J_w^T I J_w over the links."""
+    n = len(frames)
+    moved = np.empty((n, 3))
+    for i in range(n):
+        for j in range(n):
+            mass[i, j] = parameters[HEAD + i * ROW + ROTOR] if i == j else 0.0
+    for k in range(n):
+        link = parameters[HEAD + k * ROW : HEAD + k * ROW + LINK]
+        R, m = pose_axes(frames[k]), link[MASS]
+        x, y, z = rotate(R, link[COM], link[COM + 1], link[COM + 2])
+        x, y, z = x + frames[k, 0], y + frames[k, 1], z + frames[k, 2]
+        xx, xy, xz, yy, yz, zz = base_tensor(R, link)
+        for i in range(k + 1):
+            a, b, c = jacobian[3, i], jacobian[4, i], jacobian[5, i]
+            u, v, w = x - frames[i, 0], y - frames[i, 1], z - frames[i, 2]
+            moved[i, 0], moved[i, 1], moved[i, 2] = b * w - c * v, c * u - a * w, a * v - b * u
+            u, v, w = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
+            for j in range(i + 1):
+                moment = u * jacobian[3, j] + v * jacobian[4, j] + w * jacobian[5, j]
+                force = moved[i, 0] * moved[j, 0] + moved[i, 1] * moved[j, 1] + moved[i, 2] * moved[j, 2]
+                mass[i, j] += m * force + moment
+                mass[j, i] = mass[i, j]
+
+
+@njit(cache=True, error_model="numpy")
+def invert(matrix, n):
+    """Replace the symmetric positive definite matrix (n, n) by its inverse: Gauss-Jordan elimination."""
+    for k in range(n):
+        pivot = 1.0 / matrix[k, k]
+        matrix[k, k] = 1.0
+        for j in range(n):
+            matrix[k, j] *= pivot
+        for i in range(n):
+            if i != k:
+                factor = matrix[i, k]
+                matrix[i, k] = 0.0
+                for j in range(n):
+                    matrix[i, j] -= factor * matrix[k, j]
+
+
+@njit(cache=True, error_model="numpy")
+def geometric_mean(K, mobility, out):
+    """Write K # M = M (M^-1 K)^(1/2) (n, n) of K and M = mobility^-1, all symmetric positive definite.
+
+    Denman and Beavers' iteration (Higham, Functions of Matrices, 2008, eq. 6.28), multiplied by M so that all
+    iterates stay symmetric: P <- (P + Q^-1) / 2, Q <- (Q + P^-1) / 2 from P = K, Q = M^-1.
+    """
+    n = len(K)
+    scale = 0.0  # mean squared frequency
+    for i in range(n):
+        for j in range(n):
+            scale += K[i, j] * mobility[j, i] / n
+    Q, P_inverse, Q_inverse = mobility.copy(), np.empty((n, n)), np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = K[i, j] / scale
+    for _ in range(ROUNDS):
+        P_inverse[:, :] = out
+        Q_inverse[:, :] = Q
+        invert(P_inverse, n)
+        invert(Q_inverse, n)
+        for i in range(n):
+            for j in range(n):
+                out[i, j] = 0.5 * (out[i, j] + Q_inverse[i, j])
+                Q[i, j] = 0.5 * (Q[i, j] + P_inverse[i, j])
+    root = np.sqrt(scale)
+    for i in range(n):
+        for j in range(n):
+            out[i, j] *= root
+
+
+@njit(cache=True, error_model="numpy")
+def spring(s, limit):
+    """Return energy, J, and factor of the force of a spring with s = e^T K e / 2, which saturates at s = limit, J.
+
+    U = s up to the limit, then 2 sqrt(s limit) - limit. U depends on s alone, so the force has a potential for every
+    K; it rises with K, and the force stays below sqrt(2 K limit): limit = clip^2 / (2 K_high).
+    """
+    if s <= limit:
+        return s, 1.0
+    factor = np.sqrt(limit / s)
+    return 2.0 * factor * s - limit, factor
+
+
+@njit(cache=True, error_model="numpy")
+def task_energy(K, error, tilt, parameters):
+    """Return the energy, J, of the springs K (4,): error (3,) m, and tilt = 1 - cos of the rotation error."""
+    s = 0.5 * (K[0] * error[0] ** 2 + K[1] * error[1] ** 2 + K[2] * error[2] ** 2)
+    return spring(s, parameters[FORCE_LIMIT])[0] + spring(K[3] * tilt, parameters[MOMENT_LIMIT])[0]
+
+
+@njit(cache=True, error_model="numpy")
+def refill(q, n, parameters, memory, at):
+    """Add to the tank what the last damping torque took from the arm since the last cycle, J; at: place of dq_r."""
+    if memory[BEGUN] == 0.0:
+        memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
+    else:
+        for j in range(n):
+            moved = q[j] - memory[at + 2 * n + j] - memory[at + j] * parameters[CYCLE_S]
+            memory[LEVEL] -= memory[at + n + j] * moved
+    memory[LEVEL] = min(max(memory[LEVEL], 0.0), parameters[TANK])
+
+
+@njit(cache=True, error_model="numpy")
+def friction_at(v, row):
+    """Return friction, Nm, at v rad/s: linear between the speeds FIRST_DQ 4^k of a joint's row, and beyond."""
+    side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
+    low, level, high = 0.0, 0.0, FIRST_DQ
+    while abs(v) > high and k < NODES - 1:
+        low, level, high, k = high, row[side + k], 4.0 * high, k + 1
+    return level + (row[side + k] - level) * (abs(v) - low) / (high - low)
+
+
+@njit(cache=True, error_model="numpy")
+def feedforward(q, parameters, frames, jacobian, memory, at, out):
+    """Add friction at dq_r (memory[at:]), and errors of the gravity compensation, offset and drag, to `out`."""
+    n = len(q)
+    m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all that a joint carries
+    for j in range(n - 1, -1, -1):
+        row = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW]
+        u, v, w = rotate(pose_axes(frames[j]), row[MOMENT_ERROR], row[MOMENT_ERROR + 1], row[MOMENT_ERROR + 2])
+        e = row[MASS_ERROR]
+        m, x, y, z = m + e, x + u + e * frames[j, 0], y + v + e * frames[j, 1], z + w + e * frames[j, 2]
+        u, v, w = x - m * frames[j, 0], y - m * frames[j, 1], z - m * frames[j, 2]
+        a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
+        a, b, c = v * c - w * b, w * a - u * c, u * b - v * a
+        out[j] -= jacobian[3, j] * a + jacobian[4, j] * b + jacobian[5, j] * c
+        out[j] -= row[OFFSET] + row[DRAG] * np.sin(q[j]) + row[DRAG + 1] * np.cos(q[j])
+        out[j] += friction_at(memory[at + j], row)
