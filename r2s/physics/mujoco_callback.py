@@ -151,8 +151,8 @@ def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) ->
         friction = FunctionType(_friction.py_func.__code__, {**globals(), "_law": _in_order(laws)})
         names["_friction"] = njit(error_model="numpy", forceinline=True)(friction)
     if own_control := control_laws[len(BUILT_IN_CONTROL) :]:
-        drive = FunctionType(_drive.py_func.__code__, {**globals(), "control_law": chain(control_laws)})
-        names["_drive"] = njit(error_model="numpy", forceinline=True)(drive)
+        control = FunctionType(_control.py_func.__code__, {**globals(), "control_law": chain(control_laws)})
+        names["_control"] = njit(error_model="numpy")(control)
     if own or own_control:
         force = FunctionType(force.__code__, names, closure=force.__closure__)
     signature = types.void(types.CPointer(types.int64), types.CPointer(types.int64))
@@ -181,6 +181,8 @@ def _force_at(at: dict[str, int]) -> Callable:
         user = carray(_as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
         if user[0, LIMITS + TAU_MAX] > 0.0 and user[0, MARK] == MARKER:
             fields = data[q_at], data[dq_at], data[applied_at], data[bias_at], data[mass_at], data[memory_at]
+            if user[0, CONTROL] != NO_CONTROL:
+                _control(n, model[user_at], fields)
             if n == USUAL:
                 _drive(USUAL, model[user_at], fields)
             else:
@@ -267,9 +269,26 @@ def _friction(sizes, user, q, dq, forces, places):
             _hold(loads, dq, user, joint, work, (contact, jacobian), touch)
 
 
+@njit(error_model="numpy")
+def _control(n, user, fields):
+    """Replace the applied torques by those of the control law; arguments as in `_drive`.
+
+    Here n is not constant: unrolled loops of the laws would take a minute to compile.
+    """
+    user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
+    q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
+    applied, kept = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[5]), (KEPT, n))
+    c, k, p = int(user[0, COMMANDS]), int(user[0, MEMORIES]), int(user[0, PARAMETERS])
+    rest = carray(_as_doubles(fields[5]), (KEPT * n + c + k + p,))[KEPT * n :]
+    speed = carray(_stack(n), (n,))  # type: ignore[call-arg]
+    for j in range(n):
+        speed[j] = dq[j] + kept[NOISE, j]
+    control_law(user[0, CONTROL], q, speed, rest[:c], rest[c + k :], rest[c : c + k], applied)
+
+
 @njit(error_model="numpy", forceinline=True)
 def _drive(n, user, fields):
-    """Replace the applied torques by those behind control law, conditioning, safety filter and motors.
+    """Replace the applied torques by those behind conditioning, safety filter and motors.
 
     numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
 
@@ -281,12 +300,6 @@ def _drive(n, user, fields):
     applied, bias = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[3]), (n,))
     mass, kept = carray(_as_doubles(fields[4]), (n * (n + 1) // 2,)), carray(_as_doubles(fields[5]), (KEPT, n))
     if user[0, CONTROL] != NO_CONTROL:
-        c, k, p = int(user[0, COMMANDS]), int(user[0, MEMORIES]), int(user[0, PARAMETERS])
-        rest = carray(_as_doubles(fields[5]), (KEPT * n + c + k + p,))[KEPT * n :]
-        speed = carray(_stack(n), (n,))  # type: ignore[call-arg]
-        for j in range(n):
-            speed[j] = dq[j] + kept[NOISE, j]
-        control_law(user[0, CONTROL], q, speed, rest[:c], rest[c + k :], rest[c : c + k], applied)
         for j in range(n):
             target = min(max(applied[j], -user[j, TARGET_MAX]), user[j, TARGET_MAX])
             kept[FILTERED, j], kept[EFFORT, j] = condition_joint(
