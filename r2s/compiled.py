@@ -3,10 +3,12 @@
 numba caches a compiled function beside its source and recompiles it when that file changes. But the cached code also
 contains the functions that it calls, and those may lie in other files: after a change in physics/safety_filter.py,
 numba would run arm/driver.py with the old filter. So here the source of a compiled function is all compiled code of
-its room and of `physics`. Compiled code must not call functions of any other room.
+its room and of `physics`, and the modules from which they import constants. Compiled code must not call functions of
+any other room.
 """
 
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 
@@ -25,11 +27,17 @@ def _sources(room: Path) -> bytes:
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}
     else:
         paths = set(room.glob("*.py"))
+    compiled = {path for path in paths if b"r2s.compiled" in path.read_bytes()}
+    constants = {PACKAGE.joinpath(*name[1:]).with_suffix(".py") for path in compiled for name in _imports(path)}
     found = hashlib.sha256()
-    for path in sorted(paths):
-        if b"r2s.compiled" in (text := path.read_bytes()):
-            found.update(path.name.encode() + text)
+    for path in sorted(compiled | {path for path in constants if path.is_file()}):
+        found.update(path.name.encode() + path.read_bytes())
     return found.digest()
+
+
+def _imports(path: Path) -> list[list[str]]:
+    """Return the parts of the names of r2s's modules from which a module imports."""
+    return [name.split(".") for name in re.findall(r"^from (r2s[\w.]+) import", path.read_text(), re.MULTILINE)]
 
 
 class _Sources:

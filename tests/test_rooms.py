@@ -102,6 +102,10 @@ def test_a_change_in_physics_makes_what_is_compiled_of_it_new(tmp_path, monkeypa
     assert stamps() == before
     (rooms[1] / "law.py").write_text("from r2s.compiled import njit\nRATE = 2\n")
     assert all(new != old for new, old in zip(stamps(), before, strict=True))
+    (rooms[0] / "law.py").write_text("from r2s.arm.other import x\nfrom r2s.compiled import njit\n")
+    before = stamps()
+    (rooms[0] / "other.py").write_text("x = 2\n")  # a constant of a compiled module
+    assert stamps()[0] != before[0]
 
 
 def test_every_room_is_there_and_says_what_it_is():

@@ -1,4 +1,4 @@
-"""The surface of a twin: drawn from its seed around the place where one expects it, and touched in every cycle."""
+"""The surface of a twin: drawn from its seed around its nominal place, and touched in every cycle."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,8 +14,8 @@ from r2s.physics.newton_euler import links_of
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface
 
-BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the expected surface
-PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than expected
+BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the nominal surface
+PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
 
 
