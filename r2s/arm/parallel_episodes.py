@@ -59,7 +59,7 @@ def run_parallel_episodes(
                 collect(chunk, result)
     parts = [done[chunk] for chunk in chunks]
     each = [episodes for episodes, _, _ in parts]
-    names = [f.name for f in fields(Episodes) if f.name != "t"]
+    names = [f.name for f in fields(Episodes) if f.name != "t" and getattr(each[0], f.name) is not None]
     together = {name: np.concatenate([getattr(episodes, name) for episodes in each]) for name in names}
     timing = Timing()
     for _, _, durations in parts:

@@ -221,4 +221,5 @@ def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: b
     return State(
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
         tau=s.tau_J_d[None], effort=effort[None], stopped=np.array([stopped]), limited=np.array([limited]),
+        force=None if s.O_F_ext_hat_K is None else s.O_F_ext_hat_K[None, :3],
     )  # fmt: skip

@@ -165,7 +165,8 @@ def cartesian_impedance(
             every direction at home; None: CLIP times that. moment_clip: Nm, likewise.
         null_stiffness: 1/rad, stiffness towards home in the null space, per torque limit of each joint.
         hybrid: whether a force acts along a normal, and the impedance across it only. A displacement against the
-            normal then adds its stiffness times as much force.
+            normal then adds its stiffness times as much force. Of a task that `approaches` a surface, the force is at
+            most that of a spring to the target, which moves into the surface; so the approach is as slow as it.
         normal: (3,) in the base frame, out of the surface. force: N, against it. None: the task's contact.
         integral_rate: 1/s, of the force error, where a force is measured. integral_max: its share of force_clip.
 
@@ -195,6 +196,7 @@ def cartesian_impedance(
     p[law.FORCE_LIMIT] = force_clip**2 / (2 * stiffness)
     p[law.MOMENT_LIMIT] = moment_clip**2 / (2 * rotational_stiffness) if rotates else 0.0
     p[law.HYBRID], p[law.RATE] = hybrid, integral_rate
+    p[law.APPROACH] = hybrid and normal is None and getattr(task, "approaches", False)
     p[law.FORCE_MAX], p[law.INTEGRAL_MAX] = force_clip, integral_max * force_clip
     p[law.TASK_AXES], p[law.TARGET_SIZE] = 6 if rotates else 3, task.target_size
     rows[:, law.K_JOINT] = null_stiffness * limit

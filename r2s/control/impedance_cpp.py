@@ -122,7 +122,8 @@ struct Law {
       memory[BEGUN] = 1.0, memory[LEVEL] = parameters[FILL];
     } else {
       for (int j = 0; j < n; ++j)
-        memory[LEVEL] -= memory[at + n + j] * (q[j] - memory[at + 2 * n + j] - memory[at + j] * parameters[CYCLE_S]);
+        memory[LEVEL] -= memory[at + n + j] * (q[j] - memory[at + 2 * n + j] -
+                                               (1.0 - parameters[APPROACH]) * memory[at + j] * parameters[CYCLE_S]);
     }
     memory[LEVEL] = least(most(memory[LEVEL], 0.0), parameters[TANK]);
   }
@@ -305,14 +306,15 @@ _CARTESIAN = """
 constexpr int at = STIFFNESS + SPRINGS;
 const int shift = int(parameters[DISPLACED]), target = int(parameters[TARGET_AT]);
 const bool begins = memory[BEGUN] == 0.0, pushes = parameters[HYBRID] > 0.0;
-double place[3], jacobian[6][n], error[3], wrench[6] = {};
+const double follows = 1.0 - parameters[APPROACH];
+double place[3], jacobian[6][n], error[3], wrench[6] = {}, along = 0.0;
 Pose frames[n];
 Law::arm_pose(q, frames, jacobian, place);
 Law::refill(q, memory, at);
 for (int k = 0; k < 3; ++k) error[k] = command[target + k] - place[k] + (shift >= 0 ? command[shift + k] : 0.0);
 const double* normal = command + target + int(parameters[TARGET_SIZE]);
 if (pushes) {
-  const double along = error[0] * normal[0] + error[1] * normal[1] + error[2] * normal[2];
+  along = error[0] * normal[0] + error[1] * normal[1] + error[2] * normal[2];
   for (int k = 0; k < 3; ++k) error[k] -= along * normal[k];
 }
 const double tilt = AXES == 6 ? Law::rotation_error(frames[n - 1].r, command, wrench + 3) : 0.0;
@@ -323,8 +325,9 @@ const double force = Law::factor(s, parameters[FORCE_LIMIT]);
 const double moment = Law::factor(K[3] * tilt, parameters[MOMENT_LIMIT]);
 for (int k = 0; k < 3; ++k) wrench[k] = force * K[k] * error[k], wrench[3 + k] *= moment * K[3];
 if (pushes) {
-  double along = wrench[0] * normal[0] + wrench[1] * normal[1] + wrench[2] * normal[2];
-  along += Law::normal_force(command, shift, memory);
+  double push = Law::normal_force(command, shift, memory);
+  if (parameters[APPROACH] > 0.0) push = Law::least(push, Law::most(-parameters[K_DEFAULT] * along, 0.0));
+  along = push + wrench[0] * normal[0] + wrench[1] * normal[1] + wrench[2] * normal[2];
   for (int k = 0; k < 3; ++k) wrench[k] -= along * normal[k];
 }
 if (memory[SINCE] == 0.0) Law::update(command, frames, jacobian, memory);
@@ -332,7 +335,7 @@ const double *D = memory + at + 3 * n, *N = D + n * n;
 for (int j = 0; j < n; ++j) {
   double damping = 0.0, torque = 0.0;
   for (int k = 0; k < n; ++k) {
-    damping -= parameters[RATIO] * D[j * n + k] * (dq[k] - memory[at + k]);
+    damping -= parameters[RATIO] * D[j * n + k] * (dq[k] - follows * memory[at + k]);
     torque += N[j * n + k] * Law::row(k)[K_JOINT] * (Law::row(k)[HOME] - q[k]);
   }
   for (int k = 0; k < AXES; ++k) torque += jacobian[k][j] * wrench[k];

@@ -7,6 +7,7 @@ import numpy as np
 from r2s.engines.interface import Engine, FrictionTorque
 from r2s.learning.evaluate import fixed_draws
 from r2s.physics.actuation import Actuation, Motors
+from r2s.physics.contact import FORCE
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
@@ -85,4 +86,7 @@ class EngineArms:
         limited = np.array([(self._guard.changed - self._limited) / self._substeps])
         noise = self._sigma * self._rng.standard_normal((1, self.robot.n))
         self._noise = noise[0]
-        return State(t, q[None], dq[None], ee[None], jacobian[None], tau, effort, NONE, limited, noise=noise)
+        contact = self._law.contact
+        force = None if contact is None else -contact[None, FORCE : FORCE + 3]
+        joints = q[None], dq[None]
+        return State(t, *joints, ee[None], jacobian[None], tau, effort, NONE, limited, noise, force)

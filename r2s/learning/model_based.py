@@ -121,3 +121,20 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
         f"algo: computed_torque cannot do {type(task).__name__} under control={task.control(robot).name}; "
         "control=computed_torque is allowed"
     )
+
+
+def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
+    """Return `algo=hybrid_force`: zero actions under control=hybrid, which approaches and holds a task's force.
+
+    It has no feedback of the force: J^T f and the friction of its model.
+
+    Raises:
+        UserError: another controller, or a task without a contact.
+    """
+    control = task.control(robot)
+    if control.name != "hybrid" or not hasattr(task, "contact"):
+        raise UserError(
+            f"algo: hybrid_force cannot do {type(task).__name__} under control={control.name}; task=press with "
+            "control=hybrid is allowed"
+        )
+    return ZeroAction(control.action_dim)

@@ -13,6 +13,8 @@ from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import FARTHEST_M, MOST_KG, Payload, dynamics_with_payload, sphere_inertia
 from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface
+from r2s.physics.tip import nominal_plane
 
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or of one for all
 
@@ -131,6 +133,91 @@ class ForceRandomization:
     def forces(self, rng: np.random.Generator, m: int) -> np.ndarray:
         """Return (m, n) Nm."""
         return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
+
+
+@dataclass(frozen=True)
+class ContactRandomization:
+    """Arms as of `UniformRandomization`, each with a plane of its own around a nominal one.
+
+    stiffness ~ log U(stiffness); exponent ~ U({least, most}); damping, friction ~ U; bristle ~ U(bristle)
+    point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
+
+    Attributes:
+        arms: draws the arms. point: (3,) m, normal: (3,), of the nominal plane.
+        stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
+        place: m. tilt: degrees.
+
+    Raises:
+        UserError: a range that is none, or outside what a surface may have.
+    """
+
+    arms: UniformRandomization
+    point: np.ndarray
+    normal: np.ndarray
+    stiffness: Sequence[float]
+    exponent: Sequence[float]
+    damping: Sequence[float]
+    friction: Sequence[float]
+    bristle: Sequence[float]
+    place: float
+    tilt: float
+
+    def __post_init__(self):
+        for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
+            pair = getattr(self, name)
+            low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
+            for value in pair:
+                check_number(f"dr.{name}", value, low)
+            if pair[0] > pair[1]:
+                raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
+        check_number("dr.place", self.place, "[0, inf)")
+        check_number("dr.tilt", self.tilt, "[0, 45]")
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return the dynamics of m arms."""
+        n, (least, most) = self.normal, np.log(self.stiffness)
+        across = np.cross(n, np.eye(3)[np.abs(n).argmin()])
+        across /= np.linalg.norm(across)
+        about, tilt = rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, self.tilt, (m, 1)))
+        aside = np.cos(about) * across + np.sin(about) * np.cross(n, across)
+        surface = Surface(
+            point=self.point + rng.uniform(-self.place, self.place, (m, 1)) * n,
+            normal=np.cos(tilt) * n + np.sin(tilt) * aside,
+            stiffness=np.exp(rng.uniform(least, most, m)),
+            exponent=rng.choice(np.array(self.exponent, dtype=float), m),
+            damping=rng.uniform(self.damping[0], self.damping[1], m),
+            friction=rng.uniform(self.friction[0], self.friction[1], m),
+            bristle=rng.uniform(self.bristle[0], self.bristle[1], m),
+        )
+        return replace(self.arms(rng, m), surface=surface)
+
+
+def contact_randomization(
+    robot: Robot,
+    center: Dynamics,
+    *,
+    phi_relative: float,
+    inertia_relative: float,
+    payload: Sequence[float] | None = None,
+    point: Sequence[float] | None = None,
+    normal: Sequence[float] | None = None,
+    stiffness: Sequence[float],
+    exponent: Sequence[float],
+    damping: Sequence[float],
+    friction: Sequence[float],
+    bristle: Sequence[float],
+    place: float,
+    tilt: float,
+) -> ContactRandomization:
+    """Return draws of arms and surfaces about a nominal plane; see the two classes.
+
+    point, normal: None: a table below the tip at home.
+    """
+    arms = UniformRandomization(robot, center, phi_relative, inertia_relative, payload)
+    plane = nominal_plane(robot, point, normal)
+    return ContactRandomization(arms, *plane, stiffness, exponent, damping, friction, bristle, place, tilt)
 
 
 def posterior_randomization(

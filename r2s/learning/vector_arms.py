@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.safety_filter import filter_limits
@@ -40,6 +41,8 @@ class VectorArms:
         soft_start_s: float = 0.0,
         seed: int | np.random.SeedSequence = 0,
     ):
+        if task.touches and dynamics.surface is None:
+            raise UserError(f"dr: {type(task).__name__} touches a surface; dr=contact draws one")
         self.robot, self.width = robot, width
         torque, self._period = task.torque_limit(robot), 1 / task.ctrl_hz
         self.sim = Simulator(robot, dynamics, width, nthread, control=task.control(robot))
@@ -86,7 +89,9 @@ class VectorArms:
         sim, t = self.sim, self._steps * self._period
         limited = (sim.limited - self._limited) / self._substeps
         noise = self._noise if self._sigma.any() else None
-        return State(t, sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, sim.effort, self._stopped, limited, noise)
+        force = None if self.robot.tool is None else -sim.contact_force
+        arm = sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, sim.effort
+        return State(t, *arm, self._stopped, limited, noise, force)
 
     def step(self, command: np.ndarray) -> State:
         """Run one control period with commands (width, c) of the controller; return the state after it.

@@ -26,12 +26,13 @@ from r2s.physics.newton_euler import (
 
 # Parameters: cycles between two updates of D and N, 2 zeta, energies J at which force and moment saturate, first
 # level and size of the tank J, cycle s; places in the command (-1: none), size of the target, number of the task's
-# axes (3 or 6); whether the law is hybrid, rate of its integral 1/s, largest force and integral N
+# axes (3 or 6); whether the law is hybrid, rate of its integral 1/s, largest force and integral N. APPROACH: 1 if a
+# hybrid force is at most that of the spring to the target, and dq_r is the direction of friction only; else 0
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
 TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip in the last link, that link's axes at home, m/s^2
-HEAD = 43
+APPROACH, HEAD = 43, 44
 # Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
 # friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
 # saturates, home
@@ -167,7 +168,8 @@ def refill(q, n, parameters, memory, at):
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
     else:
         for j in range(n):
-            moved = q[j] - memory[at + 2 * n + j] - memory[at + j] * parameters[CYCLE_S]
+            follows = (1.0 - parameters[APPROACH]) * memory[at + j]
+            moved = q[j] - memory[at + 2 * n + j] - follows * parameters[CYCLE_S]
             memory[LEVEL] -= memory[at + n + j] * moved
     memory[LEVEL] = min(max(memory[LEVEL], 0.0), parameters[TANK])
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from r2s.compiled import njit
 from r2s.physics.impedance import (
+    APPROACH,
     BEGUN,
     CYCLE_S,
     DISPLACED,
@@ -232,7 +233,8 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
 
     command: displacement of the target (3) m and, with six axes, (3) rad as a rotation vector, then stiffness (3) N/m
     and, with six axes, (1) Nm/rad, where the action has them. Then the task's target: position (3), and where it has
-    them velocity (3) m/s and rotation vector from home (3) rad. For hybrid: see `normal_force`.
+    them velocity (3) m/s and rotation vector from home (3) rad. For hybrid: see `normal_force`; with APPROACH the
+    force grows with the distance to a target that moves into a surface, until it is the one asked for.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     frames, jacobian, place = np.empty((n, POSE)), np.empty((6, n)), np.empty(3)
@@ -241,7 +243,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     shift, target, error, wrench = int(parameters[DISPLACED]), int(parameters[TARGET_AT]), np.empty(3), np.zeros(6)
     for k in range(3):
         error[k] = command[target + k] - place[k] + (command[shift + k] if shift >= 0 else 0.0)
-    normal = target + int(parameters[TARGET_SIZE])
+    normal, along = target + int(parameters[TARGET_SIZE]), 0.0
     if parameters[HYBRID] > 0.0:
         along = error[0] * command[normal] + error[1] * command[normal + 1] + error[2] * command[normal + 2]
         for k in range(3):
@@ -255,17 +257,20 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
         wrench[k] = force * K[k] * error[k]
         wrench[3 + k] *= moment * K[3]
     if parameters[HYBRID] > 0.0:
+        push = normal_force(command, shift, parameters, memory)
+        if parameters[APPROACH] > 0.0:
+            push = min(push, max(-parameters[K_DEFAULT] * along, 0.0))
         along = wrench[0] * command[normal] + wrench[1] * command[normal + 1] + wrench[2] * command[normal + 2]
-        along += normal_force(command, shift, parameters, memory)
+        along += push
         for k in range(3):
             wrench[k] -= along * command[normal + k]
     if memory[SINCE] == 0.0:
         update(command, parameters, frames, jacobian, memory)
-    D, N = at + 3 * n, at + 3 * n + n * n
+    D, N, follows = at + 3 * n, at + 3 * n + n * n, 1.0 - parameters[APPROACH]
     for j in range(n):
         damping, torque = 0.0, 0.0
         for k in range(n):
-            damping -= parameters[RATIO] * memory[D + j * n + k] * (dq[k] - memory[at + k])
+            damping -= parameters[RATIO] * memory[D + j * n + k] * (dq[k] - follows * memory[at + k])
             row = HEAD + k * ROW
             torque += memory[N + j * n + k] * parameters[row + K_JOINT] * (parameters[row + HOME] - q[k])
         for k in range(a):

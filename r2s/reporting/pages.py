@@ -54,7 +54,8 @@ def transfer(
     measures = measures_of(run.folder)
     shown = {label: first(e) for label, e in episodes.items()}
     for label, e in episodes.items():
-        np.savez_compressed(run.folder / f"episodes_{label}.npz", **asdict(e))
+        arrays = {name: a for name, a in asdict(e).items() if a is not None}
+        np.savez_compressed(run.folder / f"episodes_{label}.npz", **arrays)
     if stops:
         logs = {f"episode_{stop.episode + 1}": stop.log for stop in stops}
         np.savez_compressed(run.folder / "stops.npz", **logs)  # type: ignore[arg-type]

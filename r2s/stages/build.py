@@ -48,7 +48,10 @@ def make_robot(cfg):
             share = plain(cfg.robot)[key]
             for value in share if isinstance(share, list) and share else [share]:
                 check_number(f"robot.{key}", value, "[1e-6, 1]")
-    return part(cfg.robot, "robot", beside=OF_TASKS)
+    settings, task = plain(cfg.robot), plain(cfg.get("task"))
+    if isinstance(settings, dict) and settings.get("tool") is None and isinstance(task, Mapping):
+        settings = {**settings, "tool": task.get("tool")}
+    return part(settings, "robot", beside=OF_TASKS)
 
 
 def make_dynamics(cfg, robot):

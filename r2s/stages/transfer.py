@@ -14,6 +14,7 @@ from r2s.stages.adapter_factory import make_adapter
 from r2s.stages.build import (
     console,
     is_learner,
+    is_simulated,
     is_twin,
     make_controller,
     make_draw,
@@ -104,6 +105,10 @@ def make_request(cfg):
     starts, goals = fixed_episodes(robot, task, cfg.evaluation.episodes)
     if cfg.simulator.name == cfg.arm.name == "none":
         raise UserError("simulator: expected a simulator or an arm, got simulator=none and arm=none")
+    if task.touches and is_simulated(cfg) and not cfg.arm.get("surface"):
+        raise UserError(
+            f"arm.surface: {type(task).__name__} touches a surface, and this arm has none; true is allowed"
+        )
     if cfg.arm.name != "none":
         space = Space(robot)
         for k, start in enumerate(starts, 1):
@@ -204,7 +209,9 @@ def predict(cfg, request, robot):
     from r2s.tasks.rollout import rollout
 
     task, goals = request.task, request.goals
-    model = VectorArms(robot, task, request.center, len(goals), cfg.threads, request.soft_start_s)
+    model = VectorArms(
+        robot, task, task.expected(robot, request.center), len(goals), cfg.threads, request.soft_start_s
+    )
     return rollout(request.policy, model, task, request.starts, goals)
 
 

@@ -90,6 +90,7 @@ def rollout(
         t=(1 + np.arange(task.steps)) / task.ctrl_hz, q=q, dq=dq, ee=np.zeros((*shape, 3)), tau=tau,
         goal=task.goal_positions(goals), distance=distance, reward=reward, reward_smooth=reward_smooth,
         q_left=np.zeros(count), limited=np.zeros(count), collision=np.full(count, "", dtype=object),
+        force=np.zeros((*shape, 2)) if task.touches else None,
     )  # fmt: skip
     contacts = CollisionCheck(robot, table=None, may_touch=task.may_touch)
     for first in range(0, count, arms.width):
@@ -123,6 +124,8 @@ def _run(
         out.reward[now, k] = terms @ weights
         out.limited[now] += state.limited / task.steps
         out.q[now, k], out.dq[now, k], out.ee[now, k], out.tau[now, k] = state.q, state.dq, state.ee, state.tau
+        if out.force is not None:
+            out.force[now, k] = task.forces(state, goals)
         before = out.dq[now, k]
         hit = np.where(over | state.stopped, -1, contacts.first_contact(state.q))
         for i in np.flatnonzero(hit >= 0):
@@ -130,7 +133,7 @@ def _run(
         over |= hit >= 0
     stopped = arms.end() | over
     out.reward_smooth[now] = out.reward[now]
-    if arms.speeds is not None:
+    if arms.speeds is not None and not task.touches:
         rate = np.diff(arms.speeds, axis=1, prepend=0.0) * task.ctrl_hz
         for k in range(task.steps):
             t, q, ee, tau = (
@@ -202,7 +205,9 @@ def gap(one: Episodes, other: Episodes) -> dict[str, float]:
 
 def select_episodes(episodes: Episodes, which: slice | np.ndarray) -> Episodes:
     """Return the episodes at these indices."""
-    return replace(episodes, **{f.name: getattr(episodes, f.name)[which] for f in fields(episodes) if f.name != "t"})
+    arrays = {f.name: getattr(episodes, f.name) for f in fields(episodes) if f.name != "t"}
+    chosen = {name: a[which] for name, a in arrays.items() if a is not None}
+    return replace(episodes, **chosen)
 
 
 def episode_measures(task: Task, episodes: Episodes, predicted: Episodes | None = None) -> list[dict[str, float]]:

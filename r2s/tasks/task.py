@@ -35,6 +35,8 @@ class State:
         limited: (m,), share of the last control period in which the safety filter changed the command.
         noise: (m, n) rad/s, sensor noise that `measured` adds where dq is the true speed; None: dq is the measured
             speed, or sensors are exact.
+        force: (m, 3) N, what the tool exerts, in base axes: true in simulation and on twins, else what the arm
+            reports. It is for rewards and measures, not for observations. None: unknown.
     """
 
     t: np.ndarray
@@ -47,6 +49,7 @@ class State:
     stopped: np.ndarray
     limited: np.ndarray
     noise: np.ndarray | None = None
+    force: np.ndarray | None = None
 
     def measured(self) -> "State":
         """Return the state as the sensors measure it: what a policy or a controller uses."""
@@ -72,6 +75,7 @@ class Episodes:
         q_left: (E,) rad, smallest distance of any joint from its position limits.
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
+        force: (E, T, 2) N, exerted against a surface and asked for; None: the task asks for none.
     """
 
     t: np.ndarray
@@ -86,6 +90,7 @@ class Episodes:
     q_left: np.ndarray
     limited: np.ndarray
     collision: np.ndarray
+    force: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,7 @@ class Task(Protocol):
             None or 0: the noise of the arm's own sensors.
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
         may_touch: pairs of body names that may touch, or of one and "table"; other contacts end an episode.
+        touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
     """
 
     @property
@@ -144,6 +150,8 @@ class Task(Protocol):
     def measure_table(self) -> MeasureTable: ...  # noqa: D102
     @property
     def may_touch(self) -> tuple[tuple[str, str], ...]: ...  # noqa: D102
+    @property
+    def touches(self) -> bool: ...  # noqa: D102
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
         """Return (n,) Nm, the largest target torque."""
@@ -200,6 +208,14 @@ class Task(Protocol):
         """
         ...
 
+    def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
+        """Return (m, 2) N, the force against a surface and the one asked for; None: the task asks for none."""
+        ...
+
+    def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
+        """Return the dynamics with the surroundings that one expects, for predictions."""
+        ...
+
     def measures(self, episodes: Episodes) -> dict[str, float]:
         """Return one row of evaluations.csv."""
         ...
@@ -241,6 +257,7 @@ class BaseTask:
     reward_terms: tuple[str, ...] = TERMS
     speed_noise: float | None = None
     may_touch: tuple[tuple[str, str], ...] = ()
+    touches = False
     controller: Controller | None = None
 
     @property
@@ -274,6 +291,14 @@ class BaseTask:
     def goal_positions(self, goals: np.ndarray) -> np.ndarray:
         """Return the goals."""
         return goals
+
+    def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
+        """Return None: the task asks for no force."""
+        return None
+
+    def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
+        """Return the dynamics: there is nothing around the arm."""
+        return dynamics
 
     def score(self, row: Mapping[str, float]) -> float:
         """Return the score of one evaluation.

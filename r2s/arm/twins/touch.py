@@ -13,8 +13,8 @@ from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import links_of
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface
+from r2s.physics.tip import expected_plane
 
-BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the nominal surface
 PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
 
@@ -76,7 +76,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
         return None
     if robot.tool is None:
         raise UserError(f"arm.surface: {robot.name} has no tool that could touch it; give robot.tool=FILE")
-    point, normal = _expected(robot, surface)
+    point, normal = expected_plane(robot) if surface is True else _place(surface)
     # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     across /= np.linalg.norm(across)
@@ -93,16 +93,8 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     )
 
 
-def _expected(robot: Robot, surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return point, m, and normal of the place where one expects the surface."""
-    if surface is True:
-        down = robot.gravity / np.linalg.norm(robot.gravity) if robot.gravity.any() else np.array([0.0, 0.0, -1.0])
-        probe = Touch(robot, None)
-        link_frames(probe.links, robot.q_home, probe.frames, probe.axes)
-        last, tool = probe.frames[-1], robot.tool
-        ee = last[3:].reshape(3, 3) @ probe._ee[:3, 3] + last[:3]
-        tip = ee + last[3:].reshape(3, 3) @ probe._ee[:3, :3] @ tool.tip  # type: ignore[union-attr]
-        return tip + (tool.radius + BELOW * np.linalg.norm(ee)) * down, -down  # type: ignore[union-attr]
+def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return point, m, and normal of the place where the user expects the surface."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

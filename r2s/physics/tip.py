@@ -1,0 +1,69 @@
+"""Where a tool's tip is, which posture brings it to a place, and where one expects a surface."""
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.physics.robot import Robot
+
+BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the expected surface
+POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
+MARGIN = 0.1  # rad, that inverse kinematics keeps from the position limits
+CLOSE = 1e-4  # m, at which inverse kinematics ends
+ROUNDS = 60
+
+
+class Tip:
+    """Kinematics of the centre of a robot's tip in the nominal geometry.
+
+    Raises:
+        UserError: the robot has no tool.
+    """
+
+    def __init__(self, robot: Robot):
+        if robot.tool is None:
+            raise UserError(f"robot.tool: {robot.name} has no tool that could touch a surface; give robot.tool=FILE")
+        self._robot, self._tip = robot, robot.tool.tip
+        self._model = robot.model(gravity=False)
+        self._data = mujoco.MjData(self._model)
+        self._site = self._model.site(robot.ee_site).id
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the place (3,) m and its Jacobian (3, n) m/rad at q (n,) rad."""
+        d = self._data
+        d.qpos = q
+        mujoco.mj_kinematics(self._model, d)
+        place = d.site_xpos[self._site] + d.site_xmat[self._site].reshape(3, 3) @ self._tip
+        return place, np.cross(d.xaxis, place - d.xanchor).T
+
+    def posture(self, place: np.ndarray) -> np.ndarray | None:
+        """Return q (n,) rad near home with the tip at `place` (3,) m, by damped least squares; None: out of reach."""
+        r = self._robot
+        low, high = r.q_range[0] + MARGIN, r.q_range[1] - MARGIN
+        q = r.q_home.copy()
+        for _ in range(ROUNDS):
+            at, jacobian = self(q)
+            if np.linalg.norm(place - at) < CLOSE:
+                return q
+            step = np.linalg.solve(jacobian.T @ jacobian + POSTURE * np.eye(r.n), jacobian.T @ (place - at))
+            q = np.clip(q + step * min(1.0, 0.3 / np.abs(step).max()), low, high)
+        return None
+
+
+def expected_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return point (3,) m and normal (3,) of a table below the tip at home, where one expects a surface."""
+    down = robot.gravity / np.linalg.norm(robot.gravity) if robot.gravity.any() else np.array([0.0, 0.0, -1.0])
+    tip = Tip(robot)
+    place, _ = tip(robot.q_home)
+    ee = tip._data.site_xpos[tip._site]
+    return place + (robot.tool.radius + BELOW * np.linalg.norm(ee)) * down, -down  # type: ignore[union-attr]
+
+
+def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return point (3,) m and normal (3,); None: of `expected_plane`."""
+    expected = expected_plane(robot)
+    values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), expected, strict=True)]
+    for name, value in zip(("point", "normal"), values, strict=True):
+        if value.shape != (3,) or not np.isfinite(value).all() or (name == "normal" and not value.any()):
+            raise UserError(f"{name}: expected 3 numbers, got {value.tolist()}")
+    return values[0], values[1] / np.linalg.norm(values[1])
