@@ -30,7 +30,7 @@ from r2s.tasks.task import BaseTask, Episodes, ObservationTerm, State
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
 LEAST_STEP = 0.2  # of the range of forces, the smallest step
 LAG_M = 0.01  # m, by which the tip may follow its target: damping at approach_speed, and 2 N of wrong friction
-TURN_S = 0.2  # s, in which the direction of friction changes after a step
+REVERSAL_S = 0.2  # s, in which the direction of friction changes after a step
 RESIDUAL_M = 5e-3  # m, displacement of an action of 1 under the task's own controller: a quarter of 20 N on the Panda
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
 REGULAR = 1e-3  # m^2/rad^2, of the least squares of the force: blind directions of the Jacobian count as force-free
@@ -238,9 +238,9 @@ class PressTask(BaseTask):
         the farthest allowed place has the larger force. Its velocity is so small that the feedforward of friction is
         that of joints about to move: against the normal while the force rises, with it after a step down.
         """
-        turns = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / TURN_S).clip(0.0, 1.0), 0.0)
+        reversal = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = goals[:, POINT] - self._depth(t, goals)[:, None] * goals[:, NORMAL]
-        return np.concatenate([place, (self.creep * (2.0 * turns - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
+        return np.concatenate([place, (self.creep * (2.0 * reversal - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def _depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's centre is below the nominal plane at t (m,) s.
