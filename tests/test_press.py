@@ -11,7 +11,7 @@ from r2s.control.torque import torque
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_draws, fixed_episodes, make_evaluation
 from r2s.learning.model_based import hybrid_force
-from r2s.learning.randomization import contact_randomization
+from r2s.learning.randomization import ContactRandomization
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.physics.tip import Tip, expected_plane
@@ -34,7 +34,7 @@ def make_task(dynamics=TRUE, robot=PANDA, **changed):
 
 def make_draw(**changed):
     exact = {"phi_relative": 0.0, "inertia_relative": 0.0}
-    return contact_randomization(PANDA, TRUE, **DR_CONF | exact | changed)
+    return ContactRandomization(PANDA, TRUE, **DR_CONF | exact | changed)
 
 
 def pressed(task, draw, episodes=4):

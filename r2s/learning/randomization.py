@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -143,17 +144,19 @@ class ContactRandomization:
     point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
 
     Attributes:
-        arms: draws the arms. point: (3,) m, normal: (3,), of the nominal plane.
+        robot, center, phi_relative, inertia_relative, payload: see `UniformRandomization`.
+        point: (3,) m, normal: (3,), of the nominal plane; None: of a table below the tip at home.
         stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
         place: m. tilt: degrees.
 
     Raises:
-        UserError: a range that is none, or outside what a surface may have.
+        UserError: a range that is none, or outside what a surface may have; no tool.
     """
 
-    arms: UniformRandomization
-    point: np.ndarray
-    normal: np.ndarray
+    robot: Robot
+    center: Dynamics
+    phi_relative: float
+    inertia_relative: float
     stiffness: Sequence[float]
     exponent: Sequence[float]
     damping: Sequence[float]
@@ -161,8 +164,20 @@ class ContactRandomization:
     bristle: Sequence[float]
     place: float
     tilt: float
+    point: Sequence[float] | None = None
+    normal: Sequence[float] | None = None
+    payload: Sequence[float] | None = None
+
+    @cached_property
+    def _arms(self) -> UniformRandomization:
+        return UniformRandomization(self.robot, self.center, self.phi_relative, self.inertia_relative, self.payload)
+
+    @cached_property
+    def _plane(self) -> tuple[np.ndarray, np.ndarray]:
+        return nominal_plane(self.robot, self.point, self.normal)
 
     def __post_init__(self):
+        _ = self._arms, self._plane  # raise for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
             pair = getattr(self, name)
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
@@ -177,13 +192,13 @@ class ContactRandomization:
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return the dynamics of m arms."""
-        n, (least, most) = self.normal, np.log(self.stiffness)
+        (point, n), (least, most) = self._plane, np.log(self.stiffness)
         across = np.cross(n, np.eye(3)[np.abs(n).argmin()])
         across /= np.linalg.norm(across)
         about, tilt = rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, self.tilt, (m, 1)))
         aside = np.cos(about) * across + np.sin(about) * np.cross(n, across)
         surface = Surface(
-            point=self.point + rng.uniform(-self.place, self.place, (m, 1)) * n,
+            point=point + rng.uniform(-self.place, self.place, (m, 1)) * n,
             normal=np.cos(tilt) * n + np.sin(tilt) * aside,
             stiffness=np.exp(rng.uniform(least, most, m)),
             exponent=rng.choice(np.array(self.exponent, dtype=float), m),
@@ -191,33 +206,7 @@ class ContactRandomization:
             friction=rng.uniform(self.friction[0], self.friction[1], m),
             bristle=rng.uniform(self.bristle[0], self.bristle[1], m),
         )
-        return replace(self.arms(rng, m), surface=surface)
-
-
-def contact_randomization(
-    robot: Robot,
-    center: Dynamics,
-    *,
-    phi_relative: float,
-    inertia_relative: float,
-    payload: Sequence[float] | None = None,
-    point: Sequence[float] | None = None,
-    normal: Sequence[float] | None = None,
-    stiffness: Sequence[float],
-    exponent: Sequence[float],
-    damping: Sequence[float],
-    friction: Sequence[float],
-    bristle: Sequence[float],
-    place: float,
-    tilt: float,
-) -> ContactRandomization:
-    """Return draws of arms and surfaces about a nominal plane; see the two classes.
-
-    point, normal: None: a table below the tip at home.
-    """
-    arms = UniformRandomization(robot, center, phi_relative, inertia_relative, payload)
-    plane = nominal_plane(robot, point, normal)
-    return ContactRandomization(arms, *plane, stiffness, exponent, damping, friction, bristle, place, tilt)
+        return replace(self._arms(rng, m), surface=surface)
 
 
 def posterior_randomization(

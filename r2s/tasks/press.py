@@ -238,9 +238,9 @@ class PressTask(BaseTask):
         the farthest allowed place has the larger force. Its velocity is so small that the feedforward of friction is
         that of joints about to move: against the normal while the force rises, with it after a step down.
         """
-        reversal = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
+        share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = goals[:, POINT] - self._depth(t, goals)[:, None] * goals[:, NORMAL]
-        return np.concatenate([place, (self.creep * (2.0 * reversal - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
+        return np.concatenate([place, (self.creep * (2.0 * share - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def _depth(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m,) m, how far the target of the tip's centre is below the nominal plane at t (m,) s.
