@@ -1,11 +1,13 @@
 """Task press: the reference holds its force, observations and draws are what they say, and errors are one line."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from conftest import conf
+from test_cli import r2s, succeed
 
 from r2s.control.torque import torque
 from r2s.errors import UserError
@@ -225,3 +227,19 @@ def test_what_does_not_fit_is_one_line():
     with pytest.raises(UserError, match=r"algo: hybrid_force cannot do PressTask under control=torque"):
         hybrid_force(PANDA, task.controlled_by(torque(PANDA, task)), TRUE)
     assert torch.equal(hybrid_force(PANDA, task, TRUE).action(torch.zeros(2, 5)), torch.zeros(2, 3))
+
+
+@pytest.mark.slow
+def test_train_and_transfer_to_a_twin(tmp_path):
+    """From the command line: a short training improves nothing yet, but the policy touches the surface of a twin."""
+    short = "budget.env_steps=4000", "budget.minutes=null", "evaluation.episodes=2", "algo.n_envs=8", "compile=false"
+    succeed("task=press", *short, f"root={tmp_path}", "name=toy", "threads=1")
+    transfer = "stage=transfer", f"policy={tmp_path}/train/toy", "arm=twin", "evaluation.episodes=2", "threads=1"
+    refused = r2s(*transfer, f"root={tmp_path}")
+    assert refused.returncode == 2
+    assert "arm.surface: PressTask touches a surface, and this arm has none" in refused.stdout + refused.stderr
+    succeed(*transfer, "arm.surface=true", f"root={tmp_path}", "name=twin")
+    rows = json.loads((tmp_path / "transfer/twin/summary.json").read_text())
+    assert {"mujoco", "predicted", "twin"} <= set(rows)
+    assert rows["twin"]["contact"] > 0.9
+    assert rows["twin"]["force_rmse_N"] < 5.0
