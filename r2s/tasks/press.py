@@ -256,9 +256,11 @@ class PressTask(BaseTask):
         )
 
     def _spring(self) -> float:
-        """Return the stiffness, N/m, of the controller's spring."""
-        control = self.controller if isinstance(self.controller, Impedance) else self.own
-        return float(control.parameters[K_DEFAULT]) if control is not None else 1e3
+        """Return the stiffness, N/m, of the controller's spring; of the task's own one if it has none."""
+        for control in (self.controller, self.own):
+            if isinstance(control, Impedance) and control.parameters[K_DEFAULT] > 0:
+                return float(control.parameters[K_DEFAULT])
+        raise UserError("task: press needs a model of the arm; call with_model first")
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (3 n + 12,) to normalise `observe` by: the task's own scales."""
