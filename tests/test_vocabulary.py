@@ -40,7 +40,6 @@ REASONS = {
     "r2s.arm.clients.panda.Panda.__init__": YAML,
     "r2s.arm.ramp.ramp": "what a user of the protocol may set, all but two named",
     "r2s.arm.twins.make_twin.make_twin": YAML,
-    "r2s.learning.randomization.contact_randomization": YAML,
     "r2s.arm.twins.twin_base.TwinBase.__init__": YAML,
     "r2s.physics.dynamics.nominal_dynamics": YAML,
     "r2s.physics.robot.load_robot": YAML,
