@@ -39,6 +39,7 @@ from r2s.arm.drive_cycle import STILL
 from r2s.arm.driver import ADDED, DAMP_S, Driver
 from r2s.arm.emulator.control import MAX_MISSED, Fault
 from r2s.arm.interface import ArmState, StopRequested
+from r2s.arm.lifeline import Lifeline
 from r2s.arm.recorder import record
 from r2s.arm.stop_request import GRACE_S, handled_signals, watched
 from r2s.arm.twins.rigid_twin import RigidTwin
@@ -345,6 +346,31 @@ def test_a_stop_finds_what_holds_a_wrong_load(load, declared, sides, tmp_path):
     stopping = after.between(1, int(end))
     assert len(stopping.kind) <= (DAMP_S + REST_S) / SIM_DT + LAG
     assert np.abs(stopping.dq[-1]).max() < REST
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="robust mutexes of Linux")
+@pytest.mark.parametrize("end", ["killed", "released"])
+def test_a_lifeline_reports_a_death_and_nothing_else(end):
+    """The process that holds it is killed, or releases it and ends."""
+    context, lifeline = multiprocessing.get_context("fork"), Lifeline()
+    line, remote = context.Pipe()
+
+    def holds():
+        lifeline.hold()
+        remote.send("held")
+        remote.recv()
+        lifeline.release()
+
+    process = context.Process(target=holds)
+    process.start()
+    assert line.poll(60)
+    assert lifeline.lost() is None
+    if end == "killed":
+        process.kill()
+    else:
+        line.send("release")
+    process.join(60)
+    assert lifeline.lost() == ("the process of the policy has ended" if end == "killed" else None)
 
 
 def test_a_request_in_the_last_cycle_of_a_recording_counts():

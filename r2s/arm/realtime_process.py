@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated, named_signals, signal_sizes
+from r2s.arm.lifeline import Lifeline
 from r2s.arm.policy_runner import PolicyRunner, Stop, as_state
 from r2s.arm.realtime import Timing, realtime_section
 from r2s.arm.stop_request import handled_signals, parent_ended, requested, serve, watched
@@ -69,13 +70,14 @@ class Channel(NamedTuple):
     Attributes:
         command: (c,) of the controller, from the policy. state: from the arm, see `_publish`.
         end: above 0 when the policy's process has ended the episode.
-        signal: number of a signal that the policy's process received.
+        signal: number of a signal that the policy's process received. lifeline: held by the policy's process.
     """
 
     command: Slot
     state: Slot
     end: Slot
     signal: Slot
+    lifeline: Lifeline
 
     @property
     def ended(self) -> bool:
@@ -118,8 +120,8 @@ class RealtimeRunner:
         self.halted: str | None = None
         self._kinematics, self._section = Kinematics(robot), ExitStack()
         self._operator: Callable[[str], bool] | None = None
-        sizes = task.control(robot).command_size, 4 + 5 * robot.n + sum(signal_sizes(robot.n).values()), 1, 1
-        self._channel = Channel(*map(Slot, sizes))
+        command, state = task.control(robot).command_size, 4 + 5 * robot.n + sum(signal_sizes(robot.n).values())
+        self._channel = Channel(Slot(command), Slot(state), Slot(1), Slot(1), Lifeline())
         self._arguments = open_arm, robot, task, {"friction": friction, **settings}, self._channel
 
     def __enter__(self) -> "RealtimeRunner":
@@ -129,6 +131,7 @@ class RealtimeRunner:
         self._process = context.Process(target=_serve, args=(remote, os.getpid(), *self._arguments), name="arm")
         self._signals = ExitStack()
         self._signals.enter_context(handled_signals(lambda number: self._channel.signal.write(np.array([number]))))
+        self._channel.lifeline.hold()
         self._process.start()
         remote.close()
         try:
@@ -148,6 +151,7 @@ class RealtimeRunner:
             self._process.join(2 * EXIT_S)
             if not self._process.is_alive():
                 break
+        self._channel.lifeline.release()
         self._signals.__exit__(*error)  # type: ignore[arg-type]
 
     @property
@@ -251,6 +255,7 @@ def _serve(
         warm_up(robot, task, settings.get("adapter"))
         with ExitStack() as stack:
             stack.enter_context(handled_signals())
+            stack.enter_context(watched(channel.lifeline.lost))
             stack.enter_context(watched(parent_ended(parent)))
             stack.enter_context(watched(channel.signalled))
             opened = open_arm()
