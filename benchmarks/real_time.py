@@ -1,6 +1,6 @@
 """Timing of recordings and of episodes in real time against the emulated arms, on a quiet and on a loaded computer.
 
-    python benchmarks/real_time.py          five motions of each kind, then benchmarks/results/real_time.md
+    python benchmarks/real_time.py          three motions of each kind, then benchmarks/results/real_time.md
 
 The emulated control box runs at 1 kHz in a process of its own on the same computer, which a real one does not: both
 share its cores. Load: a busy loop per core, at normal priority.
@@ -25,7 +25,7 @@ from r2s.arm.warm_up import warm_up
 from r2s.excitation.motion import Excitation
 from r2s.physics.robot import SIM_DT
 
-MOTIONS, SECONDS = 5, 5.0
+MOTIONS, SECONDS = 3, 5.0
 TASK = default_task("reach")
 
 
