@@ -78,12 +78,12 @@ def judged_arm(folder: Path, words: list[str]) -> dict[str, str]:
     """Return a row of the table for an arm: errors, and normal force of a press that was not fitted."""
     folder = folder.resolve()
     run, robot = identify_arm(folder, words), replace(ROBOT, tool=load_tool(folder / "tool.json"))
-    told = json.loads((folder / "truth.json").read_text())["contact"]
-    numbers = (told["k_N_per_m"], told["exponent"], told["c_s_per_m"], told["mu"])
-    truth = Surface(np.array(told["point"]), np.array(told["normal"]), *numbers)
+    true = json.loads((folder / "truth.json").read_text())["contact"]
+    numbers = (true["k_N_per_m"], true["exponent"], true["c_s_per_m"], true["mu"])
+    truth = Surface(np.array(true["point"]), np.array(true["normal"]), *numbers)
     found = load_contact(run)
     s = score(found.surface, found.interval, truth)
-    last = max(part["t0"] for part in told["segments"] if part["kind"] == "travel")
+    last = max(part["t0"] for part in true["segments"] if part["kind"] == "travel")
     space, x = load_parameters(run, robot)
     recording = read(folder / "contact.npz", torque="commanded")
     before = identify_contact(Arm(space, x, load_posterior(run, space)), recording.select(recording.t < last))

@@ -294,9 +294,9 @@ def test_arms_of_an_independent_simulator(robot, name):
     from r2s.physics.surface import load_tool
     from r2s.recordings.readers import read
 
-    told = json.loads((ARMS / name / "truth.json").read_text())
+    true = json.loads((ARMS / name / "truth.json").read_text())
     own = replace(robot, tool=load_tool(ARMS / name / "tool.json"))
-    friction, family = told["friction"], {"sigmoid": SIGMOID, "coulomb": COULOMB, "stribeck": STRIBECK}[name]
+    friction, family = true["friction"], {"sigmoid": SIGMOID, "coulomb": COULOMB, "stribeck": STRIBECK}[name]
     if name == "sigmoid":
         phi = np.stack([friction[k] for k in ("phi1", "phi2", "phi3")], -1)
     else:
@@ -306,16 +306,16 @@ def test_arms_of_an_independent_simulator(robot, name):
         if name == "stribeck":
             pytest.skip("its truth has no place in the family's parameters; benchmarks/contact_identification.py")
         phi = np.stack(columns, -1)
-    scale = np.array(told["inertia_scale"])
+    scale = np.array(true["inertia_scale"])
     nominal = replace(
         Dynamics.of(own, phi, family),
-        offset=np.array(told["offset"]),
+        offset=np.array(true["offset"]),
         inertia=own.inertia * scale[:, None, None],
-        delay=told["delay_s"],
-        lag=told["lag_s"],
+        delay=true["delay_s"],
+        lag=true["lag_s"],
     )
     space = parameter_space(own, nominal, {"offset": [-2.0, 2.0]})
-    contact = told["contact"]
+    contact = true["contact"]
     found = identify_contact(Arm(space, space.start, None), read(ARMS / name / "contact.npz", torque="commanded"))
     truth = Surface(
         np.array(contact["point"]), np.array(contact["normal"]), contact["k_N_per_m"], contact["exponent"]

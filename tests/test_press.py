@@ -16,7 +16,7 @@ from r2s.learning.model_based import hybrid_force
 from r2s.learning.randomization import ContactRandomization
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.robot import load_robot
-from r2s.physics.tip import Tip, expected_plane
+from r2s.physics.tip import Tip, default_plane
 from r2s.tasks.press import FORCES, NORMAL, POINT, PressTask
 from r2s.tasks.task import Episodes, State, observation_scale, observe
 
@@ -92,7 +92,7 @@ def test_the_tip_meets_the_surface_no_faster_than_its_target():
 def test_surfaces_are_drawn_inside_their_ranges():
     draw = make_draw()
     surface = draw(np.random.default_rng(3), 2000).surface
-    point, normal = expected_plane(PANDA)
+    point, normal = default_plane(PANDA)
     for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
         value, (low, high) = getattr(surface, name), DR_CONF[name]
         assert low <= value.min() < value.max() <= high

@@ -35,9 +35,7 @@ class ContactGate:
         self.adapter.begin()
         self.wrench.begin()
         self.adapter.held = False
-        self._past = np.zeros(
-            (REWIND, len(self.wrench.rests))
-        )  # torques of the last cycles, the next one to overwrite
+        self._past = np.zeros((REWIND, len(self.wrench.rests)))  # torques of the last cycles
         self._cycle = 0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> np.ndarray:

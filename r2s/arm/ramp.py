@@ -96,9 +96,7 @@ def ramp(
     robot = arm.robot
     places = _poses(robot, poses)
     check_paths(robot, places, table=table, z_min=z_min)
-    small = np.minimum(1.0, robot.tau_max / 12)
-    default = np.where(robot.tau_max >= SLOW_TAU_MAX, SLOW_RATE, FAST_RATE * small)
-    rising = _positive("rate", rate, default, 0.1 * robot.dtau_max)
+    rising = _positive("rate", rate, _default_rate(robot), 0.1 * robot.dtau_max)
     limit = _positive("largest", largest, MAX_SHARE * robot.tau_max, robot.tau_max)
     if not 1e-4 <= moved <= 0.02:
         raise UserError(f"ramp.moved: {moved} rad; allowed: 0.0001 to 0.02")
@@ -128,6 +126,11 @@ def ramp(
         drive.end()
     pose, joint, sign = np.array(which).T
     return Ramps(_recording(recorded, robot.name), joint, sign, pose)
+
+
+def _default_rate(robot: Robot) -> np.ndarray:
+    small = np.minimum(1.0, robot.tau_max / 12)
+    return np.where(robot.tau_max >= SLOW_TAU_MAX, SLOW_RATE, FAST_RATE * small)
 
 
 def _recording(ramps: list[list], name: str) -> Recording:

@@ -15,7 +15,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import FARTHEST_M, MOST_KG, Payload, dynamics_with_payload, sphere_inertia
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
-from r2s.physics.tip import nominal_plane
+from r2s.physics.tip import nominal_plane, tilted
 
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or of one for all
 
@@ -193,13 +193,10 @@ class ContactRandomization:
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return the dynamics of m arms."""
         (point, n), (least, most) = self._plane, np.log(self.stiffness)
-        across = np.cross(n, np.eye(3)[np.abs(n).argmin()])
-        across /= np.linalg.norm(across)
         about, tilt = rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, self.tilt, (m, 1)))
-        aside = np.cos(about) * across + np.sin(about) * np.cross(n, across)
         surface = Surface(
             point=point + rng.uniform(-self.place, self.place, (m, 1)) * n,
-            normal=np.cos(tilt) * n + np.sin(tilt) * aside,
+            normal=tilted(n, about, tilt),
             stiffness=np.exp(rng.uniform(least, most, m)),
             exponent=rng.choice(np.array(self.exponent, dtype=float), m),
             damping=rng.uniform(self.damping[0], self.damping[1], m),

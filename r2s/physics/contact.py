@@ -34,19 +34,8 @@ COLUMNS = DEPTH + 1
 ROWS = 4  # of the Jacobian: normal, and the tangential part of x, y and z
 # Columns of a guess. RATE: of the depth, and SLIDE (3): tangential velocity, at the beginning of the step. NEXT and
 # SPEED: their guess for its end. BEGIN: m, where the path begins. LINEAR and SLID (3): force and velocity found.
-RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE, SPRING, DAMPER, LINEAR, SLID = (
-    0,
-    1,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    12,
-)
+RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
+SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
 GUESS = SLID + 3
 
 RIGID = 1e-6  # m, `bristle` of a surface without one: a fiftieth of an encoder's step at a tip

@@ -1,4 +1,4 @@
-"""Where a tool's tip is, which posture brings it to a place, and where one expects a surface."""
+"""Where a tool's tip is, which posture brings it to a place, and the nominal place of a surface."""
 
 import mujoco
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.robot import Robot
 
-BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the expected surface
+BELOW = 0.15  # of the end effector's distance from the base at home: from the tip down to the nominal surface
 POSTURE = 1e-3  # m^2, weight of the start posture in the inverse kinematics
 MARGIN = 0.1  # rad, that inverse kinematics keeps from the position limits
 CLOSE = 1e-4  # m, at which inverse kinematics ends
@@ -50,8 +50,16 @@ class Tip:
         return None
 
 
-def expected_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and normal (3,) of a table below the tip at home, where one expects a surface."""
+def tilted(normal: np.ndarray, about: np.ndarray | float, tilt: np.ndarray | float) -> np.ndarray:
+    """Return a normal (3,) tilted by `tilt` rad in the direction `about` rad; of (m, 1) angles: (m, 3)."""
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    across /= np.linalg.norm(across)
+    aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)
+    return np.cos(tilt) * normal + np.sin(tilt) * aside
+
+
+def default_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return point (3,) m and normal (3,) of a table below the tip at home."""
     down = robot.gravity / np.linalg.norm(robot.gravity) if robot.gravity.any() else np.array([0.0, 0.0, -1.0])
     tip = Tip(robot)
     place, _ = tip(robot.q_home)
@@ -60,9 +68,9 @@ def expected_plane(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return point (3,) m and normal (3,); None: of `expected_plane`."""
-    expected = expected_plane(robot)
-    values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), expected, strict=True)]
+    """Return point (3,) m and normal (3,); None: of `default_plane`."""
+    default = default_plane(robot)
+    values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):
         if value.shape != (3,) or not np.isfinite(value).all() or (name == "normal" and not value.any()):
             raise UserError(f"{name}: expected 3 numbers, got {value.tolist()}")

@@ -213,7 +213,7 @@ class Task(Protocol):
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
-        """Return the dynamics with the surroundings that one expects, for predictions."""
+        """Return the dynamics with the nominal surroundings, for predictions."""
         ...
 
     def measures(self, episodes: Episodes) -> dict[str, float]:

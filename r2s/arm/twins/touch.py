@@ -7,13 +7,12 @@ import numpy as np
 
 from r2s.errors import UserError, nearest
 from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, ROWS, TIP, contact_columns, near
-from r2s.physics.description import chain
-from r2s.physics.dynamics import Dynamics
 from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import links_of
+from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface
-from r2s.physics.tip import expected_plane
+from r2s.physics.tip import default_plane, tilted
 
 PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
@@ -35,10 +34,9 @@ class Touch:
         self.there, self.contact = surface is not None, np.zeros(COLUMNS)
         self.jacobian, self.frames, self.axes = np.zeros((ROWS, n)), np.zeros((n, POSE)), np.zeros((n, 3))
         self.links = links_of(robot, robot.mass, robot.com, robot.inertia)
-        self._ee = chain(robot, Dynamics.of(robot, np.zeros((n, 3))), friction=False)[1]
+        self._ee = ee_pose(robot)[0]
         if surface is not None:
             self.contact[:] = contact_columns(robot, surface)
-            self.contact[TIP : TIP + 3] = self._ee[:3, :3] @ robot.tool.tip + self._ee[:3, 3]  # type: ignore[union-attr]
 
     def start(self, q: np.ndarray) -> float:
         """Return the depth, m, of the tip at rest at q (n,) rad; it has not slid there."""
@@ -60,12 +58,12 @@ class Touch:
         R, normal = last[3:].reshape(3, 3), self.contact[NORMAL : NORMAL + 3]
         place = last[:3] + R @ self.contact[TIP : TIP + 3] - self.contact[RADIUS] * normal
         torque = (self.axes * np.cross(place - self.frames[:, :3], force)).sum(1)
-        arm = place - last[:3] - R @ self._ee[:3, 3]
+        arm = place - last[:3] - R @ self._ee
         return torque, np.concatenate([force, np.cross(arm, force)])
 
 
 def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | None:
-    """Return a twin's surface near the place where one expects it; U: uniform.
+    """Return a twin's surface near its nominal place; U: uniform.
 
     surface: False: none. True: a table below the tip at home. {point: m, normal}: that place.
 
@@ -76,15 +74,12 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
         return None
     if robot.tool is None:
         raise UserError(f"arm.surface: {robot.name} has no tool that could touch it; give robot.tool=FILE")
-    point, normal = expected_plane(robot) if surface is True else _place(surface)
+    point, normal = default_plane(robot) if surface is True else _place(surface)
     # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    across /= np.linalg.norm(across)
     about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
-    aside = np.cos(about) * across + np.sin(about) * np.cross(normal, across)
     return Surface(
         point=point + rng.uniform(-PLACE, PLACE) * normal,
-        normal=np.cos(tilt) * normal + np.sin(tilt) * aside,
+        normal=tilted(normal, about, tilt),
         stiffness=float(np.exp(rng.uniform(*np.log(STIFFNESS)))),
         exponent=float(rng.choice([1.0, 1.5])),
         damping=float(rng.uniform(0.5, 3.0)),  # s/m
@@ -94,7 +89,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return point, m, and normal of the place where the user expects the surface."""
+    """Return point, m, and normal of the nominal place."""
     if not isinstance(surface, Mapping):
         raise UserError(f"arm.surface: expected false, true or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2s.compiled import njit
+from r2s.physics.contact import RIGID
 from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import links_of
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface, normal_force
-
-RIGID = 1e-6  # m, deflection of a surface whose bristles are stiffer than encoders resolve
 
 
 @dataclass(frozen=True)
