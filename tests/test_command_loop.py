@@ -26,9 +26,10 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.arm.stop_request import handled_signals, watched
 from r2s.arm.tracking_controller import CORRECTION_SHARE, MAX_DEVIATION, TrackingController
 from r2s.errors import UserError
+from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
-from r2s.excitation.motion_checks import Space, allowed_deviation
+from r2s.excitation.motion_checks import Space
 from r2s.excitation.paths import check_path
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
@@ -134,7 +135,7 @@ def test_every_command_comes_from_a_driver(monkeypatch):
 def test_a_held_recording_is_bounded():
     """A recording pushes with at most its plan and CORRECTION_SHARE, plus what brakes the link; then it gives up."""
     plan, arm = motion(2.0, 0.8), LoggedArm(hold_from=0.7)
-    allowed = allowed_deviation(Space(PANDA), plan, MAX_DEVIATION)
+    allowed = DeviationLimits.along(Space(PANDA), plan, MAX_DEVIATION)
     with pytest.raises(ArmStopped, match=r"joint 1 is 0.\d+ rad off its path, allowed") as stopped:
         record(arm, plan)
     feedforward = TrackingController(PANDA, plan)._feedforward[:, 0]
@@ -146,7 +147,8 @@ def test_a_held_recording_is_bounded():
     assert np.abs(arm.commands[-1]).max() < 1.0
     assert len(stopped.value.recording.t) > caught  # the rows so far are kept
     end = len(stopped.value.recording.t)
-    assert np.abs(plan.q[end, 0] - arm.read().q[0]) >= allowed[end] - 1e-3
+    off = np.abs(plan.q[end] - arm.read().q) + 1e-3
+    assert allowed.share(end, off).sum(1).max() >= 1
 
 
 def test_a_requested_stop_keeps_its_reason():
@@ -163,7 +165,7 @@ def test_a_requested_stop_keeps_its_reason():
 def test_the_adaptive_estimate_is_bounded():
     """The estimate of a joint that is held off its plan stays within plausible friction and offset."""
     plan, arm = motion(4.0, 0.8), LoggedArm()
-    tracker, state = TrackingController(PANDA, plan, max_deviation=np.inf), arm.read()
+    tracker, state = TrackingController(PANDA, plan, DeviationLimits.uniform(7, np.inf)), arm.read()
     for k in range(len(plan.t)):
         target = tracker(k, state)
     assert (np.abs(tracker._theta) <= tracker._theta_max).all()

@@ -17,16 +17,9 @@ from r2s.arm.tracking_controller import (
     TrackingController,
 )
 from r2s.errors import UserError
+from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.motion import Excitation
-from r2s.excitation.motion_checks import (
-    TABLE_M,
-    TOOL_M,
-    Space,
-    allowed_deviation,
-    check_limits,
-    check_space,
-    friction_margin,
-)
+from r2s.excitation.motion_checks import TABLE_M, TOOL_M, Space, check_limits, check_space, friction_margin
 from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
@@ -63,8 +56,8 @@ def record(
         timing: receives the durations of the cycles.
 
     Raises:
-        ArmStopped: the arm or the driver ended the motion, the arm deviated from the plan by more than the
-            `allowed_deviation`, or in real time it missed more than 1 % of the commands; the exception's `recording`
+        ArmStopped: the arm or the driver ended the motion, the arm deviated from the plan by more than its
+            `DeviationLimits`, or in real time it missed more than 1 % of the commands; the exception's `recording`
             holds the rows so far.
         UserError: the excitation is not allowed.
 
@@ -74,8 +67,8 @@ def record(
     _check(arm.robot, excitation, share)
     check_space(arm.robot, excitation, table=table, z_min=z_min)
     follow, most = (LoadedTrackingController, LOADED_DEVIATION) if loaded else (TrackingController, MAX_DEVIATION)
-    room = allowed_deviation(Space(arm.robot, table=table, z_min=z_min), excitation, most)
-    controller = follow(arm.robot, excitation, room)
+    allowed = DeviationLimits.along(Space(arm.robot, table=table, z_min=z_min), excitation, most)
+    controller = follow(arm.robot, excitation, allowed)
     limits = TORQUE_SHARE * arm.robot.tau_max, 2 * friction_margin(arm.robot)
     fence = CollisionCheck(arm.robot, table=table)
     loop = CommandLoop(arm, Driver(arm.robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=share))

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from r2s.arm.interface import ArmState
+from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import friction_margin
 from r2s.physics.newton_euler import WORK, equations, links_of
@@ -37,11 +38,11 @@ class TrackingController:
 
     Args:
         robot: the nominal model. excitation: the plan.
-        max_deviation: (T,) or one number, rad, largest allowed deviation of a joint from the plan.
+        allowed: deviations from the plan; None: MAX_DEVIATION of each joint.
     """
 
-    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: np.ndarray | float = MAX_DEVIATION):
-        self._plan, self._max_deviation = excitation, np.broadcast_to(max_deviation, len(excitation.t))
+    def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
+        self._plan, self._allowed = excitation, allowed or DeviationLimits.uniform(robot.n, MAX_DEVIATION)
         self._feedforward, self._mass = _inverse_dynamics(robot, excitation)
         dq = excitation.dq
         basis = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
@@ -72,12 +73,16 @@ class TrackingController:
     def deviation(self, k: int, state: ArmState) -> str | None:
         """Return the message for a joint that deviates too far from the plan in cycle k, or None."""
         deviation = np.abs(self._plan.q[k] - state.q)
-        if (deviation <= self._max_deviation[k]).all():
+        share = self._allowed.share(k, deviation)
+        total = share.sum(1)
+        if (total <= 1).all():
             return None
-        i = int(deviation.argmax())
+        worst = int(total.argmax())
+        i = int(share[worst].argmax())
+        off = deviation[i]
         return (
-            f"joint {i + 1} is {deviation[i]:.3f} rad off its path, allowed {self._max_deviation[k]:.3g} rad: an "
-            "obstacle blocks it, or it cannot follow"
+            f"joint {i + 1} is {off:.3f} rad off its path, allowed {off / total[worst]:.3g} rad: an obstacle "
+            "blocks it, or it cannot follow"
         )
 
 
@@ -88,8 +93,8 @@ class LoadedTrackingController(TrackingController):
     larger deviation and a larger correction.
     """
 
-    def __init__(self, robot: Robot, excitation: Excitation, max_deviation: np.ndarray | float = LOADED_DEVIATION):
-        super().__init__(robot, excitation, max_deviation)
+    def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
+        super().__init__(robot, excitation, allowed or DeviationLimits.uniform(robot.n, LOADED_DEVIATION))
         half = np.array(0.5 * MOST_KG)
         payload = Payload(half, np.zeros(3), sphere_inertia(half))
         links = with_payload(robot, payload, (robot.mass, robot.com, robot.inertia))

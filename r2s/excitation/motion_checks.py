@@ -120,7 +120,7 @@ def check_derivatives(robot: Robot, motion: Motion) -> None:
 
 def check_torque(robot: Robot, motion: Motion) -> None:
     """Raise UserError if the nominal model and friction need more than 80 % of a torque limit."""
-    rows = _every(motion)
+    rows = geometry_rows(motion)
     share = torque_share(robot, motion.q[rows], motion.dq[rows], motion.ddq[rows])
     bad = np.argwhere(~(share <= TORQUE_SHARE))
     if len(bad):
@@ -136,14 +136,8 @@ def check_torque(robot: Robot, motion: Motion) -> None:
 def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
     """Raise UserError if a link comes too near to the table or to another link; paths.py checks the approach."""
     space = Space(robot, table=table, z_min=z_min)
-    rows = _every(motion)
+    rows = geometry_rows(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
-
-
-def allowed_deviation(space: "Space", motion: Motion, most: float) -> np.ndarray:
-    """Return (T,) rad, `Space.deviations` along a motion, at most `most`."""
-    rows = _every(motion)
-    return np.interp(motion.t, motion.t[rows], space.deviations(motion.q[rows], most))
 
 
 def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
@@ -177,11 +171,11 @@ def friction_margin(robot: Robot) -> np.ndarray:
 class Space:
     """Distances of an arm's links from the table and from each other; see `collision` for the geoms that count.
 
-    An arm is not exactly where it was planned to be. If no joint deviates by more than e rad, a distance shrinks by
-    at most e times its lever, to first order: the sum over the joints that change it of how far a rad of that joint
-    moves the link, from the Jacobian at that posture. A planned posture must leave room for DEVIATION, and a plan is
-    followed only as long as the arm is within `deviations`, which are larger where there is room. So no plan is
-    refused for a deviation that the arm never has, and an arm that deviates stops before it comes near.
+    An arm is not exactly where it was planned to be. If joint j deviates by e_j rad, a distance shrinks by at most
+    sum_j lever_j |e_j|, to first order: the lever is how far a rad of that joint moves the link, from the Jacobian at
+    that posture. A planned posture must leave room for DEVIATION of all joints, and a plan is followed only as long
+    as the arm is within its `DeviationLimits`, which are larger where there is room. So no plan is refused for a
+    deviation that the arm never has, and an arm that deviates stops before it comes near.
 
     Attributes:
         clearance: (K,) m, required distances: end effector above z_min (for the search only: `gaps` does not subtract
@@ -217,33 +211,24 @@ class Space:
         need = np.minimum(CLEARANCE_M, 0.5 * at_home)  # an arm with a low home posture must be able to return to it
         self.clearance = np.array([CLEARANCE_M, *need, *(CLEARANCE_M for _ in self.pairs)])
         # more than half of the distance at home is never asked for, so that an arm may return to a low posture
-        self._most = np.maximum(0.5 * self._measured(robot.q_home[None])[0][0], self.clearance)
+        self._most = np.maximum(0.5 * self.measured(robot.q_home[None])[0][0], self.clearance)
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
         """Return distances minus what they have to be, (T, K) m, at postures q (T, n) rad; negative: too near."""
-        distances, levers = self._measured(q)
+        distances, levers = self.measured(q)
         return distances - self._needed(levers)
 
-    def deviations(self, q: np.ndarray, most: float) -> np.ndarray:
-        """Return the deviation (T,) rad of all joints, at most `most`, that clears the fence at q (T, n) rad.
-
-        It is DEVIATION where `gaps` are 0, and nowhere less: an arm that starts too near must be able to leave.
-        """
-        distances, levers = self._measured(q)
-        allowed = (distances[:, 1:] - FENCE_M) / np.maximum(levers[:, 1:], 1e-9)
-        return np.clip(allowed.min(1, initial=most), min(DEVIATION, most), most)
-
     def _needed(self, levers: np.ndarray) -> np.ndarray:
-        """Return the distances (T, K) m that are asked for; that of the end effector is its height above z_min."""
-        need = np.clip(FENCE_M + self._deviation * levers, self.clearance, self._most)
+        """Return the required distances (T, K) m for levers (T, K, n); 0 for the end effector."""
+        need = np.clip(FENCE_M + self._deviation * levers.sum(2), self.clearance, self._most)
         need[:, 0] = 0.0
         return need
 
-    def _measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distances (T, K) m and their levers (T, K) m/rad, 0 for the end effector."""
+    def measured(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances (T, K) m and the joints' levers on them (T, K, n) m/rad, 0 for the end effector."""
         tip, apart = np.empty((len(q), 1)), np.empty((len(q), len(self.pairs)))
         places, frames = (np.empty((len(q), self.model.ngeom, k)) for k in (3, 9))
-        levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs)))
+        levers = np.zeros((len(q), 1 + len(self.above) + len(self.pairs), q.shape[1]))
         for k, posture in enumerate(q):
             self._pose(posture)
             tip[k] = self.data.site_xpos[self.site, 2]
@@ -253,18 +238,18 @@ class Space:
         return np.hstack([tip - self.floor, self._heights(places, frames) - self.table, apart]), levers
 
     def _levers(self) -> np.ndarray:
-        """Return the most by which a rad of all joints changes each distance, (K - 1,) m/rad, at the present q."""
+        """Return the most by which a rad of each joint changes each distance, (K - 1, n) m/rad, at the present q."""
         d, radius, link = self.data, self.model.geom_rbound, self._link
         arm = d.geom_xpos[:, None] - d.xanchor
         moved = np.cross(d.xaxis, arm)  # (ngeom, n, 3) of each geom's centre
         joint = np.arange(len(d.xaxis))
         up = np.abs(moved[:, :, 2]) + radius[:, None] * np.hypot(*d.xaxis.T[:2])
-        lifted = np.where(joint < link[:, None], up, 0.0)[self.above].sum(1)
+        lifted = np.where(joint < link[:, None], up, 0.0)[self.above]
         far = np.linalg.norm(moved, axis=2) + radius[:, None]
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         between = (joint >= link[a, None]) & (joint < link[b, None])
         # at the nearest points of two links the joints between them move one link as fast as the other
-        return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0).sum(1)])
+        return np.concatenate([lifted, np.where(between, np.minimum(far[a], far[b]), 0.0)])
 
     def check(self, q: np.ndarray, when: Callable[[int], str]) -> None:
         """Raise UserError at the first posture of q (T, n) that is too near; `when(k)` describes row k."""
@@ -276,7 +261,7 @@ class Space:
 
     def explain(self, which: int, q: np.ndarray, when: str) -> str:
         """Return the error for column `which` of `gaps` at q (n,) rad."""
-        distances, levers = self._measured(q[None])
+        distances, levers = self.measured(q[None])
         seen, allowed = distances[0, which], self._needed(levers)[0, which]
         if which == 0:
             seen += self.floor
@@ -333,7 +318,7 @@ class Space:
                 return np.full(len(up), m.geom_rbound[g])
 
 
-def _every(motion: Motion) -> np.ndarray:
+def geometry_rows(motion: Motion) -> np.ndarray:
     """Return row indices at GEOMETRY_HZ, with the last row."""
     rows = np.arange(0, len(motion.t), max(1, round(1 / (GEOMETRY_HZ * SIM_DT))))
     return np.union1d(rows, [len(motion.t) - 1])

@@ -22,9 +22,10 @@ from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes
 from r2s.arm.realtime import realtime_section
 from r2s.arm.tracking_controller import CUTOFF_HZ, TrackingController
 from r2s.errors import UserError, check_number
+from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
-from r2s.excitation.motion_checks import Space, allowed_deviation, friction_margin
+from r2s.excitation.motion_checks import Space, friction_margin
 from r2s.excitation.paths import approach
 from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
@@ -275,8 +276,8 @@ class Franka:
         """Follow the straight joint path to q (7,) rad."""
         path, moving = _slow_path(self.robot, self._state.q, q, self.speed_share)
         assert self._space is not None  # of `_plan`
-        room = allowed_deviation(self._space, path, MAX_DEVIATION)
-        controller, loop = TrackingController(self.robot, path, room), self._loop
+        allowed = DeviationLimits.along(self._space, path, MAX_DEVIATION)
+        controller, loop = TrackingController(self.robot, path, allowed), self._loop
         limit = INTEGRAL_SHARE * self.robot.tau_max
         integral, last_error = np.zeros(7), np.zeros(7)
         loop.begin()
