@@ -11,10 +11,22 @@ from r2s.compiled import njit
 from r2s.physics.actuation import condition
 from r2s.physics.control_laws import BUILT_IN, chain, control_law
 from r2s.physics.fence import Fence, breached
+from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import WORK as DESK
 from r2s.physics.newton_euler import equations
+from r2s.physics.push_limit import limit_pushes
 from r2s.physics.robot import SIM_DT
-from r2s.physics.safety_filter import BRAKE_S, DQ_ALLOWED, STEP, TAU_MAX, WORK, JointDynamics, filter_torque
+from r2s.physics.safety_filter import (
+    BRAKE_S,
+    DQ_ALLOWED,
+    STEP,
+    TAU_MAX,
+    WORK,
+    JointDynamics,
+    fade,
+    limit_acceleration,
+    limit_rate,
+)
 
 STILL = 0.02  # rad/s, below which a joint is at rest
 # rad/s: a joint that goes on sliding while it is brought to rest meets a spring of this frequency, as a change of the
@@ -39,6 +51,7 @@ class Memory(NamedTuple):
         why: (m,), RUNS or why the arm is brought to rest. limited: (m,), cycles that the safety filter changed.
         rests: (m,), whether the arm is at rest. commanded: (m,), whether there was a command.
         least: (m, K) m, least distance of each pair of the fence.
+        push: (m, COLUMNS of push_limit.py), the limit of pushes and what it keeps; (m, 0): without.
     """
 
     command: np.ndarray
@@ -57,14 +70,16 @@ class Memory(NamedTuple):
     rests: np.ndarray
     commanded: np.ndarray
     least: np.ndarray
+    push: np.ndarray
 
     @staticmethod
-    def fresh(m: int, n: int, command: int, law: int, pairs: int) -> "Memory":
+    def fresh(m: int, n: int, command: int, law: int, pairs: int, push: np.ndarray) -> "Memory":
         """Return the state of m arms of n joints before their first cycle, without torque."""
         own = np.zeros((m, command)), np.zeros((m, law))
         count, flags = np.zeros((5, m), dtype=np.int64), np.zeros((2, m), dtype=bool)
         least = np.full((m, pairs), -np.inf)
-        return Memory(*own, *np.zeros((5, m, n)), np.ones(m), *count, *flags, least)  # type: ignore[call-arg]
+        own_push = np.tile(push, (m, 1))
+        return Memory(*own, *np.zeros((5, m, n)), np.ones(m), *count, *flags, least, own_push)  # type: ignore[call-arg]
 
 
 class Given(NamedTuple):
@@ -167,6 +182,16 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
             target[j] += faded * min(max(given.added[i, j], -most), most)
 
 
+@njit(cache=True)
+def _push(limit, arm, share, model, last, out):
+    """Limit the push of the torques `out` (n,) Nm; see push_limit.py."""
+    n = len(out)
+    frames, axes = np.empty((n, POSE)), np.empty((n, 3))
+    link_frames(model.links, arm.q, frames, axes)
+    hand = frames[n - 1, :3], frames[n - 1, 3:]
+    return limit_pushes(limit, arm, hand, (frames, axes), last, share, model.friction, model.limits, out)
+
+
 def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     """Return the commands (m, n) Nm of this cycle.
 
@@ -215,7 +240,12 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
             share, now = memory.share[i], effort[0, 0]
             _compensate(i, dq[i], stopping, given, bounds, memory, now)
             arm = JointDynamics(q[i], dq[i], mass, bias)
-            changed = filter_torque(arm, now, last, share, model.friction, limits, work, out[i])
+            changed = fade(q[i], dq[i], now, limits, out[i])
+            if len(memory.push[i]) == 0:
+                changed |= limit_acceleration(arm, share, model.friction, limits, work, out[i])
+            else:
+                changed |= _push(memory.push[i], arm, share, model, last, out[i])
+            limit_rate(last, limits, out[i])
             memory.limited[i] += changed
         else:
             for j in range(n):

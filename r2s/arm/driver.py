@@ -34,6 +34,7 @@ from r2s.physics.collision import CollisionCheck, empty_scene
 from r2s.physics.control_laws import BUILT_IN, ControlLaw, law_number, registered, torque_law
 from r2s.physics.fence import Fence
 from r2s.physics.newton_euler import links_of
+from r2s.physics.push_limit import PushLimit
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
@@ -64,6 +65,7 @@ class DriverBatch:
             robot's. control: control law; None: commands are torques (n,) Nm.
         fence: the arm is stopped before it touches itself or the table; None: without.
         speed_share: share of all allowed speeds, in (0, 1].
+        push_limit: of force and speed of contacts of the robot's tool; None: without.
     """
 
     def __init__(
@@ -80,10 +82,12 @@ class DriverBatch:
         control: ControlLaw | None = None,
         fence: CollisionCheck | None = None,
         speed_share: float = 1.0,
+        push_limit: PushLimit | None = None,
     ):
         self._shape, self._fence, self._speed_share = (m, robot.n), fence, speed_share
         own = (robot.n, 0) if control is None else (control.command_size, control.memory_size)
         self._sizes = *own, 0 if fence is None else len(fence.names)
+        self._push = np.zeros(0) if push_limit is None else push_limit.columns(robot)
         number = law_number(torque_law if control is None else control.law)
         self._control = float(number), np.zeros(0) if control is None else control.parameters
         self._drive = compiled_cycle(registered() if number >= len(BUILT_IN) else BUILT_IN)
@@ -115,7 +119,7 @@ class DriverBatch:
 
     def reset(self) -> None:
         """Begin a motion, from zero torque."""
-        self._memory = Memory.fresh(*self._shape, *self._sizes)
+        self._memory = Memory.fresh(*self._shape, *self._sizes, self._push)
         self.stopping: list[str | None] = [None] * self._shape[0]
 
     @property

@@ -104,6 +104,10 @@ def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
 def check_exportable(robot: Robot, task: Task) -> None:
     """Raise UserError if a runtime, which takes a point or a plan of `TrackTask`, cannot run a task."""
     control = task.control(robot)
+    if task.push_limit is not None:
+        raise UserError(
+            "export: the runtime of a bundle does not limit pushes (safety.force_max); stage=transfer runs it"
+        )
     if isinstance(control, ComputedTorque) and control.model.dynamics.family.name not in FRICTION:
         raise UserError(
             f"export: the runtime of a bundle has no friction of family '{control.model.dynamics.family.name}'; "

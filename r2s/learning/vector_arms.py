@@ -46,7 +46,7 @@ class VectorArms:
         self.robot, self.width = robot, width
         torque, self._period = task.torque_limit(robot), 1 / task.ctrl_hz
         self.sim = Simulator(robot, dynamics, width, nthread, control=task.control(robot))
-        self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s)
+        self.sim.drive(filter_limits(robot, torque), torque, task.cutoff_hz, soft_start_s, task.push_limit)
         self._substeps, self._none = task.substeps, np.zeros((width, task.substeps, robot.n))
         self.speeds = None
         self._limited = np.zeros(width)  # cycles before the last step

@@ -32,7 +32,9 @@ from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
 from r2s.physics.control_laws import chain, control_law, registered
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.linear_algebra import packed_element
-from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, filter_torque
+from r2s.physics.push_limit import COLUMNS as PUSH_COLUMNS
+from r2s.physics.push_limit import limit_pushes
+from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, fade, limit_acceleration, limit_rate
 from r2s.physics.safety_filter import STEP as TAU_STEP
 from r2s.physics.stick_slip import TINY, JointForces, any_reversal, coming_velocity
 
@@ -48,15 +50,16 @@ LIMITS = LEVEL + 1  # of the safety filter, COLUMNS wide; 0: no filter
 # The path of a command: number of the control law (NO_CONTROL: `rollout` gives efforts), cycles of the soft start,
 # factor of the low-pass, largest target Nm, and the sizes of command, memory and parameters of the law in `userdata`
 CONTROL, FADE, LOW_PASS, TARGET_MAX, COMMANDS, MEMORIES, PARAMETERS = range(LIMITS + COLUMNS, LIMITS + COLUMNS + 7)
-CONTACT = PARAMETERS + 1  # where the contact (contact.py) begins in `userdata`; 0: nothing is touched
-WIDTH = CONTACT + 1
+# Where the contact (contact.py) and the limit of pushes (push_limit.py) begin in `userdata`; 0: without
+CONTACT, PUSH = PARAMETERS + 1, PARAMETERS + 2
+WIDTH = PUSH + 1
 NO_CONTROL = -1.0
 MARKER = 7_202_020.0
 # Rows of `joint`, which a step computes. REST and EDGES have two each, of the negative and the positive direction.
 SPEED, FORCE, FRICTION, LOADED, COMING, REST, EDGES, ROWS = 0, 1, 2, 3, 4, 5, 7, 9
 # Rows of n in `userdata`: bristles, last command, motor state, cycle count (one number), number of cycles that the
 # safety filter changed (one number), low-pass state, effort, noise of the measured speeds, and SLOTS of commands.
-# Behind them: command, memory and parameters of the control law, and the contact of a robot with a tool.
+# Behind them: command, memory and parameters of the control law; of a robot with a tool its push limit and contact.
 BRISTLE, SENT, MOTOR, CYCLE, LIMITED, FILTERED, EFFORT, NOISE, LINE = range(9)
 KEPT = LINE + SLOTS
 USUAL = 7  # joints that the driver's part is compiled for; others run slower
@@ -181,12 +184,13 @@ def _force_at(at: dict[str, int]) -> Callable:
         user = carray(_as_doubles(model[user_at]), (n, WIDTH))  # type: ignore[call-arg]
         if user[0, LIMITS + TAU_MAX] > 0.0 and user[0, MARK] == MARKER:
             fields = data[q_at], data[dq_at], data[applied_at], data[bias_at], data[mass_at], data[memory_at]
+            places = data[xpos_at], data[xmat_at], data[anchor_at], data[axis_at]
             if user[0, CONTROL] != NO_CONTROL:
                 _control(n, model[user_at], fields)
             if n == USUAL:
-                _drive(USUAL, model[user_at], fields)
+                _drive(USUAL, model[user_at], fields, places)
             else:
-                _drive(n, model[user_at], fields)
+                _drive(n, model[user_at], fields, places)
         sizes = n, model[nbody_at]
         forces = model[damping_at], data[applied_at], data[passive_at], data[bias_at], data[mass_at], data[memory_at]
         _friction(
@@ -284,13 +288,13 @@ def _control(n, user, fields):
 
 
 @njit(error_model="numpy", forceinline=True)
-def _drive(n, user, fields):
+def _drive(n, user, fields, places):
     """Replace the applied torques by those behind conditioning, safety filter and motors.
 
     numba compiles a constant n into the code: loops unroll, and the filter takes half the time (benchmarks/law.py).
 
     Args:
-        n: number of joints. user, fields: addresses of MuJoCo's arrays.
+        n: number of joints. user, fields, places: addresses of MuJoCo's arrays.
     """
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
@@ -309,10 +313,27 @@ def _drive(n, user, fields):
     sent = kept[LINE + cycle % SLOTS]
     level, limits = user[:, LEVEL], user[:, LIMITS : LIMITS + COLUMNS]
     arm = JointDynamics(q, dq, mass, bias)
-    kept[LIMITED, 0] += filter_torque(arm, applied, kept[SENT], 1.0, level, limits, desk, sent)
+    changed = fade(q, dq, applied, limits, sent)
+    at = int(user[0, PUSH])
+    if at == 0:
+        changed |= limit_acceleration(arm, 1.0, level, limits, desk, sent)
+    else:
+        limit = carray(_as_doubles(fields[5]), (at + PUSH_COLUMNS,))[at:]  # type: ignore[call-arg]
+        changed |= _push(limit, arm, int(user[n - 1, BODY]), places, kept[SENT], (level, limits), sent)
+    limit_rate(kept[SENT], limits, sent)
+    kept[LIMITED, 0] += changed
     kept[SENT, :] = sent
     motor_torque(kept[LINE:], kept[MOTOR], cycle, user[0, DELAY], user[0, LAG], applied)
     kept[CYCLE, 0] += 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _push(limit, arm, body, places, last, bounds, sent):
+    """Limit the push of the command `sent` (n,) Nm; see push_limit.py. places: xpos, xmat, xanchor, xaxis."""
+    n = len(sent)
+    xpos, xmat = carray(_as_doubles(places[0]), (body + 1, 3)), carray(_as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
+    joints = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
+    return limit_pushes(limit, arm, (xpos[body], xmat[body]), joints, last, 1.0, bounds[0], bounds[1], sent)
 
 
 @njit(cache=True, error_model="numpy")

@@ -128,11 +128,27 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
         friction: (n,) Nm, estimated friction, at least 0.
         limits: (n, COLUMNS) of `filter_limits`. work: (2 n + WORK, n), any content.
     """
+    fades = fade(arm.q, arm.dq, effort, limits, out)
+    changed = limit_acceleration(arm, share, friction, limits, work, out)
+    limit_rate(last, limits, out)
+    return fades or changed
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def fade(q, dq, effort, limits, out):
+    """Write the effort (n,) Nm by rule 1 into `out`; return whether it is less."""
+    kept = _torque_share(q, dq, limits)
+    for j in range(len(q)):
+        out[j] = kept * effort[j]
+    return kept < 1.0
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def limit_acceleration(arm, share, friction, limits, work, out):
+    """Change the torques `out` (n,) Nm by rule 2; return whether they were beyond it. See `filter_torque`."""
     q, dq, n = arm.q, arm.dq, len(arm.q)
     ddq, low, high, root = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
-    kept = _torque_share(q, dq, limits)
     for j in range(n):
-        out[j] = kept * effort[j]
         ddq[j] = out[j] - arm.bias[j]
     unpack(arm.mass, 1.0, limits[:, ADDED], root)
     factor(root, root)
@@ -152,14 +168,19 @@ def filter_torque(arm, effort, last, share, friction, limits, work, out):
         _stop_torque(ddq, low, high, work)
         for j in range(n):
             out[j] += work[2 * n + _STOP, j]
-    scale = 1.0
+    return not inside
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def limit_rate(last, limits, out):
+    """Change the torques `out` (n,) Nm by rule 3, after the command `last` (n,) Nm."""
+    n, scale = len(out), 1.0
     for j in range(n):
         out[j] = min(max(out[j], -limits[j, TAU_MAX]), limits[j, TAU_MAX]) - last[j]
         if abs(out[j]) > limits[j, STEP]:
             scale = min(scale, limits[j, STEP] / abs(out[j]))
     for j in range(n):
         out[j] = last[j] + min(max(scale * out[j], -limits[j, STEP]), limits[j, STEP])
-    return kept < 1.0 or not inside
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)

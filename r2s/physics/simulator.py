@@ -17,6 +17,8 @@ from r2s.physics.actuation import low_pass_factor, steps_late
 from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, TIP, contact_columns
 from r2s.physics.control_laws import ControlLaw, law_number
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.push_limit import COLUMNS as PUSH_COLUMNS
+from r2s.physics.push_limit import PushLimit
 from r2s.physics.rigid_body import principal_axes, set_links
 from r2s.physics.robot import SIM_DT, Robot
 
@@ -43,13 +45,14 @@ class Simulator:
         control: ControlLaw | None = None,
     ):
         self._control, self._kept = control, native.KEPT * robot.n
-        self._touching = 0 if robot.tool is None else COLUMNS
+        self._touching, pushing = (0, 0) if robot.tool is None else (COLUMNS, PUSH_COLUMNS)
         self._law_number = native.NO_CONTROL if control is None else float(law_number(control.law))
         native.install()
         self.robot = robot
         sizes = (0, 0, 0) if control is None else (control.command_size, control.memory_size, len(control.parameters))
         self._sizes = sizes
-        self._contact_at = self._kept + sum(sizes)
+        self._push_at = self._kept + sum(sizes)
+        self._contact_at = self._push_at + pushing
         memory = self._contact_at + self._touching
         self.model = robot.model(gravity=False, user=native.WIDTH, memory=memory, dt=dt)
         self.batch = mujoco.batch.Batch(self.model, nsim, nthread)
@@ -66,7 +69,8 @@ class Simulator:
         self.q = self.batch.bind("qpos")
         self.dq = self.batch.bind("qvel")
         self._memory = self.batch.bind("userdata")
-        self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] : self._contact_at]
+        self._parameters = self._memory[:, self._kept + sizes[0] + sizes[1] : self._push_at]
+        self._push, self._push_limit = self._memory[:, self._push_at : self._contact_at], np.zeros(pushing)
         self._contact = self._memory[:, self._contact_at :]
         self._surfaces = np.zeros((nsim, self._touching))  # what `reset` puts into the memory
         self._xanchor, self._xaxis = self.batch.bind("xanchor"), self.batch.bind("xaxis")
@@ -106,6 +110,7 @@ class Simulator:
         torque_limit: np.ndarray | float = np.inf,
         cutoff_hz: float = np.inf,
         soft_start_s: float = 0.0,
+        push_limit: PushLimit | None = None,
     ) -> None:
         """Put control law, conditioning, safety filter, delay and lag between `rollout` and the joints.
 
@@ -114,6 +119,7 @@ class Simulator:
         Args:
             limits: (n, COLUMNS), see `r2s.physics.safety_filter.filter_limits`.
             torque_limit: (n,) Nm, largest target. cutoff_hz: low-pass on the target. soft_start_s: s, of an episode.
+            push_limit: of a robot with a tool; None: pushes are not limited.
         """
         u = native
         self._user[:, :, u.LIMITS : u.LIMITS + limits.shape[1]] = limits
@@ -122,6 +128,9 @@ class Simulator:
         self._user[:, :, u.LOW_PASS] = low_pass_factor(cutoff_hz)
         self._user[:, :, u.TARGET_MAX] = torque_limit
         self._user[:, :, u.COMMANDS : u.PARAMETERS + 1] = self._sizes
+        self._user[:, :, u.PUSH] = 0.0 if push_limit is None else self._push_at
+        if push_limit is not None:
+            self._push[:] = self._push_limit = push_limit.columns(self.robot)
 
     def command(self, command: np.ndarray, speed_noise: np.ndarray | None = None) -> None:
         """Set the commands (nsim, c) of the control law until the next call.
@@ -153,6 +162,7 @@ class Simulator:
         if self._control is not None:
             self._parameters[at] = self._control.parameters
         self._contact[at] = self._surfaces[at]
+        self._push[at] = self._push_limit
         self._damping[at] = self.model.dof_damping
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS)
 

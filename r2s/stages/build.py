@@ -78,15 +78,24 @@ def dynamics_of(robot, friction, inertia):
     return called(nominal_dynamics, "friction", {**friction, "inertia_scale": inertia["scale"]}, robot)
 
 
-def make_task(cfg, robot, dynamics):
-    """Return the task of conf/task with the model of the arm and the controller of conf/control."""
+def make_task(cfg, robot, dynamics, safety=None):
+    """Return the task of conf/task with the model of the arm, the controller of conf/control and `safety`.
+
+    safety: of a later run, whose values replace those of the config.
+    """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in plain(cfg.task).items() if k != "_target_"}
     task = called(target(cfg.task, "task"), "task", settings).with_model(robot, dynamics)
-    if "_target_" not in cfg.control:  # control=default: the task's own
+    if "_target_" in cfg.control:  # not of control=default: the task's own
+        task = task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
+    given = {k: v for k, v in (plain(safety) or {}).items() if v is not None}
+    safety = {**(plain(cfg.get("safety")) or {}), **given}
+    if unknown := set(safety) - {"force_max", "speed_near"}:
+        raise UserError(f"safety: unknown key '{min(unknown)}'; force_max and speed_near are allowed")
+    if not any(value is not None for value in safety.values()):
         return task
-    return task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
+    return task.pushing_within(robot, dynamics.level, safety.get("force_max"), safety.get("speed_near"))
 
 
 def make_draw(cfg, robot, center):

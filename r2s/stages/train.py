@@ -37,7 +37,7 @@ CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification
 
 def reads(cfg):
     """Return the config keys of this stage."""
-    keys = {"robot", "dr", "algo", "task", "control", "evaluation.episodes", "calibration"}
+    keys = {"robot", "dr", "algo", "task", "control", "safety", "evaluation.episodes", "calibration"}
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
     if "n_envs" in cfg.algo:  # an algorithm that learns

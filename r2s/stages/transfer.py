@@ -37,7 +37,7 @@ WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trai
 
 def reads(cfg):
     """Return the config keys of this stage."""
-    return {"policy", "simulator", "arm", "adapt", "evaluation.episodes"}
+    return {"policy", "simulator", "arm", "adapt", "safety", "evaluation.episodes"}
 
 
 def trained_config(cfg, option="policy"):
@@ -98,7 +98,7 @@ def make_request(cfg):
     check_number("evaluation.episodes", cfg.evaluation.episodes, "[1, inf)", whole=True)
     robot = make_robot(trained)
     center = make_dynamics(trained, robot)
-    task = make_task(trained, robot, center)
+    task = make_task(trained, robot, center, cfg.get("safety"))
     set_threads(cfg)
     learned = is_learner(trained)
     policy = load_policy(source, robot, task) if learned else make_controller(trained, robot, task, center)

@@ -19,6 +19,7 @@ from r2s.physics.dynamics import Dynamics
 from r2s.physics.impedance import FIRST_DQ, FORCE_MAX, K_DEFAULT, arm_pose
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.kinematics import POSE
+from r2s.physics.push_limit import push_limit
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import Tip, nominal_plane
@@ -138,6 +139,15 @@ class PressTask(BaseTask):
         """Return the task with this controller; raise UserError if it cannot exert the forces."""
         self._check_force(controller)
         return super().controlled_by(controller)
+
+    def pushing_within(
+        self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
+    ) -> "PressTask":
+        """Return the task with a limit of force and speed at the nominal plane, which admits its forces."""
+        limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1])
+        if limit is not None:
+            limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
+        return self._with("push_limit", limit)
 
     def _check_force(self, controller: Controller) -> None:
         if isinstance(controller, Impedance) and controller.hybrid:

@@ -7,13 +7,14 @@ task is one file beside reach.py and one yaml (docs/how_to/extending.md).
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from r2s.control.controller import Controller
 from r2s.control.torque import torque
 from r2s.physics.dynamics import Dynamics
+from r2s.physics.push_limit import PushLimit, push_limit
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.rewards import TERMS
@@ -126,6 +127,7 @@ class Task(Protocol):
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
         may_touch: pairs of body names that may touch, or of one and "table"; other contacts end an episode.
         touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
+        push_limit: of force and speed of its contacts; None: they are not limited.
     """
 
     @property
@@ -152,6 +154,8 @@ class Task(Protocol):
     def may_touch(self) -> tuple[tuple[str, str], ...]: ...  # noqa: D102
     @property
     def touches(self) -> bool: ...  # noqa: D102
+    @property
+    def push_limit(self) -> PushLimit | None: ...  # noqa: D102
 
     def torque_limit(self, robot: Robot) -> np.ndarray:
         """Return (n,) Nm, the largest target torque."""
@@ -163,6 +167,12 @@ class Task(Protocol):
 
     def controlled_by(self, controller: Controller) -> "Task":
         """Return the task with this controller."""
+        ...
+
+    def pushing_within(
+        self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
+    ) -> "Task":
+        """Return the task with limited force, N, and speed, m/s, of contacts; friction (n,) Nm may hide some."""
         ...
 
     def control(self, robot: Robot) -> Controller:
@@ -259,6 +269,7 @@ class BaseTask:
     may_touch: tuple[tuple[str, str], ...] = ()
     touches = False
     controller: Controller | None = None
+    push_limit: PushLimit | None = None
 
     @property
     def steps(self) -> int:
@@ -276,8 +287,17 @@ class BaseTask:
 
     def controlled_by(self, controller: Controller) -> Self:
         """Return the task with this controller."""
+        return self._with("controller", controller)
+
+    def pushing_within(
+        self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
+    ) -> Self:
+        """Return the task with the limit of `push_limit` (r2s/physics/push_limit.py) at a table below home."""
+        return self._with("push_limit", push_limit(robot, friction, force_max, speed_near))
+
+    def _with(self, name: str, value: Any) -> Self:
         task = copy.copy(self)
-        object.__setattr__(task, "controller", controller)  # tasks are frozen dataclasses
+        object.__setattr__(task, name, value)  # tasks are frozen dataclasses
         return task
 
     def control(self, robot: Robot) -> Controller:

@@ -1,0 +1,253 @@
+"""Limit of the force with which a tool's tip may press on a surface, and of the speed at which it may meet it.
+
+Along the inward normal the tip has the speed v and the effective mass m = 1 / (J M^-1 J^T) (Khatib, IEEE J. Robotics
+and Automation 3(1), 1987), and
+
+    m dv/dt = P + P_f - F,   P = m (J M^-1 (tau - bias) + dJ/dt dq)
+
+with the push P of the command, the contact force F >= 0 and the push P_f of joint friction, at most `hidden` =
+m |J M^-1| friction. The limit keeps, every millisecond,
+
+1. P + hidden <= force_max,
+2. m dv/dt <= m RATE (v_max - v) with the force that resists the push estimated: P <= R + m RATE (v_max - v). v_max is
+   `speed_near` at the surface and grows with the distance from it.
+
+R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-pass of P - m dv/dt. A tip in the air
+has R = 0 and cannot accelerate beyond v_max; a tip that presses has R = P, so its force can rise. A tip faster than
+v_max, or that leaves the surface, has lost what resisted it: R = 0.
+
+So the force is at most force_max + speed_near sqrt(k m) on a surface of stiffness k: when it rises through force_max
+the tip moves at speed_near or slower, and from there on P + P_f - F brakes it. What the surface's own friction does
+to the tip in other directions is not counted.
+
+Both rules are half-spaces of torques with the same normal J M^-1. The limit sends the nearest torque by Gauss'
+principle, so it subtracts J^T f. The acceleration bounds of the joints (safety_filter.py) hold as well: the force f
+is the one with which their law sends a torque within the limit, found by regula falsi.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.errors import UserError, check_number
+from r2s.physics.linear_algebra import factor, solve, unpack
+from r2s.physics.payload import ee_pose
+from r2s.physics.rigid_body import InverseInertia
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, limit_acceleration
+from r2s.physics.safety_filter import WORK as FILTER_WORK
+from r2s.physics.tip import Tip, nominal_plane
+
+# Columns of a limit, and what it keeps between cycles: RESISTED N, SPEED m/s, and whether it has begun
+FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
+    *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
+)
+COLUMNS = BEGUN + 1
+WORK = 3  # rows of `work` beside n
+ROUNDS = 16  # most trials of f
+CLOSE = 1e-2  # m/s^2, by which the found torque may push less than is allowed
+OVERSHOOT = 1.5  # a tip meets the surface at up to this times v_max: it brakes as fast as the latency allows
+STIFF = 1e5  # N/m, stiffest surface of conf/dr/contact.yaml
+NEAR_M = 0.3  # m, from the surface; farther away the limit does nothing
+
+
+@dataclass(frozen=True)
+class PushLimit:
+    """Limits of `push_bound` at a plane of roughly known place; see the module.
+
+    Attributes:
+        force_max: N. speed_near: m/s. point, normal: (3,) of the plane in the base frame, m.
+        place: m and tilt: rad, by which the true plane may differ.
+
+    """
+
+    force_max: float
+    speed_near: float
+    point: np.ndarray
+    normal: np.ndarray
+    place: float = 0.0
+    tilt: float = 0.0
+
+    def columns(self, robot: Robot) -> np.ndarray:
+        """Return the limit (COLUMNS,) of the robot's tool, before the first cycle."""
+        Tip(robot)  # raises without a tool
+        site, axes = ee_pose(robot)
+        out = np.zeros(COLUMNS)
+        out[FORCE_MAX], out[SPEED_NEAR] = self.force_max, self.speed_near / OVERSHOOT
+        out[SLOPE], out[MARGIN] = np.tan(self.tilt), self.place
+        out[POINT : POINT + 3], out[NORMAL : NORMAL + 3] = self.point, self.normal
+        out[TIP : TIP + 3], out[RADIUS] = site + axes @ robot.tool.tip, robot.tool.radius  # type: ignore[union-attr]
+        return out
+
+    def at(self, robot: Robot, friction: np.ndarray, q: np.ndarray) -> tuple[float, float]:
+        """Return effective mass, kg, and `hidden`, N, at q (n,) rad for joint friction (n,) Nm."""
+        row = -self.normal @ Tip(robot)(q)[1]
+        lever = InverseInertia(robot)(q[None])[0] @ row
+        mass = 1.0 / float(row @ lever)
+        return mass, mass * float(np.abs(lever) @ friction)
+
+
+def push_limit(
+    robot: Robot,
+    friction: np.ndarray,
+    force_max: float | None,
+    speed_near: float | None,
+    plane: tuple[np.ndarray, np.ndarray] | None = None,
+    asked: float = 0.0,
+) -> PushLimit | None:
+    """Return the limit of `safety.force_max` and `safety.speed_near`; None if both are null.
+
+    Args:
+        robot: with a tool. friction: (n,) Nm, level of each joint's friction.
+        force_max: N. speed_near: m/s; null: what lets a rigid surface of 1e5 N/m add force_max.
+        plane: point and normal; None: a table below the tip at home. asked: N, largest force that the task asks for.
+
+    Raises:
+        UserError: a value out of range, the robot has no tool, or the force is below what joint friction may hide
+            and the task asks.
+    """
+    if force_max is None and speed_near is None:
+        return None
+    if force_max is None:
+        raise UserError("safety.speed_near: it needs safety.force_max, got null; set a force in N")
+    check_number("safety.force_max", force_max, "(0, inf)")
+    point, normal = plane or nominal_plane(robot)
+    mass, hidden = PushLimit(force_max, 1.0, point, normal).at(robot, friction, robot.q_home)
+    if speed_near is None:
+        speed_near = force_max / np.sqrt(STIFF * mass)
+    check_number("safety.speed_near", speed_near, "(0, inf)")
+    if (least := asked + 2.0 * hidden) > force_max:
+        raise UserError(
+            f"safety.force_max: {force_max:g} N is not allowed; {least:.3g} N or more is: the task asks for "
+            f"{asked:g} N, and joint friction may hide {hidden:.2g} N in each direction"
+        )
+    return PushLimit(float(force_max), float(speed_near), point, normal)
+
+
+@njit(cache=True, error_model="numpy")
+def _tip_motion(limit, position, R, anchor, axis, dq, row):
+    """Write how joints move the tip inwards, (n,) m/rad; return its height, speeds m/s, and dJ/dt dq m/s^2.
+
+    Height: m, above the highest place of the true plane. Speeds: inwards, and along the plane.
+    """
+    a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
+    nx, ny, nz = limit[NORMAL], limit[NORMAL + 1], limit[NORMAL + 2]
+    x = position[0] + R[0] * a + R[1] * b + R[2] * c
+    y = position[1] + R[3] * a + R[4] * b + R[5] * c
+    z = position[2] + R[6] * a + R[7] * b + R[8] * c
+    rx, ry, rz = x - limit[POINT], y - limit[POINT + 1], z - limit[POINT + 2]
+    height = nx * rx + ny * ry + nz * rz
+    aside = np.sqrt(max(rx * rx + ry * ry + rz * rz - height * height, 0.0))
+    height -= limit[RADIUS] + limit[MARGIN] + limit[SLOPE] * aside
+    wx, wy, wz, ex, ey, ez = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # angular velocity and acceleration of a link
+    vx, vy, vz, conv = 0.0, 0.0, 0.0, 0.0
+    for j in range(len(dq)):
+        ux, uy, uz, s = axis[j, 0], axis[j, 1], axis[j, 2], dq[j]
+        rx, ry, rz = x - anchor[j, 0], y - anchor[j, 1], z - anchor[j, 2]
+        cx, cy, cz = uy * rz - uz * ry, uz * rx - ux * rz, ux * ry - uy * rx
+        row[j] = -(nx * cx + ny * cy + nz * cz)
+        vx, vy, vz = vx + s * cx, vy + s * cy, vz + s * cz
+        # the angular acceleration that this joint's turning axis adds, and the centripetal part of its link
+        tx, ty, tz = s * (wy * uz - wz * uy), s * (wz * ux - wx * uz), s * (wx * uy - wy * ux)
+        ex, ey, ez = ex + tx, ey + ty, ez + tz
+        wx, wy, wz = wx + s * ux, wy + s * uy, wz + s * uz
+        last = j == len(dq) - 1
+        dx = (x if last else anchor[j + 1, 0]) - anchor[j, 0]
+        dy = (y if last else anchor[j + 1, 1]) - anchor[j, 1]
+        dz = (z if last else anchor[j + 1, 2]) - anchor[j, 2]
+        gx, gy, gz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
+        conv -= nx * (ey * dz - ez * dy + wy * gz - wz * gy)
+        conv -= ny * (ez * dx - ex * dz + wz * gx - wx * gz)
+        conv -= nz * (ex * dy - ey * dx + wx * gy - wy * gx)
+    inwards = -(nx * vx + ny * vy + nz * vz)
+    along = np.sqrt(max(vx * vx + vy * vy + vz * vz - inwards * inwards, 0.0))
+    return height, inwards, along, conv
+
+
+@njit(cache=True, error_model="numpy")
+def push_bound(limit, arm, place, joints, last, friction, work):
+    """Return how large an inward acceleration, m/s^2, a torque may cause, infinite far from the surface.
+
+    Args:
+        limit: (COLUMNS,) of `PushLimit.columns`, updated.
+        arm: `JointDynamics`, finite. place: position (3,) m and rotation (9,) of the last link in the base frame.
+        joints: anchor and axis (n, 3) of the joints. last: (n,) Nm, the torque that the arm applied last.
+        friction: (n,) Nm, level of each joint's friction.
+        work: (n + WORK, n), any content; row n becomes J, and row n + 1 J M^-1.
+    """
+    n = len(last)
+    root, row, lever, none = work[:n], work[n], work[n + 1], work[n + 2]
+    height, speed, along, convective = _tip_motion(limit, place[0], place[1], joints[0], joints[1], arm.dq, row)
+    if height > NEAR_M:
+        limit[RESISTED], limit[BEGUN] = 0.0, 0.0
+        return np.inf
+    none[:] = 0.0
+    lever[:] = row
+    unpack(arm.mass, 1.0, none, root)
+    factor(root, root)
+    solve(root, lever)
+    mobility, before, own, hidden = 0.0, convective, convective, 0.0  # hidden: m/s^2
+    for j in range(n):
+        mobility += row[j] * lever[j]
+        before += lever[j] * (last[j] - arm.bias[j])
+        own -= lever[j] * arm.bias[j]
+        hidden += abs(lever[j]) * friction[j]
+    mass, most = 1.0 / mobility, limit[FORCE_MAX]
+    if limit[BEGUN] == 0.0:
+        limit[SPEED], limit[BEGUN] = speed, 1.0
+    resisted = limit[RESISTED] + RATE * (SIM_DT * (mass * before - limit[RESISTED]) - mass * (speed - limit[SPEED]))
+    allowed = limit[SPEED_NEAR] - limit[SLOPE] * along + APPROACH * max(height, 0.0)
+    if speed > allowed or speed < -limit[SPEED_NEAR]:
+        resisted = min(resisted, 0.0)
+    limit[RESISTED], limit[SPEED] = min(max(resisted, -most), most), speed
+    return min(RATE * (allowed - speed) + mobility * limit[RESISTED], mobility * most - hidden) - own
+
+
+@njit(cache=True, error_model="numpy")
+def limit_pushes(limit, arm, place, joints, last, share, friction, limits, out):
+    """Change the torques `out` (n,) Nm by the bounds of the joints, which see the contact, and by those of pushes.
+
+    Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
+    """
+    n = len(out)
+    own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()
+    bound = push_bound(limit, arm, place, joints, last, friction, own)
+    row, lever, load = own[n], own[n + 1], own[n + 2]
+    for j in range(n):
+        load[j] = arm.bias[j] + max(limit[RESISTED], 0.0) * row[j]
+    touching = JointDynamics(arm.q, arm.dq, arm.mass, load)
+    changed = limit_acceleration(touching, share, friction, limits, work, out)
+    before = _excess(lever, bound, out)
+    if before <= 0.0:
+        return changed
+    mobility = 0.0
+    for j in range(n):
+        mobility += row[j] * lever[j]
+    low, high, after, force = 0.0, np.inf, 0.0, before / mobility  # N; the excess at low and high
+    for _ in range(ROUNDS):
+        for j in range(n):
+            out[j] = effort[j] - force * row[j]
+        limit_acceleration(touching, share, friction, limits, work, out)
+        now = _excess(lever, bound, out)
+        if -CLOSE <= now <= 0.0:
+            break
+        if now > 0.0:
+            low, before, after = force, now, 0.5 * after
+        else:
+            high, after, before = force, now, (0.5 if high < np.inf else 1.0) * before
+        if high == np.inf:
+            force *= 2.0
+        else:  # regula falsi with the Illinois rule (Dowell and Jarratt, BIT 11, 1971), towards the middle of CLOSE
+            x, y = before + 0.5 * CLOSE, after + 0.5 * CLOSE
+            force = (low * y - high * x) / (y - x) if y < 0.0 else 0.5 * (low + high)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _excess(lever, bound, tau):
+    """Return by how much the torques (n,) Nm push beyond `push_bound`, m/s^2."""
+    out = -bound
+    for j in range(len(tau)):
+        out += lever[j] * tau[j]
+    return out
