@@ -163,6 +163,14 @@ def test_late_messages_are_put_in_order_and_repeated_ones_dropped(tmp_path):
     assert_motion(read(joint_states(tmp_path, data=mixed, others="fixed"), torque="measured"), data)
 
 
+def test_messages_before_the_first_stamp_are_left_out(tmp_path):
+    """A driver may send some with stamp 0 before it knows the time."""
+    data = motion()
+    early = [np.concatenate([x[:5], x]) for x in data]
+    early[0][:5] = -EPOCH
+    assert_motion(read(joint_states(tmp_path, data=early, others="fixed"), torque="measured"), data)
+
+
 def test_a_restarted_clock_is_refused(tmp_path):
     """Rows of two starts must not be shuffled into one another."""
     data = motion(step=0.02)

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.physics.description import Bodies, about, make_pose, shaped
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.welds import Bodies, about, make_pose, shaped
 
 
 class DartEngine:

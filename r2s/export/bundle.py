@@ -71,7 +71,8 @@ def write_bundle(
         for name in IDENTIFIED:
             if (source / name).is_file():
                 shutil.copyfile(source / name, part / name)
-        write_description(part / "model", robot, dynamics)
+        for line in write_description(part / "model", robot, dynamics):
+            print(line)
         (part / "r2s_runtime.py").write_text(one_file(task.control(robot)))
         if contract["goal"]["kind"] == "plan":
             plans = task.goals(robot, np.random.default_rng(0), EXAMPLES)

@@ -1,22 +1,20 @@
 """Units, signs and joint order of a recording, judged by the arm's model.
 
-dq is compared with the slope of q, and torque with that of the nominal arm for the same motion. The judgement is
-coarse on purpose: a nominal arm that is wrong by a factor of 3, an undeclared payload, any friction and sensor
-offsets pass; a factor of 1000, of 57.3 or of -1, or another joint order do not. r2s refuses a recording only if more
-than half of its square is unexplained, and one such correction leaves at most a quarter of that.
+dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with that of the nominal
+arm for the same motion. The judgement is coarse on purpose: a nominal arm that is wrong by a factor of 3, an
+undeclared payload, any friction and sensor offsets pass; a factor of 1000, of 57.3 or of -1, another joint order or
+mounting do not. r2s refuses a recording only if a correction leaves at most a quarter of what is unexplained.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import mujoco
 import numpy as np
-from scipy.optimize import linear_sum_assignment, lsq_linear
+from scipy.optimize import linear_sum_assignment
 
 from r2s.errors import UserError
-from r2s.physics.friction import WIDTH_DQ
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.identification.torque_fit import MASS_LEFT, Moments, Unexplained, mounting, other_masses, other_orders
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.clock import check_clock
 from r2s.recordings.recording import Recording
 
 CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # of the motion at which torques are compared
@@ -25,26 +23,14 @@ SLOWEST_HZ = 5.0  # sampling rate below which nothing is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint that stands
 REFUSED, CORRECTED = 0.5, 0.25  # unexplained shares of a square: refused from; left by a correction, of that
+SUSPECT = 0.3  # misfit from which another order is tried; arms of our recordings: 0.006 to 0.21
+TURNED = 0.05  # misfit from which a mounting is tried: its three numbers must leave a tenth of it
 HELD = 0.05  # of tau_max RMS: a joint with so much gravity torque is judged even if it stands
-INERTIA = 0.3, 4.0  # allowed scale of the nominal torque: published tensors, payloads, sensor gains
-FRICTION, OFFSET = 0.5, 0.1  # of tau_max, at most
-MAX_LEFT = 2.0  # upper limit of the unexplained share of a joint
 HAS_GRAVITY, NO_GRAVITY = (0.7, 2.0), 0.3  # shares of nominal gravity with which a torque includes it, or does not
-# gravity is judged where it changes: least RMS, of tau_max; factor of a standard error for correlated rows; largest
-# standard error of the share
-CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
+CURRENT = 0.005  # Nm/A: no arm's joint has less, so a smaller factor is no current
 OVER_LIMIT = 3.0  # times tau_max, at most
 RATIO = 4.0  # factor between dq and the slope of q that is refused, like its inverse
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
-
-
-class Moments(NamedTuple):
-    """Motion at which torque is compared: q, dq, ddq, tau (T, n), zero-phase filtered; dq and ddq are slopes of q."""
-
-    q: np.ndarray
-    dq: np.ndarray
-    ddq: np.ndarray
-    tau: np.ndarray
 
 
 def check_units(robot: Robot, recording: Recording) -> None:
@@ -56,12 +42,16 @@ def check_units(robot: Robot, recording: Recording) -> None:
             f"the recording: tau of joint {dead[0] + 1} is {recording.tau[0, dead[0]]:g} Nm in every row, though the "
             "joint moves: is its sensor dead?"
         )
-    if any(s.stop - s.start < 2 for s in recording.stretches) or recording.rate_hz < SLOWEST_HZ:
+    if any(s.stop - s.start < 2 for s in recording.stretches):
+        return
+    if recording.rate_hz < SLOWEST_HZ:
+        check_clock(recording)
         return
     smooth, step = recording.resample(SIM_DT).smooth(CUTOFF_HZ), round(1 / (RATE_HZ * SIM_DT))
     dq = smooth.derivative(smooth.q)
     rows = np.concatenate([np.arange(s.start + EDGE, s.stop - EDGE, step) for s in smooth.stretches])
     if len(rows) < MIN_ROWS:
+        check_clock(recording)
         return
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MAX_ROWS)).astype(int)]
     dead = np.flatnonzero(moved & (np.ptp(recording.dq, axis=0) == 0))
@@ -71,6 +61,7 @@ def check_units(robot: Robot, recording: Recording) -> None:
             "moves; leave dq out of the file to derive it from q"
         )
     _check_velocity(dq[rows], smooth.dq[rows])
+    check_clock(recording)
     m = Moments(smooth.q[rows], dq[rows], smooth.derivative(dq)[rows], smooth.tau[rows])
     _check_torque(robot, m, recording, moved)
 
@@ -123,25 +114,34 @@ def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndar
     """Compare the torque with that of the nominal arm for the same motion."""
     gravity = recording.torque != "commanded"
     most = np.quantile(np.abs(recording.tau), 0.99, axis=0) / robot.tau_max
-    left = _Unexplained(robot, m, gravity)
+    left = Unexplained(robot, m, gravity)
     held = np.sqrt((left.need**2).mean(0)) > HELD * robot.tau_max
     left.seen = np.flatnonzero(moved | held)
     if not len(left.seen):
         return
     own = left.each(m.tau)
     tau = f"the recording: {recording.torque} tau"
-    corrections = []  # (unexplained share after it, description)
+    corrections = []  # (what it leaves of the misfit, description)
     if own.mean() > REFUSED or most.max() > OVER_LIMIT:
         for factor, unit in UNITS["tau"].items():
             words = f"is {factor:g} times what {robot.name} needs for this motion: {unit}, not Nm?"
-            corrections.append((left.each(m.tau / factor).mean(), words))
+            corrections.append((left.each(m.tau / factor).mean() / own.mean(), words))
     if own.mean() > REFUSED:
         words = f"has the other sign in all joints: negated, it fits what {robot.name} needs"
-        corrections.append((left.each(-m.tau).mean(), words))
-        corrections += _other_orders(robot, m, gravity)
-    corrections = [x for x in corrections if x[0] < CORRECTED * own.mean()]
+        corrections.append((left.each(-m.tau).mean() / own.mean(), words))
+    misfit = left.misfit()
+    if misfit > SUSPECT:
+        kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # of the other kind of torque
+        limit = min(SUSPECT, kind)
+        corrections += [(after / misfit, words) for after, words in other_orders(left, gravity) if after < limit]
+    if misfit > TURNED and gravity:
+        corrections += [(after / misfit, words) for after, words in mounting(left) if after < MASS_LEFT * misfit]
+    corrections = [x for x in corrections if x[0] < CORRECTED]
     if own.max() > REFUSED:
-        corrections += _corrected_joints(left, own)
+        corrections += [(after / own.mean(), words) for after, words in _corrected_joints(left, own)]
+    if misfit > SUSPECT and not corrections:
+        masses = [(after / misfit, words) for after, words in other_masses(left, gravity)]
+        corrections = [x for x in masses if x[0] < MASS_LEFT]
     if corrections:
         raise UserError(f"{tau} {min(corrections)[1]}")
     if most.max() > OVER_LIMIT:
@@ -157,13 +157,19 @@ def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndar
     if gravity and shares.max() < -HAS_GRAVITY[0]:
         raise UserError(f"{tau} contains gravity with the other sign {mean}")
     if gravity and np.abs(shares).max() < NO_GRAVITY:
+        (factors, rest), other = left.scaled(), left.with_need(left.inverse_dynamics(False)).scaled()[1]
+        if rest < min(SUSPECT, other) and np.median(factors) > CURRENT:
+            raise UserError(
+                f"{tau} is {np.median(factors):.2g} times what {robot.name} needs: is it a current in A? Then set "
+                "data.torque=motor and data.torque_constant=[Nm/A of each joint, gear included]"
+            )
         raise UserError(f"{tau} hardly contains gravity {mean}: is it data.torque=commanded?")
     # an undeclared payload adds another share to each joint
     if not gravity and shares.min() > HAS_GRAVITY[0] and shares.max() < HAS_GRAVITY[1]:
         raise UserError(f"{tau} contains gravity {mean}: is it data.torque=measured?")
 
 
-def _corrected_joints(left: "_Unexplained", own: np.ndarray) -> list[tuple[float, str]]:
+def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str]]:
     """Return corrections of single joints: swapped columns, and flipped signs."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
@@ -177,67 +183,6 @@ def _corrected_joints(left: "_Unexplained", own: np.ndarray) -> list[tuple[float
         words = f"has the other sign in joint{_listed(seen[flipped])}: negated, it fits what {left.robot.name} needs"
         out.append((np.where(flipped, signs, own).mean(), words))
     return out
-
-
-def _other_orders(robot: Robot, m: Moments, gravity: bool) -> list[tuple[float, str]]:
-    """Return corrections by rotated or reversed columns that stay within the position limits."""
-    every, out = np.arange(robot.n), []
-    for order in [*(np.roll(every, k) for k in range(1, robot.n)), every[::-1]]:
-        turned = Moments(*(x[:, order] for x in m))
-        if (turned.q >= robot.q_min).all() and (turned.q <= robot.q_max).all():
-            columns = " ".join(str(k + 1) for k in order)
-            words = f"and the motion fit {robot.name} only with the joints in another order: columns {columns}"
-            out.append((_Unexplained(robot, turned, gravity).each(turned.tau).mean(), words))
-    return out
-
-
-class _Unexplained:
-    """Share of a torque's square that the motion of its joint does not explain; `seen`: the judged joints."""
-
-    def __init__(self, robot: Robot, m: Moments, gravity: bool):
-        self.robot, self.m = robot, m
-        self.seen, self.need = np.arange(robot.n), self._inverse_dynamics(gravity)
-
-    def _inverse_dynamics(self, gravity: bool) -> np.ndarray:
-        """Return (T, n) Nm of the nominal arm without friction."""
-        model = self.robot.model(gravity=gravity)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-        return mujoco_inverse_dynamics(model, self.m.q, self.m.dq, self.m.ddq)
-
-    def gravity_shares(self) -> np.ndarray | None:
-        """Return the share of nominal gravity in tau for each joint whose motion determines it, or None."""
-        inertial = self._inverse_dynamics(False)
-        weight, shares = self._inverse_dynamics(True) - inertial, []
-        for j in self.seen:
-            parts = inertial[:, j], np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(weight))
-            rest = np.column_stack(parts)
-            a, b = (x - rest @ np.linalg.lstsq(rest, x, rcond=None)[0] for x in (weight[:, j], self.m.tau[:, j]))
-            square = max(a @ a, 1e-12)
-            share = a @ b / square
-            if CORRELATED * np.sqrt(((b - a * share) ** 2).mean() / square) < MAX_SIGMA and (
-                square / len(a) > (CHANGES * self.robot.tau_max[j]) ** 2
-            ):
-                shares.append(share)
-        return np.array(shares) if shares else None
-
-    def each(self, tau: np.ndarray) -> np.ndarray:
-        """Return (S,): the unexplained share of tau (T, n) of each joint, given its own motion."""
-        return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
-
-    def pairs(self) -> np.ndarray:
-        """Return (S, S): the unexplained share of column k of tau, given the motion of joint j."""
-        return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
-
-    def _share(self, j: int, tau: np.ndarray) -> float:
-        """Explain tau (T,) Nm by joint j: nominal torque, a rotor, Coulomb and viscous friction, an offset."""
-        most, m = self.robot.tau_max[j], self.m
-        slow = [m.ddq[:, j], np.tanh(m.dq[:, j] / WIDTH_DQ), m.dq[:, j]]
-        scale = most / np.maximum([np.sqrt((x**2).mean()) for x in slow], 1e-9)
-        scaled = [x * s for x, s in zip(slow, scale, strict=True)]
-        columns = np.column_stack([self.need[:, j], *scaled, np.full(len(tau), most)])
-        low, high = [INERTIA[0], 0.0, 0.0, 0.0, -OFFSET], [INERTIA[1], *[FRICTION] * 3, OFFSET]
-        fit = lsq_linear(columns, tau, bounds=(low, high))
-        return min(float(2.0 * fit.cost / max((tau**2).sum(), 1e-12)), MAX_LEFT)
 
 
 def _listed(joints: Sequence[int] | np.ndarray) -> str:

@@ -15,7 +15,8 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.urdf import GEAR, ROTOR, Inertia, combined
+from r2s.physics.urdf import GEAR, ROTOR
+from r2s.physics.welds import Bodies, about, make_pose, rotation
 
 ENDLESS = 1e16  # rad, SDF's value for no limit
 HAND = 1e-12, 1e-13  # kg, kg m^2 of the link `ee` in URDF: DART gives a link without inertia 1 kg and 1 kg m^2
@@ -30,7 +31,8 @@ class Link:
         origin: (4, 4) pose of the joint in the frame of the link before it, at angle zero.
         axis: (3,) in the joint's frame.
         mass: kg. com: (3,) m, in the link's frame. inertia: (3, 3) kg m^2 about it, link axes.
-        damping: Nm s/rad. friction: Nm, Coulomb. armature: kg m^2.
+        damping: (3,) Nm s/rad, .../rad^2 and so on: MuJoCo's polynomial. friction: Nm, Coulomb. armature: kg m^2.
+        stiffness: (3,) Nm/rad and so on, of a spring that rests at springref, rad.
     """
 
     name: str
@@ -40,9 +42,11 @@ class Link:
     mass: float
     com: np.ndarray
     inertia: np.ndarray
-    damping: float
+    damping: np.ndarray
     friction: float
     armature: float
+    stiffness: np.ndarray
+    springref: float
 
 
 def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[list[Link], np.ndarray]:
@@ -71,9 +75,11 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
                 mass=mass,
                 com=com - model.jnt_pos[i],
                 inertia=inertia,
-                damping=float(model.dof_damping[i] + viscous[i]),
+                damping=np.array([model.dof_damping[i] + viscous[i], *model.dof_dampingpoly[i]]),
                 friction=float(model.dof_frictionloss[i] + coulomb[i]),
                 armature=float(dynamics.armature[i]),
+                stiffness=np.array([model.jnt_stiffness[i], *model.jnt_stiffnesspoly[i]]),
+                springref=float(model.qpos_spring[i]),
             )
         )
         before = joint
@@ -90,13 +96,22 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
     return np.maximum(fast - viscous * robot.dq_max, 0.0), viscous
 
 
-def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> None:
-    """Write arm.xml (MJCF), arm.urdf and, for an arm without armature, arm.sdf into `folder`."""
+def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
+    """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; return a line for each format that cannot hold it.
+
+    An arm.sdf of an arm with armature is left out without a line: SDF has no rotors, and most arms have some.
+    """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)
-    write_urdf(folder / "arm.urdf", robot, dynamics)
-    if not dynamics.armature.any():
-        write_sdf(folder / "arm.sdf", robot, dynamics)
+    left_out = []
+    for write, name in ((write_urdf, "arm.urdf"), (write_sdf, "arm.sdf")):
+        if name == "arm.sdf" and dynamics.armature.any():
+            continue
+        try:
+            write(folder / name, robot, dynamics)
+        except UserError as error:
+            left_out.append(f"not written: {name}: {error}")
+    return left_out
 
 
 def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
@@ -111,12 +126,15 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
         x = link.inertia
         tensor = np.array([x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]])
         ET.SubElement(parent, "inertial", pos=_words(link.com), mass=repr(link.mass), fullinertia=_words(tensor))
-        own = {"damping": link.damping, "frictionloss": link.friction, "armature": link.armature}
+        own = {"frictionloss": repr(link.friction), "armature": repr(link.armature)}
+        own |= {"damping": _polynomial(link.damping)}
+        if link.stiffness.any():
+            own |= {"stiffness": _polynomial(link.stiffness), "springref": repr(link.springref)}
         torque = _words(np.array([-robot.tau_max[i], robot.tau_max[i]]))
         joint = {"name": link.joint, "axis": _words(link.axis), "actuatorfrcrange": torque}
         if np.isfinite(robot.q_max[i]):
             joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
-        ET.SubElement(parent, "joint", joint | {k: repr(v) for k, v in own.items()})
+        ET.SubElement(parent, "joint", joint | own)
         ET.SubElement(actuator, "motor", name=link.joint, joint=link.joint, ctrlrange=torque)
     ET.SubElement(parent, "site", {"name": "ee"} | _place(tip))
     _write(path, root)
@@ -126,8 +144,12 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as URDF with a link `ee` at the end effector; armature becomes Drake's rotor inertia.
 
     URDF itself has no armature: r2s and Drake read this element, other readers ignore it.
+
+    Raises:
+        UserError: a joint has a spring or nonlinear damping, which URDF cannot represent.
     """
     links, tip = chain(robot, dynamics)
+    _check_linear(links, "URDF", springs=False)
     root = urdf(robot, links)
     for link in links:
         if link.armature:
@@ -162,7 +184,7 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
         limit = {} if endless else {"lower": robot.q_min[i], "upper": robot.q_max[i]}
         limit |= {"velocity": robot.dq_max[i], "effort": robot.tau_max[i]}
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
-        ET.SubElement(joint, "dynamics", damping=repr(link.damping), friction=repr(link.friction))
+        ET.SubElement(joint, "dynamics", damping=repr(float(link.damping[0])), friction=repr(link.friction))
         if robot.velocity_envelope is not None:  # Franka's extension of URDF, which libfranka requires
             deceleration, offset = (repr(float(x[i])) for x in robot.velocity_envelope)
             own = {"velocity_offset": offset, "deceleration_limit": deceleration}
@@ -179,11 +201,13 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
     (r2s applies it as a torque). A rotor becomes damping, armature / 1 ms; gazebo.py compensates that torque.
 
     Raises:
-        UserError: without `world`, the joints have armature, which SDF cannot represent.
+        UserError: without `world`, the joints have armature, or a nonlinear spring or damping; SDF has none.
     """
     links, tip = chain(robot, dynamics, friction=not world)
     if not world and any(link.armature for link in links):
         raise UserError("robot.armature: expected 0, as SDF has no rotor inertia; add it to the links")
+    if not world:
+        _check_linear(links, "SDF", springs=True)
     root = ET.Element("sdf", version="1.9")
     place = root
     if world:
@@ -208,94 +232,36 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         axis = ET.SubElement(joint, "axis")
         _text(axis, xyz=_words(link.axis))
         low, high = np.nan_to_num([robot.q_min[i], robot.q_max[i]], posinf=ENDLESS, neginf=-ENDLESS)
-        limit, damping = {"lower": low, "upper": high}, link.damping
+        limit, damping = {"lower": low, "upper": high}, link.damping[0]
         if world:
             damping += link.armature / SIM_DT
         else:
             limit |= {"effort": robot.tau_max[i], "velocity": robot.dq_max[i]}
         _text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})
-        _text(ET.SubElement(axis, "dynamics"), damping=repr(damping), friction=repr(link.friction))
+        own = {"damping": repr(float(damping)), "friction": repr(link.friction)}
+        if link.stiffness.any():
+            own |= {"spring_reference": repr(link.springref), "spring_stiffness": repr(float(link.stiffness[0]))}
+        _text(ET.SubElement(axis, "dynamics"), **own)
         parent = link.name
     frame = ET.SubElement(model, "frame", name="ee", attached_to=parent)
     _text(frame, pose=_pose_words(tip))
     _write(path, root)
 
 
-class Bodies:
-    """Masses, centres and tensors of all bodies, and the poses of welded bodies on the moving ones."""
-
-    def __init__(self, model: mujoco.MjModel):
-        self.model = model
-        self.mass, self.com = model.body_mass.copy(), model.body_ipos.copy()
-        axes = [rotation(quat) for quat in model.body_iquat]
-        self.inertia = np.array([r * d @ r.T for r, d in zip(axes, model.body_inertia, strict=True)])
-        poses = zip(model.body_pos, model.body_quat, strict=True)
-        self.local = [make_pose(position, rotation(quat)) for position, quat in poses]
-
-    def override(
-        self,
-        bodies: np.ndarray,
-        masses: np.ndarray | None,
-        coms: np.ndarray | None,
-        inertias: np.ndarray | None,
-        n: int,
-    ) -> None:
-        """Replace mass (n,), centre (n, 3) and tensor (n, 3, 3) of these bodies, unless None."""
-        if masses is not None:
-            self.mass[bodies] = masses
-        if coms is not None:
-            self.com[bodies] = coms
-        if (inertias := shaped("inertias", inertias, (n, 3, 3))) is not None:
-            self.inertia[bodies] = inertias
-
-    def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
-        """Return the nearest body with a joint at or above `body` (0: the world), and the pose of `body` in it."""
-        pose = np.eye(4)
-        while body and self.model.body_dofnum[body] == 0:
-            pose = self.local[body] @ pose
-            body = int(self.model.body_parentid[body])
-        return body, pose
-
-    def lumped(self, body: int) -> Inertia:
-        """Return mass, centre and tensor about the centre of `body` with all bodies welded to it."""
-        parts = [(self.mass[body], self.com[body], self.inertia[body])]
-        for other in range(1, self.model.nbody):
-            anchor, pose = self.moving_parent(other)
-            if other != body and anchor == body and self.mass[other] > 0:
-                r = pose[:3, :3]
-                parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
-        return combined(parts)
+def _polynomial(coefficients: np.ndarray) -> str:
+    """Return a coefficient, or all three if it is not linear."""
+    return _words(coefficients if coefficients[1:].any() else coefficients[:1])
 
 
-def shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return value; raise UserError unless it is None or has this shape."""
-    if value is not None and np.shape(value) != shape:
-        raise UserError(f"{name}: expected shape {shape}, got {np.shape(value)}")
-    return value
-
-
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a quaternion w x y z."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quat)
-    return matrix.reshape(3, 3)
-
-
-def about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation matrix (3, 3) about an axis by an angle, rad."""
-    quat = np.empty(4)
-    mujoco.mju_axisAngle2Quat(quat, axis, angle)
-    return rotation(quat)
-
-
-def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
-    """Return the pose (4, 4) with this position and rotation; None is zero or the identity."""
-    pose = np.eye(4)
-    if position is not None:
-        pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation
-    return pose
+def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
+    """Raise UserError for a spring that a format cannot represent, or for nonlinear damping; springs: linear ones."""
+    for link in links:
+        nonlinear = link.damping[1:].any() or link.stiffness[1:].any()
+        if nonlinear or (link.stiffness.any() and not springs):
+            what = "nonlinear damping or spring" if nonlinear else f"spring of {link.stiffness[0]:g} Nm/rad"
+            raise UserError(
+                f"robot.mjcf: joint '{link.joint}' has a {what}, which {form} cannot represent; use the MJCF"
+            )
 
 
 def _place(pose: np.ndarray) -> dict[str, str]:

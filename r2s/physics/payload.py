@@ -8,16 +8,15 @@ not represent it, because that force would depend on the resulting acceleration.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.physics.description import Bodies, rotation
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
+from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centres (..., n, 3) m, tensors (..., n, 3, 3)
 MOST_KG, FARTHEST_M = 1.5, 0.075  # kg, m: largest payload, and largest distance of its centre from the end effector
@@ -125,12 +124,12 @@ def sphere_inertia(mass: np.ndarray) -> np.ndarray:
     return (0.4 * mass * radius**2)[..., None, None] * np.eye(3)
 
 
-_ee_poses: dict[tuple[Path, str], tuple[np.ndarray, np.ndarray]] = {}  # compiling a model takes some 10 ms
+_ee_poses: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}  # compiling a model takes some 10 ms
 
 
 def ee_pose(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Return the end effector's position (3,) m and rotation (3, 3) in the last link's frame."""
-    key = robot.mjcf, robot.ee_site
+    key = robot.mjcf, robot.ee_site, *robot.lock.items()
     if key not in _ee_poses:
         model = robot.model(gravity=False)
         site = model.site(robot.ee_site).id

@@ -1,10 +1,11 @@
 """The arm: kinematics, inertia and gravity of an MJCF or URDF file, limits of the file or the config.
 
 r2s commands joint torques, so it uses a file's joints, links, armature and damping, and drops actuators, sensors,
-keyframes and contacts. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+keyframes, free objects, gravity compensation and contacts. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -13,8 +14,10 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import located
+from r2s.physics.robot_checks import check_arm, check_limits, check_masses, gravity_of, torque_limits
+from r2s.physics.robot_file import read_spec, rotors, strip
 from r2s.physics.surface import Tool, load_tool
-from r2s.physics.urdf import is_urdf, read_urdf
+from r2s.physics.urdf import NO_RANGE, is_urdf
 
 PANDA = "r2s:models/panda.xml"
 # Share of an arm's torque rate limit that commands use. libfranka's own limiter stays 1e-3 Nm/s below the limit; an
@@ -44,6 +47,7 @@ class Robot:
         velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
             deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
         tool: the tip that touches; None: a bare end effector.
+        lock: {joint: rad or m} of the file that are welded.
     """
 
     name: str
@@ -63,6 +67,7 @@ class Robot:
     armature: np.ndarray
     velocity_envelope: tuple[np.ndarray, np.ndarray] | None = None
     tool: Tool | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -90,11 +95,10 @@ class Robot:
             memory: doubles of the callback's state.
             dt: time step, s.
         """
-        spec, _ = read_spec(self.mjcf)
+        spec, _ = read_spec(self.mjcf, self.lock)
         spec.compile()  # assigns the joints' ids; the changes below invalidate them
         joints = sorted(spec.joints, key=lambda joint: joint.id)
-        for item in [*spec.actuators, *spec.sensors, *spec.keys]:
-            spec.delete(item)
+        strip(spec)
         if self.ee_site not in [site.name for site in spec.sites]:
             spec.body(self.ee_site).add_site(name=self.ee_site)
         unit = np.degrees(1.0) if spec.compiler.degree else 1.0
@@ -108,7 +112,6 @@ class Robot:
         spec.nuserdata = memory
         spec.option.timestep = dt
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         spec.option.gravity = self.gravity if gravity else np.zeros(3)
         return spec.compile()
 
@@ -131,20 +134,6 @@ def per_joint(name: str, value: ArrayLike, n: int, joints: str) -> np.ndarray:
     return array
 
 
-def read_spec(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """Return the spec of an MJCF or URDF file and the velocity limits, (n,) or one, rad/s; nan: no limit.
-
-    Raises:
-        UserError: the file is not valid.
-    """
-    if is_urdf(path):
-        return read_urdf(path)
-    try:
-        return mujoco.MjSpec.from_file(str(path)), np.array(np.nan)
-    except ValueError as error:
-        raise UserError(f"robot.mjcf: {path} is not a valid MJCF: {' '.join(str(error).split())}") from None
-
-
 def load_robot(
     mjcf: str | None = None,
     *,
@@ -159,11 +148,13 @@ def load_robot(
     gravity: list[float] | None = None,
     armature: list[float] | float | None = None,
     tool: str | None = None,
+    lock: Mapping[str, float] | None = None,
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
     The file gives position and torque limits (MJCF: `actuatorfrcrange` of the joint, or `forcerange`/`ctrlrange` of
-    its motor); a URDF also gives velocity limits. Neither format has limits of acceleration or torque rate.
+    its motor) and, by a keyframe named home, q_home; a URDF also gives velocity limits. Neither format has limits of
+    acceleration or torque rate. `gravcomp`, disabled gravity and objects on free joints do not belong to the arm.
 
     Args:
         mjcf: the file; `r2s:models/panda.xml` is one of the package; None: the Panda.
@@ -172,6 +163,7 @@ def load_robot(
         gravity: (3,) m/s^2 in the base frame; None: the file's; for a URDF, that of an upright base.
         armature: kg m^2, rotor inertia at the joints; None: the file's.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
+        lock: {joint: rad or m} of the file that are welded there, such as a gripper's; None: none.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
@@ -180,12 +172,13 @@ def load_robot(
     if not path.is_file():
         others = [p.name for p in path.parent.glob("*.*")]
         raise UserError(f"robot.mjcf: no such file: {path}{nearest(path.name, others)}")
-    spec, fastest = read_spec(path)
+    spec, fastest = read_spec(path, lock)
     try:
         model = spec.compile()
     except ValueError as error:
         raise UserError(f"robot.mjcf: {path} is not a valid model: {' '.join(str(error).split())}") from None
-    _check_serial(model, path)
+    check_arm(model, path)
+    down = gravity_of(model, path) if gravity is None else per_joint("robot.gravity", gravity, 3, "x, y and z")
     n, site = model.njnt, _end_effector(model, ee, path)
 
     def each(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
@@ -195,9 +188,12 @@ def load_robot(
     low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
     high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
     tenth = 0.1 * np.where(np.isfinite(high - low), high - low, 0.0)
-    home = each("q_home", q_home, np.clip(model.qpos0, low + tenth, high - tenth))
-    torque = each("tau_max", tau_max, _torque_limits(model))
-    _check_limits(model, path, low, high, home, torque)
+    keys = {model.key(i).name: model.key_qpos[i] for i in range(model.nkey)}
+    home = each("q_home", q_home, keys.get("home", np.clip(model.qpos0, low + tenth, high - tenth)))
+    torque = each("tau_max", tau_max, torque_limits(model))
+    unset = [joint.name for joint in spec.joints if joint.info == NO_RANGE and (q_min is None or q_max is None)]
+    check_limits(model, path, low, high, home, torque, unset)
+    check_masses(model, path, down, home, torque)
     return Robot(
         name=spec.modelname or path.stem,
         mjcf=path.resolve(),
@@ -209,35 +205,14 @@ def load_robot(
         dtau_max=each("dtau_max", dtau_max, np.ones(n)),
         q_home=home,
         ee_site=site,
-        gravity=per_joint("robot.gravity", model.opt.gravity if gravity is None else gravity, 3, "x, y and z"),
+        gravity=down,
         mass=model.body_mass[model.jnt_bodyid].copy(),
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=_tensors(model),
-        armature=each("armature", armature, model.dof_armature),
+        armature=each("armature", armature, rotors(model)),
         tool=None if tool is None else load_tool(tool),
+        lock=dict(lock or {}),
     )
-
-
-def _check_limits(
-    model: mujoco.MjModel, path: Path, low: np.ndarray, high: np.ndarray, home: np.ndarray, torque: np.ndarray
-) -> None:
-    """Raise UserError unless position and torque limits are complete and q_home lies within them."""
-    valid = (low < high) & (np.isfinite(low) == np.isfinite(high))
-    if not np.all(valid):
-        j = int(np.argmin(valid))
-        raise UserError(
-            f"robot.q_min: expected q_min below q_max, or neither, got {low[j]:g} and {high[j]:g} rad (joint {j + 1})"
-        )
-    if not np.all(torque > 0):
-        joints = [model.joint(i).name or f"joint {i + 1}" for i in np.flatnonzero(~(torque > 0))]
-        raise UserError(
-            f"robot.tau_max: no torque limit of {choices(joints)} in {path.name}; set robot.tau_max=[...]"
-        )
-    if np.any(home < low) or np.any(home > high):
-        j = int(np.argmax(np.maximum(low - home, home - high)))
-        raise UserError(
-            f"robot.q_home: expected {low[j]:.3f} to {high[j]:.3f} rad, got {home[j]:.3f} (joint {j + 1})"
-        )
 
 
 def _tensors(model: mujoco.MjModel) -> np.ndarray:
@@ -247,26 +222,6 @@ def _tensors(model: mujoco.MjModel) -> np.ndarray:
         mujoco.mju_quat2Mat(rotation[i].reshape(9), model.body_iquat[body])
     principal = model.body_inertia[model.jnt_bodyid]
     return rotation * principal[:, None, :] @ rotation.transpose(0, 2, 1)
-
-
-def _check_serial(model: mujoco.MjModel, path: Path) -> None:
-    """Raise UserError unless all joints are hinges of one chain."""
-    for i in range(model.njnt):
-        if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_HINGE:
-            kind = mujoco.mjtJoint(int(model.jnt_type[i])).name
-            raise UserError(f"robot.mjcf: {path.name}: expected hinges, got {kind} (joint '{model.joint(i).name}')")
-    if model.njnt == 0:
-        raise UserError(f"robot.mjcf: {path.name} has no joints")
-    for previous, body in zip(model.jnt_bodyid[:-1], model.jnt_bodyid[1:], strict=True):
-        ancestors, at = [], body
-        while at:
-            at = model.body_parentid[at]
-            ancestors.append(at)
-        if previous not in ancestors:
-            raise UserError(
-                f"robot.mjcf: {path.name} is not a serial arm: link '{model.body(body).name}' does not follow "
-                f"'{model.body(previous).name}'"
-            )
 
 
 def _end_effector(model: mujoco.MjModel, name: str | None, path: Path) -> str:
@@ -292,17 +247,3 @@ def _ends(model: mujoco.MjModel) -> list[str]:
     last = model.jnt_bodyid[-1]
     parents = set(model.body_parentid.tolist())
     return [model.body(i).name for i in np.flatnonzero(model.body_weldid == last) if i not in parents]
-
-
-def _torque_limits(model: mujoco.MjModel) -> np.ndarray:
-    """Return the torque limits (n,) Nm of the joints' actuatorfrcrange or of their motors; nan: none in the file."""
-    limit = np.where(model.jnt_actfrclimited.astype(bool), np.abs(model.jnt_actfrcrange).min(1), np.nan)
-    for i in range(model.nu):
-        joint = model.actuator_trnid[i, 0]
-        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or not np.isnan(limit[joint]):
-            continue
-        if model.actuator_forcelimited[i]:
-            limit[joint] = np.abs(model.actuator_forcerange[i]).min() * abs(model.actuator_gear[i, 0])
-        elif model.actuator_ctrllimited[i] and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE:
-            limit[joint] = np.abs(model.actuator_ctrlrange[i]).min() * abs(model.actuator_gear[i, 0])
-    return limit

@@ -4,7 +4,7 @@ Meshes, materials and elements of simulators are ignored. The base and links fix
 does not count. A link fixed to a moving one becomes part of it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -12,12 +12,14 @@ import mujoco
 import numpy as np
 
 from r2s.errors import UserError, choices, nearest
+from r2s.physics.welds import Inertia, about, combined
 
 MOVING, FIXED = ("revolute", "continuous"), "fixed"
 ROUNDED = 1e-9  # share of a tensor's largest moment, round-off of the file
 DRAKE = "http://drake.mit.edu"  # XML namespace of Drake's rotor elements, for which URDF has none
 ROTOR, GEAR = f"{{{DRAKE}}}rotor_inertia", f"{{{DRAKE}}}gear_ratio"
 ET.register_namespace("drake", DRAKE)
+NO_RANGE = "limits 0 to 0"  # `info` of such a joint
 COUNT = {"xyz": 3, "rpy": 3, "size": 3}  # numbers in an attribute; 1 in all others
 
 
@@ -32,33 +34,20 @@ def is_urdf(path: Path) -> bool:
         return False
 
 
-def read_urdf(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:
+def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujoco.MjSpec, np.ndarray]:
     """Return the spec of a URDF and the joints' velocity limits (n,) rad/s; nan: no limit.
 
-    Bodies and joints keep their names, joints their damping and friction.
+    Bodies and joints keep their names, joints their damping and friction. The joints in `lock` ({name: rad or m}) are
+    fixed, and so are those that mimic them.
 
     Raises:
         UserError: no XML, no URDF, or not an arm of revolute joints.
     """
-    return _Reader(path).spec()
-
-
-Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; centre (3,), m; tensor (3, 3) about it, kg m^2
-
-
-def combined(parts: list[Inertia]) -> Inertia:
-    """Return the inertia of several bodies with parallel axes (Steiner's theorem)."""
-    mass = sum(m for m, _, _ in parts)
-    if len(parts) == 1 or mass == 0:
-        return float(mass), parts[0][1], parts[0][2]
-    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass
-    arms = [(m, c - com) for m, c, _ in parts]
-    steiner = sum((m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms), np.zeros((3, 3)))
-    return float(mass), com, sum((i for _, _, i in parts), np.zeros((3, 3))) + steiner
+    return _Reader(path, lock or {}).spec()
 
 
 class _Reader:
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, lock: Mapping[str, float]):
         self.path = path
         try:
             root = ET.parse(path).getroot()
@@ -69,8 +58,10 @@ class _Reader:
         if any("xacro" in element.tag for element in root.iter()):
             raise self._error("expected URDF, got xacro: convert it with `xacro FILE > arm.urdf`")
         self.name = root.get("name") or path.stem
+        self.placed: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # of locked joints
         self.links = self._named(root, "link")
         self.joints = self._named(root, "joint")
+        self._lock({str(name): float(value) for name, value in lock.items()})
         self.rotors = dict(self._rotor(element) for element in root.findall("transmission"))
         self.children: dict[str, list[ET.Element]] = {name: [] for name in self.links}
         self.above: dict[str, ET.Element] = {}
@@ -116,13 +107,52 @@ class _Reader:
             out[name] = element
         return out
 
+    def _lock(self, at: dict[str, float]) -> None:
+        """Turn joints, and those that mimic them, into fixed ones at a position, rad or m."""
+        for name in at:
+            if name not in self.joints:
+                joints = choices(self.joints)
+                raise UserError(
+                    f"robot.lock: no joint '{name}' in {self.path.name}; joints: {joints}{nearest(name, self.joints)}"
+                )
+        for name, joint in self.joints.items():
+            if (mimic := joint.find("mimic")) is not None and mimic.get("joint") in at and name not in at:
+                ratio, offset = (
+                    self._number(mimic, k, _what(joint), d) for k, d in (("multiplier", "1"), ("offset", "0"))
+                )
+                at[name] = ratio * at[mimic.get("joint", "")] + offset
+        for name, value in at.items():
+            joint = self.joints[name]
+            position, rotation = self._origin(joint, _what(joint))
+            along = self._axis(joint)
+            if joint.get("type") == "prismatic":
+                position = position + rotation @ along * value
+            elif joint.get("type") in MOVING:
+                rotation = rotation @ about(along, value)
+            else:
+                raise self._error(f"{_what(joint)}: robot.lock: expected a hinge or slide, got {joint.get('type')}")
+            self.placed[name] = position, rotation
+            joint.set("type", FIXED)
+            for mimic in joint.findall("mimic"):
+                joint.remove(mimic)
+
+    def _axis(self, joint: ET.Element) -> np.ndarray:
+        """Return the unit axis (3,) of a joint, in its frame."""
+        axis = joint.find("axis")
+        along = np.array([1.0, 0.0, 0.0]) if axis is None else self._numbers(axis, "xyz", "1 0 0", _what(joint))
+        if np.linalg.norm(along) < 1e-6:
+            raise self._error(f"{_what(joint)}: expected an axis, got 0 0 0")
+        return along / np.linalg.norm(along)
+
     def _attach(self, joint: ET.Element) -> None:
         """Register the links of a joint."""
         kind, child = joint.get("type"), self._end(joint, "child")
+        lock = f"; robot.lock={{{joint.get('name')}: 0}} welds it there"
         if kind not in (*MOVING, FIXED):
-            raise self._error(f"{_what(joint)}: expected {choices((*MOVING, FIXED))}, got {kind}")
+            hint = lock if kind == "prismatic" else ""
+            raise self._error(f"{_what(joint)}: expected {choices((*MOVING, FIXED))}, got {kind}{hint}")
         if joint.find("mimic") is not None:
-            raise self._error(f"{_what(joint)}: mimic joints are not supported")
+            raise self._error(f"{_what(joint)}: mimic joints are not supported{lock}")
         if child in self.above:
             raise self._error(f"link '{child}' has two joints, {_what(self.above[child])} and {_what(joint)}")
         self.above[child] = joint
@@ -171,7 +201,9 @@ class _Reader:
         return float(self._numbers(element if element is not None else ET.Element(key), key, default, owner)[0])
 
     def _origin(self, element: ET.Element, owner: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (3,) m and rotation (3, 3) of an element's <origin>."""
+        """Return position (3,) m and rotation (3, 3) of an element's <origin>, or of a locked joint."""
+        if element.tag == "joint" and element.get("name") in self.placed:
+            return self.placed[element.get("name", "")]
         origin = element.find("origin")
         origin = ET.Element("origin") if origin is None else origin
         angles = self._numbers(origin, "rpy", "0 0 0", owner)
@@ -180,11 +212,8 @@ class _Reader:
     def _move(self, body: mujoco.MjsBody, joint: ET.Element) -> float:
         """Add the joint of a body; return its velocity limit, rad/s, or nan."""
         what = _what(joint)
-        axis, limit, dynamics = (joint.find(tag) for tag in ("axis", "limit", "dynamics"))
-        along = np.array([1.0, 0.0, 0.0]) if axis is None else self._numbers(axis, "xyz", "1 0 0", what)
-        if np.linalg.norm(along) < 1e-6:
-            raise self._error(f"{what}: expected an axis, got 0 0 0")
-        hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=along)
+        limit, dynamics = (joint.find(tag) for tag in ("limit", "dynamics"))
+        hinge = body.add_joint(name=joint.get("name"), type=mujoco.mjtJoint.mjJNT_HINGE, axis=self._axis(joint))
         hinge.armature = self.rotors.get(joint.get("name", ""), 0.0)
         hinge.damping[0] = self._number(dynamics, "damping", what, "0")
         hinge.frictionloss = self._number(dynamics, "friction", what, "0")
@@ -193,8 +222,10 @@ class _Reader:
         )
         if low > high:
             raise self._error(f"{what}: expected lower below upper, got {low:g} and {high:g} rad")
-        # some files declare a continuous joint as revolute without a range
+        # some files declare a continuous joint as revolute without a range; 0 to 0 is a mistake
         hinge.limited = int(joint.get("type") == "revolute" and low < high)
+        if joint.get("type") == "revolute" and low == high and limit is not None and limit.get("upper"):
+            hinge.info = NO_RANGE
         if hinge.limited:
             hinge.range = low, high
         hinge.actfrclimited = int(effort > 0)

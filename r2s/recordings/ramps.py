@@ -9,7 +9,8 @@ import numpy as np
 
 from r2s.errors import UserError, nearest
 from r2s.recordings import readers
-from r2s.recordings.readers import Options, Spec, find_columns, scalar
+from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, find_columns, listed
+from r2s.recordings.readers import Options, scalar
 from r2s.recordings.recording import FIELDS, Recording, save_npz
 from r2s.recordings.robot_logs import Table
 
@@ -103,7 +104,7 @@ def _from_columns(table: Table, columns: dict[str, Spec], n_joints: int | None, 
         if field not in table:
             raise UserError(
                 f"no column '{field}': ramps need 'joint' (from 1) and 'sign' (1 or -1), per row or per ramp; "
-                f"columns: {readers.listed(table)}{nearest(field, table)}"
+                f"columns: {listed(table)}{nearest(field, table)}"
             )
     t = scalar(table, find_columns(table, "t", columns.get("t")))
     found = find_columns(table, "trajectory", columns.get("trajectory"))
@@ -122,10 +123,10 @@ def _from_columns(table: Table, columns: dict[str, Spec], n_joints: int | None, 
     cut[1:] |= steps > gap
     trajectory = np.cumsum(cut)
     rows = np.bincount(trajectory)[trajectory] > 1  # a single row has no motion
-    dropped = ("joint", "sign", *readers.DEFAULT_COLUMNS["trajectory"])
+    dropped = ("joint", "sign", *DEFAULT_COLUMNS["trajectory"])
     table = {k: v[rows] if len(v) == len(t) else v for k, v in table.items() if v.ndim and k not in dropped}
     table["trajectory"] = np.unique(trajectory[rows], return_inverse=True)[1]
-    how = Options("commanded", columns | {"trajectory": "trajectory"}, n_joints, name=name)
+    how = Options("commanded", columns | {"trajectory": "trajectory"}, n_joints, name=name, repair=False)
     motion = readers.from_table(table, how)
     first = [s.start for s in motion.stretches]
     joint, sign = joint[rows][first], sign[rows][first]

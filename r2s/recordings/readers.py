@@ -1,9 +1,8 @@
 """Read a `Recording` from .csv, .npz, .parquet, HDF5 or a robot's log, with one mapping of column names."""
 
 import os
-import re
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,25 +13,16 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import DAMAGED
+from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed, specs_of
+from r2s.recordings.csv_table import read_csv, without_units
 from r2s.recordings.recording import MIN_ROWS, SIGNALS, Recording, declared_torque
-from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra
+from r2s.recordings.repairs import held, repair_rows, unwrap
+from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra, rostopic_table
 
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
-DEFAULT_COLUMNS = {  # the first name in the file counts
-    "t": ("t",),
-    "q": ("q",),
-    "dq": ("dq",),
-    "tau": ("tau",),
-    "trajectory": ("segment", "trajectory"),
-}
-TAU = {"measured": "tau_J", "commanded": "tau_J_d", "motor": "tau_motor"}  # preferred to the column tau
-CURRENT = ("current", "i")  # used with a torque constant
-OPTIONAL = ("dq", "trajectory")
 NO_BAG = dict.fromkeys(("topic", "joints", "model_joints", "n_joints"))
 RESTART_S = 0.1  # s, a clock that goes back to within this of its first value has restarted
-
-Spec = str | list[str] | None
 
 
 @dataclass(frozen=True)
@@ -47,6 +37,9 @@ class Options:
     name: str = ""
     torque_constant: np.ndarray | None = None
     restarts: bool = False  # a clock that goes back to its start begins a new trajectory
+    robot_joints: Sequence[str] | None = None
+    limits: tuple[np.ndarray, np.ndarray] | None = None
+    repair: bool = True  # rows may be left out
 
 
 def read(
@@ -62,6 +55,7 @@ def read(
     joints: Sequence[str] | None = None,
     model_joints: Sequence[str] | None = None,
     torque_constant: ArrayLike | None = None,
+    limits: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Recording:
     """Read the recording in `path`; the logs of libfranka and of Franka's ROS messages hold several torques.
 
@@ -76,12 +70,17 @@ def read(
         max_gap_s: a longer pause in time begins a new trajectory; None: no splitting.
         period: s, see `Recording`.
         name: of the recording; the default is the file's.
-        topic, joints, model_joints: of a bag, see `bag_table`.
+        topic: of a bag, see `bag_table`.
+        joints, model_joints: names of the robot's joints in the file and in its description; they give the order of
+            what the file names, see `by_names` and `choose_joints`.
         torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
 
+        limits: lowest and highest q of the robot (n,) rad: angles that differ by whole turns are turned into them.
+
     Without a column dq, dq is the central difference of q over the logged time. Without a column trajectory, gaps
-    separate trajectories, and (not in a bag) so does a clock that goes back to its start. A file of `Recording.save`
-    is restored unchanged.
+    separate trajectories, and (not in a bag) so does a clock that goes back to its start. Faults with one remedy are
+    repaired (r2s/recordings/repairs.py), and the recording's notes say so. A file of `Recording.save` is restored
+    unchanged.
 
     Raises:
         UserError: the file or a column is missing or damaged, or the values do not make a recording.
@@ -91,7 +90,10 @@ def read(
     table = load_table(path, {"topic": topic, "joints": joints, "model_joints": model_joints, "n_joints": n_joints})
     restarts = not is_bag(path)  # a bag may mix the messages of two starts
     how = Options(torque, columns or {}, n_joints, max_gap_s, period, name or path.stem, constant, restarts)
+    how = replace(how, robot_joints=model_joints, limits=limits)
     try:
+        if not is_bag(path):
+            table = by_names(table, joints, model_joints, n_joints)
         return from_table(table, how)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
@@ -103,14 +105,21 @@ def from_table(table: Table, how: Options) -> Recording:
     table = {k: v for k, v in table.items() if v.ndim > 0}
     torque = _agreed_torque(how.torque, notes.get("torque"))
     constant = how.torque_constant
-    found = {x: find_columns(table, x, spec, torque, constant) for x, spec in _specs(how.columns).items()}
+    specs, names_of = specs_of(how.columns), how.robot_joints
+    found = {x: find_columns(table, x, spec, torque, constant, names_of) for x, spec in specs.items()}
     arrays = {
         x: _vector(table, names, how.n_joints, x) if x in ("q", "dq", "tau") else scalar(table, names)
         for x, names in found.items()
         if names
     }
+    saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
+    repair = how.repair and not saved
+    arrays, repairs = repair_rows(arrays) if repair else (arrays, [])
     if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
         arrays["trajectory"] = index
+    if not saved:
+        arrays, more = unwrap(arrays, how.limits)
+        repairs += more
     if not np.any(arrays["tau"]):  # position-controlled and simulated arms fill the field with zeros
         raise UserError(f"tau ({listed(found['tau'])}) is 0 in every row: this log holds no {torque} torque")
     if constant is not None:
@@ -121,14 +130,25 @@ def from_table(table: Table, how: Options) -> Recording:
     derive_dq = "dq" not in arrays
     if derive_dq:
         arrays["dq"] = np.zeros_like(arrays["q"])
-    saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
     signals = {k: v for k, v in table.items() if k in SIGNALS} if saved else {}
     period = notes.get("period") if saved and how.period is None else how.period
     name = notes["name"] if saved else how.name
-    recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)
+    recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals, notes=tuple(repairs))
     if how.max_gap_s is not None and not saved:
         recording = recording.split_at_gaps(how.max_gap_s)
+    if repair:
+        recording = _without_holds(recording)
     return replace(recording, dq=recording.derivative(recording.q)) if derive_dq else recording
+
+
+def _without_holds(recording: Recording) -> Recording:
+    """Return the rows that have values of their own, of a log that repeats slower values."""
+    rows = held(recording.t, recording.q, recording.dq, recording.stretches)
+    if rows is None:
+        return recording
+    kept = recording.rows(np.flatnonzero(rows), recording.trajectory[rows], drop_lone=True)
+    note = f"each value is repeated: the log has {recording.rate_hz:.4g} rows/s, its values {kept.rate_hz:.4g} per s"
+    return replace(kept, notes=(*recording.notes, f"{note}; the repetitions are left out"))
 
 
 def restart_index(t: np.ndarray) -> np.ndarray | None:
@@ -154,16 +174,6 @@ def _agreed_torque(declared: str | None, stored) -> str:
     return stored
 
 
-def _specs(columns: Mapping[str, Spec]) -> dict[str, Spec]:
-    for key in columns:
-        if key not in DEFAULT_COLUMNS:
-            raise UserError(
-                f"unknown key '{key}' in data.columns; allowed: {choices(DEFAULT_COLUMNS)}"
-                f"{nearest(str(key), DEFAULT_COLUMNS)}"
-            )
-    return {x: columns.get(x) for x in DEFAULT_COLUMNS}
-
-
 def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
     """Return torque constants in Nm/A, () or (n,), or None if none are given."""
     if value is None:
@@ -178,91 +188,6 @@ def _constant(value: ArrayLike | None, torque: str | None) -> np.ndarray | None:
     if constant.ndim > 1 or not np.all(np.isfinite(constant)) or np.any(constant == 0):
         raise UserError(f"{where}: expected finite Nm/A other than 0, one or one per joint, got {constant.tolist()}")
     return constant
-
-
-def _is_current(name: str) -> bool:
-    """Return whether a column's name denotes a current, which must not be read as a torque."""
-    base = name.rsplit("/", 1)[-1].lower()
-    return "current" in base or re.fullmatch(r"i(_?(\d+|\{[ij]\})|\[\d+\])?", base) is not None
-
-
-def find_columns(
-    table: Table, field: str, spec: Spec, torque: str = "", constant: np.ndarray | None = None
-) -> list[str]:
-    """Return the columns of a field; [] if an optional one is absent."""
-    candidates = DEFAULT_COLUMNS[field]
-    if field == "tau":
-        candidates = (TAU[torque], *candidates) if constant is None else CURRENT
-        named = [name for name in ([spec] if isinstance(spec, str) else spec or []) if _is_current(name)]
-        if spec is None and not any(_match(table, field, name) for name in candidates):
-            named = [name for name in CURRENT if _match(table, field, name)]
-        if named and torque == "motor" and constant is None:
-            raise UserError(
-                f"column '{named[0]}' is a current: set data.torque_constant=[Nm/A of each joint, gear included]"
-            )
-    if spec is not None and not isinstance(spec, str):
-        missing = [name for name in spec if name not in table]
-        if missing or not spec:
-            raise _missing(table, field, missing[0] if missing else "")
-        return list(spec)
-    for name in candidates if spec is None else (spec,):
-        names = _match(table, field, name)
-        if names:
-            return names
-    if field in OPTIONAL and spec in (None, *candidates):
-        return []
-    raise _missing(table, field, spec or candidates[0], torque)
-
-
-def _match(table: Table, field: str, name: str) -> list[str]:
-    """Return the columns that a name stands for."""
-    if field in ("t", "trajectory"):
-        return [name] if name in table else []
-    if name in table and table[name].ndim > 1:
-        return [name]
-    if "{j}" in name or "{i}" in name:
-        return _numbered(table, re.sub(r"\{[ij]\}", "{}", name), 1 if "{j}" in name else 0)
-    for pattern in (name + "{}", name + "_{}", name + "[{}]"):
-        names = _numbered(table, pattern, None)
-        if names:
-            return names
-    return [name] if name in table else []
-
-
-def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
-    """Return the columns numbered by `pattern` without a gap, from `first` (None: 0 if present, else 1)."""
-    before, _, after = pattern.partition("{}")
-    hits = (re.fullmatch(re.escape(before) + r"(0|[1-9]\d*)" + re.escape(after), name) for name in table)
-    numbers = sorted(int(hit[1]) for hit in hits if hit)
-    if first is None:
-        first = 0 if 0 in numbers else 1
-    numbers = [number for number in numbers if number >= first]
-    for expected, number in enumerate(numbers, start=first):
-        if number != expected:
-            raise UserError(f"expected column '{before}{expected}{after}' before '{before}{number}{after}'")
-    return [f"{before}{number}{after}" for number in numbers]
-
-
-def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
-    """Return the error for a missing column; another kind of torque is never suggested as a typo."""
-    inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
-    nested = [key for key, last in inside.items() if last == name]
-    hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)
-    for other, column in TAU.items():
-        known = column in inside.values() or _match(table, field, column)
-        if field == "tau" and torque and other != torque and known and not nested:
-            hint = f"; {column} is {other} torque"
-    in_nm = [column for column in (TAU["motor"], "tau") if _match(table, field, column)]
-    if torque == "motor" and name in CURRENT and in_nm:
-        hint = f"; if {in_nm[0]} is in Nm, leave data.torque_constant null"
-    of = f" ({torque} torque)" if torque and field == "tau" else ""
-    return UserError(f"no column '{name}' for {field}{of}; columns: {listed(table)}{hint} (set data.columns.{field})")
-
-
-def listed(names: Iterable[str], limit: int = 40) -> str:
-    """Return at most `limit` names for an error message."""
-    names = list(names)
-    return choices(names[:limit]) + (f", ... ({len(names)} in all)" if len(names) > limit else "")
 
 
 def _vector(table: Table, names: list[str], n_joints: int | None, field: str) -> np.ndarray:
@@ -323,10 +248,10 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
     try:
         if is_bag(path):
             return bag_table(path, **bag)
-        for key in ("topic", "joints"):
+        for key in ("topic", "joints") if suffix in (".csv", ".parquet") else ("topic",):
             if bag[key] is not None:
                 raise UserError(f"data.{key}: expected null for {suffix}, got {bag[key]}: it is for {choices(BAGS)}")
-        return libfranka_table(_columns(path, suffix))
+        return rostopic_table(libfranka_table(without_units(_columns(path, suffix))))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     except DAMAGED as error:
@@ -339,7 +264,9 @@ def _columns(path: Path, suffix: str) -> Table:
         return _load_hdf5(path)
     if suffix == ".npz":
         return _load_npz(path)
-    frame = pd.read_csv(path, skipinitialspace=True, low_memory=False) if suffix == ".csv" else pd.read_parquet(path)
+    if suffix == ".csv":
+        return read_csv(path)
+    frame = pd.read_parquet(path)
     return {str(name).strip(): _column(frame[name]) for name in frame.columns}
 
 

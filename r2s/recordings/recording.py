@@ -37,6 +37,7 @@ class Recording:
         signals: {name of `SIGNALS`: (T,) or (T, k)}, what the arm knew in each row; None: nothing.
         trajectory: (T,) index of the continuous stretch of each row; None: all rows are one stretch.
         period: s, the excitation repeats itself in `t` with this period (see `split`); None: it does not.
+        notes: what the reader repaired, a line each.
     """
 
     t: np.ndarray
@@ -48,6 +49,7 @@ class Recording:
     period: float | None = None
     name: str = ""
     signals: Mapping[str, np.ndarray] = None  # type: ignore[assignment]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         for field in FIELDS[:4]:
@@ -101,9 +103,11 @@ class Recording:
             back = np.flatnonzero(np.diff(self.t[stretch]) <= 0)
             if len(back):
                 row = stretch.start + int(back[0]) + 1
+                equal = self.t[row] == self.t[row - 1]
+                hint = "log more digits of the time" if equal else "a restarted clock needs a new trajectory"
                 raise UserError(
                     f"time does not increase at row {row}: t is {self.t[row - 1]!s}, then {self.t[row]!s} s "
-                    f"({len(back)} such rows in trajectory {label}; a restarted clock needs a new trajectory)"
+                    f"({len(back)} such rows in trajectory {label}; {hint})"
                 )
 
     @property
@@ -140,7 +144,7 @@ class Recording:
             raise UserError(f"expected a mask of shape {self.t.shape} bool, got {mask.shape} {mask.dtype}")
         rows = np.flatnonzero(mask)
         cut = (np.diff(rows) != 1) | (np.diff(self.trajectory[rows]) != 0)
-        return self._rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
+        return self.rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
 
     def split_at_gaps(self, max_gap_s: float) -> "Recording":
         """Start a new trajectory after each pause longer than `max_gap_s`; drop rows with a gap on both sides."""
@@ -155,7 +159,7 @@ class Recording:
             return self
         cut = (np.diff(self.t) > max_gap_s) | (np.diff(self.trajectory) != 0)
         trajectory = np.concatenate([[0], np.cumsum(cut)])
-        return self._rows(np.arange(len(self.t)), trajectory, drop_lone=True)
+        return self.rows(np.arange(len(self.t)), trajectory, drop_lone=True)
 
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
@@ -302,7 +306,8 @@ class Recording:
         own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
         return {**own, **period, **self.signals}
 
-    def _rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
+    def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
+        """Return these rows (K,) with their trajectory index (K,); drop_lone: without trajectories of one row."""
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
             rows, trajectory = rows[together], np.unique(trajectory[together], return_inverse=True)[1]
@@ -312,7 +317,7 @@ class Recording:
 
     def _without_lone_rows(self) -> "Recording":
         dense = np.unique(self.trajectory, return_inverse=True)[1]
-        return self._rows(np.arange(len(self.t)), dense, drop_lone=True)
+        return self.rows(np.arange(len(self.t)), dense, drop_lone=True)
 
 
 def save_npz(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""Robot logs as tables of t, q, dq and tau for `readers.read`: ROS 1 and ROS 2 bags, MCAP, and libfranka's CSV."""
+"""Robot logs as tables of t, q, dq and tau for `readers.read`: bags, MCAP, and the CSV of libfranka and rostopic."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -47,6 +47,30 @@ def libfranka_table(table: Table) -> Table:
     if "tau_J_d" in found and numeric and found["tau_J_d"].dtype.kind in "iuf":
         found["tau_J_d"] = shift_command(t, found["tau_J_d"])
     return found | table
+
+
+def rostopic_table(table: Table) -> Table:
+    """Add t, q, dq, tau and joint_names to a JointState log of `rostopic echo -p`; return other tables unchanged.
+
+    Its stamps are in ns; `field.name0` and so on hold the names, which some drivers sort by the alphabet.
+    """
+    fields = {"q": "field.position", "dq": "field.velocity", "tau": "field.effort"}
+    stamp = table.get("field.header.stamp")
+    if stamp is None or stamp.dtype.kind not in "iuf" or "field.position0" not in table:
+        return table
+    found = {"t": (stamp - stamp[0]) * 1e-9}
+    for field, name in fields.items():
+        columns = [table[k] for k in sorted((k for k in table if re.fullmatch(name + r"\d+", k)), key=_last_number)]
+        if columns and all(column.dtype.kind in "iuf" for column in columns):
+            found[field] = np.stack(columns, axis=1)
+    names = [table[k] for k in sorted((k for k in table if re.fullmatch(r"field\.name\d+", k)), key=_last_number)]
+    if names and all((column == column[0]).all() for column in names):
+        found["joint_names"] = np.array([str(column[0]) for column in names])
+    return found | table
+
+
+def _last_number(name: str) -> int:
+    return int(re.findall(r"\d+", name)[-1])
 
 
 def shift_command(t: np.ndarray, tau_J_d: np.ndarray) -> np.ndarray:
@@ -99,6 +123,8 @@ def bag_table(
     stamp = np.array([s.stamp for s in kept])
     if not stamp.any():
         stamp = np.array([s.received for s in kept])
+    first = int(np.argmax(stamp != 0))  # a driver may send messages before it knows the time
+    stamp, table = stamp[first:], {field: x[first:] for field, x in table.items()}
     stamp, table = _in_order(stamp, table)
     table["t"] = (stamp - stamp[0]) * 1e-9  # integer difference: an epoch in seconds has a resolution of 0.2 us
     if "tau_J_d" in table:

@@ -119,14 +119,23 @@ def file_data(cfg, path=None):
 
 
 def read_file(robot, file, path, torque=None):
-    """Return the recording at `path`, with the columns of a `FileData`; `torque`: its kind, if not data.torque."""
-    from r2s.recordings.readers import read
+    """Return the recording at `path`, with the columns of a `FileData`; `torque`: its kind, if not data.torque.
+
+    What the reader repaired is printed. A second recording in another format need not have the first one's topic.
+    """
+    from r2s.recordings.readers import is_bag, read
 
     file = file if torque is None else replace(file, torque=torque)
     keys = ("torque", "torque_constant", "columns", "period", "max_gap_s", "topic", "joints")
     names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
     how = {k: getattr(file, k) for k in keys}
-    return read(path, **how, n_joints=robot.n, model_joints=names if all(names) else None)
+    if path != file.path and file.path and is_bag(Path(file.path)) and not is_bag(Path(path)):
+        how |= {"topic": None, "joints": None}
+    limits = robot.q_min, robot.q_max
+    out = read(path, **how, n_joints=robot.n, model_joints=names if all(names) else None, limits=limits)
+    for note in out.notes:
+        print(f"{path}: {note}")
+    return out
 
 
 def read_motion(robot, file, share):
@@ -164,6 +173,17 @@ def read_motion(robot, file, share):
             "motion (to hold out a part of a periodic motion, leave data.validation=null)"
         )
     return recording, validation
+
+
+def check_cutoff(cutoff_hz, recordings):
+    """Raise UserError unless identify.cutoff_hz is below the Nyquist rate of each recording."""
+    check_number("identify.cutoff_hz", cutoff_hz, "(0, 500)")  # r2s works at 1 kHz
+    for recording in recordings:
+        if cutoff_hz >= 0.499 * recording.rate_hz:  # the clock of a log jitters
+            raise UserError(
+                f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
+                f"{recording.name or 'the recording'} ({recording.rate_hz:.4g} Hz), got {cutoff_hz:g}"
+            )
 
 
 def read_user_ramps(robot, file):

@@ -7,7 +7,7 @@ from typing import Any
 from r2s.errors import check_number
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
 from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration, only_contact
-from r2s.stages.data import check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
+from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
 from r2s.stages.parts import called, part, plain
 
 WHY = {
@@ -72,10 +72,12 @@ def make_parts(cfg):
         file = file_data(cfg)
         contact = contact_data(cfg, robot, file)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
+        check_cutoff(cfg.identify.cutoff_hz, (train, validation))
         ramps = read_user_ramps(robot, file)
         files = [*file.files, *(contact.files if contact else [])]
         return Parts(robot, nominal, searches, files, None, train, validation, ramps, contact)
     check_data(cfg)
+    check_cutoff(cfg.identify.cutoff_hz, ())
     ramp_poses(cfg, robot)
     check_source(cfg, robot)
     if not cfg.data.excitation:
@@ -138,7 +140,8 @@ def identify(cfg, overrides):
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         for row in found.history.to_dict("records"):
             run.track("metrics", row)
-        write_description(run.folder / "model", robot, found.dynamics)
+        for line in write_description(run.folder / "model", robot, found.dynamics):
+            print(line)
         run.summary(summary)
         identification_page(run, robot, nominal, found, validation, summary, **how)
         identification_table(console(), robot, found, summary)

@@ -1,0 +1,183 @@
+"""How much of a recording's torque the nominal arm explains, and which other order, mounting or mass explains it."""
+
+from collections.abc import Sequence
+from copy import copy
+from itertools import combinations
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from r2s.physics.friction import WIDTH_DQ
+from r2s.physics.rigid_body import LinkInertia, mujoco_inverse_dynamics, regressor
+from r2s.physics.robot import Robot
+
+MASS, MASS_LEFT = 3.0, 0.1  # a link's factor that is named, and the share of the misfit that it leaves, at most
+CARRIED = 3  # last links, whose mass an undeclared payload may explain
+TILTED = np.radians(20)  # angle of a mounting that is named; link masses are not known better
+INERTIA = 0.3, 4.0  # allowed scale of the nominal torque: published tensors, payloads, sensor gains
+FRICTION, OFFSET = 0.5, 0.1  # of tau_max, at most
+MAX_LEFT = 2.0  # upper limit of the unexplained share of a joint
+# gravity is judged where it changes: least RMS, of tau_max; factor of a standard error for correlated rows; largest
+# standard error of the share
+CHANGES, CORRELATED, MAX_SIGMA = 0.01, 3.0, 0.15
+
+
+class Moments(NamedTuple):
+    """Motion at which torque is compared: q, dq, ddq, tau (T, n), zero-phase filtered; dq and ddq are slopes of q."""
+
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    tau: np.ndarray
+
+
+class Unexplained:
+    """Share of a torque's square that the motion of its joint does not explain; `seen`: the judged joints."""
+
+    def __init__(self, robot: Robot, m: Moments, gravity: bool):
+        self.robot, self.m = robot, m
+        self.seen, self.need = np.arange(robot.n), self.inverse_dynamics(gravity)
+
+    def with_need(self, need: np.ndarray) -> "Unexplained":
+        """Return the same with another nominal torque (T, n) Nm."""
+        out = copy(self)
+        out.need = need
+        return out
+
+    def inverse_dynamics(self, gravity: bool, down: np.ndarray | None = None) -> np.ndarray:
+        """Return (T, n) Nm of the nominal arm without friction; down: (3,) m/s^2 instead of the robot's gravity."""
+        model = self.robot.model(gravity=gravity)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+        if down is not None:
+            model.opt.gravity[:] = down
+        return mujoco_inverse_dynamics(model, self.m.q, self.m.dq, self.m.ddq)
+
+    def fit(self, parts: np.ndarray) -> np.ndarray:
+        """Return the factors (K,) of torques (K, T, n) Nm that all joints share, beside their own friction."""
+        rows = np.concatenate(self._apart([*parts, self.m.tau - self.need]))
+        return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
+
+    def misfit(self) -> float:
+        """Return the square of tau minus the nominal torque over that of tau, beside each joint's own friction."""
+        left, whole = np.square(np.concatenate(self._apart([self.m.tau - self.need, self.m.tau]))).sum(0)
+        return float(left / max(whole, 1e-12))
+
+    def scaled(self) -> tuple[np.ndarray, float]:
+        """Return each joint's factor (S,) of the nominal torque that fits tau best, and the misfit that is left."""
+        factors, left, whole = [], 0.0, 1e-12
+        for need, tau in (x.T for x in self._apart([self.need, self.m.tau])):
+            factors.append(need @ tau / max(need @ need, 1e-12))
+            left, whole = left + float(((tau - factors[-1] * need) ** 2).sum()), whole + float(tau @ tau)
+        return np.array(factors), left / whole
+
+    def _apart(self, torques: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return (T, K) of each joint, in shares of tau_max: torques (T, n) without its friction and offset."""
+        out = []
+        for j in self.seen.tolist():
+            own = np.column_stack([np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(self.m.dq))])
+            x = np.column_stack([tau[:, j] for tau in torques]) / self.robot.tau_max[j]
+            out.append(x - own @ np.linalg.lstsq(own, x, rcond=None)[0])
+        return out
+
+    def gravity_shares(self) -> np.ndarray | None:
+        """Return the share of nominal gravity in tau for each joint whose motion determines it, or None."""
+        inertial = self.inverse_dynamics(False)
+        weight, shares = self.inverse_dynamics(True) - inertial, []
+        for j in self.seen:
+            parts = inertial[:, j], np.tanh(self.m.dq[:, j] / WIDTH_DQ), self.m.dq[:, j], np.ones(len(weight))
+            rest = np.column_stack(parts)
+            a, b = (x - rest @ np.linalg.lstsq(rest, x, rcond=None)[0] for x in (weight[:, j], self.m.tau[:, j]))
+            square = max(a @ a, 1e-12)
+            share = a @ b / square
+            if CORRELATED * np.sqrt(((b - a * share) ** 2).mean() / square) < MAX_SIGMA and (
+                square / len(a) > (CHANGES * self.robot.tau_max[j]) ** 2
+            ):
+                shares.append(share)
+        return np.array(shares) if shares else None
+
+    def each(self, tau: np.ndarray) -> np.ndarray:
+        """Return (S,): the unexplained share of tau (T, n) of each joint, given its own motion."""
+        return np.array([self._share(j, tau[:, j]) for j in self.seen.tolist()])
+
+    def pairs(self) -> np.ndarray:
+        """Return (S, S): the unexplained share of column k of tau, given the motion of joint j."""
+        return np.array([[self._share(j, self.m.tau[:, k]) for k in self.seen] for j in self.seen.tolist()])
+
+    def _share(self, j: int, tau: np.ndarray) -> float:
+        """Explain tau (T,) Nm by joint j: nominal torque, a rotor, Coulomb and viscous friction, an offset."""
+        most, m = self.robot.tau_max[j], self.m
+        slow = [m.ddq[:, j], np.tanh(m.dq[:, j] / WIDTH_DQ), m.dq[:, j]]
+        scale = most / np.maximum([np.sqrt((x**2).mean()) for x in slow], 1e-9)
+        scaled = [x * s for x, s in zip(slow, scale, strict=True)]
+        columns = np.column_stack([self.need[:, j], *scaled, np.full(len(tau), most)])
+        low, high = [INERTIA[0], 0.0, 0.0, 0.0, -OFFSET], [INERTIA[1], *[FRICTION] * 3, OFFSET]
+        fit = lsq_linear(columns, tau, bounds=(low, high))
+        return min(float(2.0 * fit.cost / max((tau**2).sum(), 1e-12)), MAX_LEFT)
+
+
+def other_orders(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
+    """Return corrections by another order of all columns, or of tau's: by name, rotated, reversed, or two swapped."""
+    robot, m, every, out = left.robot, left.m, np.arange(left.robot.n), []
+    names = [robot.model(gravity=False).joint(i).name for i in range(robot.n)]
+    orders = {tuple(np.argsort(np.argsort(names))): " (the log has them in alphabetical order)"}
+    for k in range(1, robot.n):
+        orders.setdefault(tuple(np.roll(every, k)), "")
+    orders.setdefault(tuple(every[::-1]), "")
+    for i, j in combinations(range(robot.n), 2):
+        swap = every.copy()
+        swap[[i, j]] = j, i
+        orders.setdefault(tuple(swap), "")
+    orders.pop(tuple(every), None)
+    for order, why in orders.items():
+        own = left.with_need(left.need)
+        own.m = m._replace(tau=m.tau[:, order])
+        off = [j for j in range(robot.n) if order[j] != j]
+        columns, joints = (", ".join(str(k + 1) for k in x) for x in ([order[j] for j in off], off))
+        words = f"has its joints in another order than q: columns {columns} of tau fit joints {joints}{why}"
+        out.append((own.misfit(), words))
+        turned = Moments(*(x[:, order] for x in m))
+        if (turned.q >= robot.q_min).all() and (turned.q <= robot.q_max).all():
+            columns = " ".join(str(k + 1) for k in order)
+            words = f"and the motion fit {robot.name} only with the joints in another order: columns {columns}{why}"
+            out.append((Unexplained(robot, turned, gravity).misfit(), words))
+    return out
+
+
+def other_masses(left: Unexplained, gravity: bool) -> list[tuple[float, str]]:
+    """Return corrections by another mass of one link, with its moments in proportion."""
+    robot, m, out = left.robot, left.m, []
+    y = regressor(robot, m.q, m.dq, m.ddq, robot.gravity if gravity else None)
+    standard, names = LinkInertia(robot.mass, robot.com, robot.inertia).standard(), robot.model(gravity=False)
+    for k in range(robot.n - CARRIED):
+        own = y[:, :, k] @ standard[k]
+        (change,) = left.fit(own[None])
+        if (1 + change > MASS or 1 + change < 1 / MASS) and 1 + change > 0:
+            link, mass = names.body(names.jnt_bodyid[k]).name or f"link {k + 1}", robot.mass[k]
+            words = (
+                f"fits {robot.name} only if link '{link}' has {mass * (1 + change):.3g} kg, not {mass:.3g}: correct "
+                f"its mass and tensor in {robot.mjcf.name}"
+            )
+            out.append((left.with_need(left.need + change * own).misfit(), words))
+    return out
+
+
+def mounting(left: Unexplained) -> list[tuple[float, str]]:
+    """Return the correction by another direction of gravity, fitted to the torque: an arm on a wall or a ceiling."""
+    robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
+    inertial = left.inverse_dynamics(False)
+    parts = np.array([left.inverse_dynamics(True, g) - inertial for g in np.eye(3)])
+    fitted = left.with_need(inertial).fit(parts)
+    if size == 0 or not np.any(fitted):
+        return []
+    down = fitted / np.linalg.norm(fitted)
+    axis = np.eye(3)[np.abs(down).argmax()] * np.sign(down[np.abs(down).argmax()])
+    down = axis if down @ axis > np.cos(0.5 * TILTED) else down
+    cosine = float(down @ robot.gravity / size)
+    if cosine > np.cos(TILTED):
+        return []
+    where = "hangs" if cosine < -0.9 else "is mounted on a wall" if abs(cosine) < 0.4 else "is mounted at an angle"
+    given = ", ".join(f"{size * x + 0.0:.3g}" for x in down)
+    words = f"fits {robot.name} only if it {where}: set robot.gravity=[{given}]"
+    return [(left.with_need(inertial + size * np.tensordot(down, parts, 1)).misfit(), words)]

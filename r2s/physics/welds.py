@@ -1,0 +1,96 @@
+"""Poses, and bodies that are welded to moving ones: their poses, masses, centres and tensors."""
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError
+
+Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; centre (3,), m; tensor (3, 3) about it, kg m^2
+
+
+def combined(parts: list[Inertia]) -> Inertia:
+    """Return the inertia of several bodies with parallel axes (Steiner's theorem)."""
+    mass = sum(m for m, _, _ in parts)
+    if len(parts) == 1 or mass == 0:
+        return float(mass), parts[0][1], parts[0][2]
+    com = sum((m * c for m, c, _ in parts), np.zeros(3)) / mass
+    arms = [(m, c - com) for m, c, _ in parts]
+    steiner = sum((m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in arms), np.zeros((3, 3)))
+    return float(mass), com, sum((i for _, _, i in parts), np.zeros((3, 3))) + steiner
+
+
+class Bodies:
+    """Masses, centres and tensors of all bodies, and the poses of welded bodies on the moving ones."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self.model = model
+        self.mass, self.com = model.body_mass.copy(), model.body_ipos.copy()
+        axes = [rotation(quat) for quat in model.body_iquat]
+        self.inertia = np.array([r * d @ r.T for r, d in zip(axes, model.body_inertia, strict=True)])
+        poses = zip(model.body_pos, model.body_quat, strict=True)
+        self.local = [make_pose(position, rotation(quat)) for position, quat in poses]
+
+    def override(
+        self,
+        bodies: np.ndarray,
+        masses: np.ndarray | None,
+        coms: np.ndarray | None,
+        inertias: np.ndarray | None,
+        n: int,
+    ) -> None:
+        """Replace mass (n,), centre (n, 3) and tensor (n, 3, 3) of these bodies, unless None."""
+        if masses is not None:
+            self.mass[bodies] = masses
+        if coms is not None:
+            self.com[bodies] = coms
+        if (inertias := shaped("inertias", inertias, (n, 3, 3))) is not None:
+            self.inertia[bodies] = inertias
+
+    def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
+        """Return the nearest body with a joint at or above `body` (0: the world), and the pose of `body` in it."""
+        pose = np.eye(4)
+        while body and self.model.body_dofnum[body] == 0:
+            pose = self.local[body] @ pose
+            body = int(self.model.body_parentid[body])
+        return body, pose
+
+    def lumped(self, body: int) -> Inertia:
+        """Return mass, centre and tensor about the centre of `body` with all bodies welded to it."""
+        parts = [(self.mass[body], self.com[body], self.inertia[body])]
+        for other in range(1, self.model.nbody):
+            anchor, pose = self.moving_parent(other)
+            if other != body and anchor == body and self.mass[other] > 0:
+                r = pose[:3, :3]
+                parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
+        return combined(parts)
+
+
+def shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return value; raise UserError unless it is None or has this shape."""
+    if value is not None and np.shape(value) != shape:
+        raise UserError(f"{name}: expected shape {shape}, got {np.shape(value)}")
+    return value
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a quaternion w x y z."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rotation matrix (3, 3) about an axis by an angle, rad."""
+    quat = np.empty(4)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    return rotation(quat)
+
+
+def make_pose(position: np.ndarray | None, rotation: np.ndarray | None) -> np.ndarray:
+    """Return the pose (4, 4) with this position and rotation; None is zero or the identity."""
+    pose = np.eye(4)
+    if position is not None:
+        pose[:3, 3] = position
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    return pose
