@@ -1,134 +1,149 @@
-"""Force without a sensor on independent arms that press and slide: beside the momentum observer of their README.
+"""Force without a sensor: independent arms and hidden twins that press and slide, with the truth.
 
-    python benchmarks/wrench.py [FOLDER] [NAME,...]
+    python benchmarks/wrench.py [--arms FOLDER] [--twins rigid_0,elastic_0,...]
 
-FOLDER holds one folder per arm with train.npz, validation.npz, ramps.npz, contact.npz, tool.json, and for the judge
-truth.json and truth_contact.npz; it is not part of this repository. The script identifies each arm with the defaults
-of stage=identify in runs/identify/wrench_<arm>, and skips finished ones. The contact threshold comes from train.npz
-and validation.npz; false alarms are counted in ramps.npz and wherever contact.npz touches nothing. Writes
-benchmarks/results/wrench.md.
+arms    FOLDER/<name> with train, validation, ramps and contact recordings and the truth, no part of this repository;
+        identified with the defaults of stage=identify and data.contact (benchmarks/contact_identification.py)
+twins   variant_seed: recordings of benchmarks/press_twins.py on the surface of the seed, identified from free motion
 
-moving, rest: RMSE of the normal force in contact without the first 50 ms of a touch; at rest every joint has been
-below 3 mrad/s for 30 ms. inside: share of force components within their 95 % interval.
+Finished identifications in runs/identify are not repeated. The contact threshold comes from free motion; false alarms
+are counted in ramps.npz and wherever a press recording touches nothing. Writes benchmarks/results/wrench.md.
+
+moving, rest: RMSE of the normal force in contact without the first 50 ms of a touch (`impact`); at rest every joint
+has been below 3 mrad/s for 30 ms. inside: share of force components within their 95 % interval.
 """
 
+import argparse
 import json
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from common import JUDGING, ROBOT, ROOT, identify_twins, markdown_rows, write_page
+from contact_identification import identify_arm
+from press_twins import armed, press_twin
 
-ROOT = Path(__file__).parent.parent
-# N, in motion and at rest, of a momentum observer with the true parameters; from the README of the data
-ARMS = {"sigmoid": (0.56, 0.71), "coulomb": (0.55, 1.14), "stribeck": (0.87, 1.94)}
-NOTE = "Normal force in contact. The constants of the filter were chosen on these three recordings."
+from r2s.adaptation.wrench import WrenchObserver, contact_threshold, observe_recording
+from r2s.adaptation.wrench_fusion import FusedWrench
+from r2s.identification.contact.contact_file import load_contact
+from r2s.physics.surface import load_tool
+from r2s.recordings.readers import read
+from r2s.stages.adapter_factory import calibrated, free_recordings
+
+ARMS = {  # N: momentum observer with the true parameters, moving and at rest, from the README of the data
+    "sigmoid": (0.56, 0.71),
+    "coulomb": (0.55, 1.14),
+    "stribeck": (0.87, 1.94),
+}
+NOTE = (
+    "Normal force in contact, RMSE. The constants of the filter were chosen on these three arms and on twins 0 to 2; "
+    f"twins from {JUDGING['rigid'].start} (rigid) and {JUDGING['elastic'].start} (elastic) are for judging. fused: "
+    "with the identified surface, and with the same surface moved by 0.3 mm along its normal."
+)
 EARLY, STILL, SLOW = 50, 30, 3e-3  # cycles, cycles, rad/s
-DETECTED = 5.0  # N
+BOUNCE = 200  # cycles within which a touch belongs to the one before
+DETECTED, OFF = 5.0, 3e-4  # N; m
 
 
-def identified(arm: Path, root: Path) -> Path:
-    """Identify an arm with the defaults unless finished; return its run folder."""
-    data = [f"data.path={arm}/train.npz", f"data.validation={arm}/validation.npz", f"data.ramps={arm}/ramps.npz"]
-    words = ["stage=identify", "data=recording", "data.torque=commanded", *data, f"robot.tool={arm}/tool.json"]
-    name = f"wrench_{arm.name}"
-    command = [sys.executable, "run.py", *words, f"root={root}", f"name={name}", "skip_completed=true"]
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    return root / "identify" / name
-
-
-def evaluate(arm: Path, calibration: Path) -> dict:
-    """Return the measures of one arm."""
-    from r2s.adaptation.wrench import WrenchObserver, contact_threshold, observe_recording
-    from r2s.physics.robot import load_robot
-    from r2s.recordings.readers import read
-    from r2s.stages.adapter_factory import calibrated
-    from r2s.stages.parts import plain
-    from r2s.stages.run_config import loaded
-
-    settings = plain(loaded(calibration / "config.yaml").robot) | {"tool": str(arm / "tool.json")}
-    beside = ("_target_", "torque_fraction", "tracking_fraction", "reach")
-    robot = load_robot(**{k: v for k, v in settings.items() if k not in beside})
-    dynamics = calibrated(calibration, robot)[0]
-    observer = WrenchObserver(robot, dynamics)
-    free = [read(arm / f"{name}.npz", torque="commanded") for name in ("train", "validation")]
-    observer.threshold = contact_threshold(robot, observer, free)
-    ramps = observe_recording(robot, observer, read(arm / "ramps.npz", torque="commanded"))
-    recording = read(arm / "contact.npz", torque="commanded")
-    found = observe_recording(robot, observer, recording)
-    return scores(found, recording, arm) | {
-        "threshold": observer.threshold,
-        "false alarms in ramps": int((np.diff(ramps["in_contact"]) > 0).sum()),
-        "ramps, s": len(ramps) * 1e-3,
-    }
-
-
-def scores(found: pd.DataFrame, recording, arm: Path) -> dict:
-    """Compare a table of `observe_recording` with the truth."""
-    truth = np.load(arm / "truth_contact.npz")
-    normal = np.array(json.loads((arm / "truth.json").read_text())["contact"]["normal"])
-    true, fn = truth["wrench"][:, :3], truth["normal_force"]
+def scores(found: pd.DataFrame, recording, true: np.ndarray, normal: np.ndarray) -> dict:
+    """Compare a table of `observe_recording` with the true force (T, 3) N."""
     force = found[[f"force_{c}_N" for c in "xyz"]].to_numpy()
     half = found[[f"force_{c}_N_half" for c in "xyz"]].to_numpy()
-    touches = found["in_contact"].to_numpy()
+    touches, fn = found["in_contact"].to_numpy(), true @ normal
     on = fn > 0
-    begins = np.flatnonzero(on & ~np.r_[False, on[:-1]])
+    recent = pd.Series(on.astype(float)).rolling(BOUNCE, min_periods=1).max().shift(fill_value=0.0).to_numpy() > 0
+    begins = np.flatnonzero(on & ~recent)
     early = np.zeros(len(fn), dtype=bool)
     for k in begins:
         early[k : k + EARLY] = True
     smooth = np.apply_along_axis(lambda x: np.convolve(x, np.ones(15) / 15, "same"), 0, recording.dq)
     still = pd.Series((np.abs(smooth) < SLOW).all(1)).rolling(STILL).min().fillna(0.0).to_numpy() > 0
     error, out = force @ normal - fn, {}
-    for name, mask in (("moving", on & ~early & ~still), ("rest", on & ~early & still)):
-        out[name] = float(np.sqrt((error[mask] ** 2).mean()))
-        out[f"{name} inside"] = 100 * float((np.abs(force - true) < half)[mask].mean())
+    parts = {"moving": on & ~early & ~still, "rest": on & ~early & still, "impact": on & early}
+    for name, mask in parts.items():
+        out[name] = float(np.sqrt((error[mask] ** 2).mean())) if mask.any() else float("nan")
+        out[f"{name} inside"] = (
+            100 * float((np.abs(force - true) < half)[mask].mean()) if mask.any() else float("nan")
+        )
     delays = []
-    for k in begins:
-        reached = k + int(np.argmax(fn[k : k + 3000] > DETECTED))
-        after = np.flatnonzero(touches[k : k + 3000])
-        delays.append(int(k + after[0] - reached) if len(after) else None)
+    for a, b in zip(begins, [*begins[1:], len(fn)], strict=True):
+        above = np.flatnonzero(fn[a:b] > DETECTED)
+        if len(above):
+            after = np.flatnonzero(touches[a:b])
+            delays.append(int(after[0] - above[0]) if len(after) else None)
     false = (np.diff(touches) > 0) & ~on[1:] & ~on[:-1]
-    return out | {
-        "delays after 5 N, ms": delays,
-        "false alarms": int(false.sum()),
-        "free, s": float((~on).sum() * 1e-3),
+    return out | {"delays": delays, "false": int(false.sum()), "free": float((~on).sum() * 1e-3)}
+
+
+def arm(folder: Path) -> dict[str, str]:
+    """Return the row of an independent arm."""
+    run, robot = identify_arm(folder, []), replace(ROBOT, tool=load_tool(folder / "tool.json"))
+    dynamics, surface = calibrated(run, robot)[0], load_contact(run)
+    observer = WrenchObserver(robot, dynamics)
+    observer.threshold = contact_threshold(robot, observer, free_recordings(run))
+    recording, truth = read(folder / "contact.npz", torque="commanded"), np.load(folder / "truth_contact.npz")
+    true = truth["wrench"][:, :3], np.array(json.loads((folder / "truth.json").read_text())["contact"]["normal"])
+    own = scores(observe_recording(robot, observer, recording), recording, *true)
+    ramps = observe_recording(robot, observer, read(folder / "ramps.npz", torque="commanded"))
+    own["false"] += int((np.diff(ramps["in_contact"]) > 0).sum())
+    own["free"] += len(ramps) * 1e-3
+    fused = []
+    for off in (0.0, OFF):
+        moved = [replace(s, point=s.point + off * s.normal) for s in (surface.surface, *surface.draws)]
+        together = FusedWrench(robot, dynamics, moved[0], moved[1:], threshold=observer.threshold)
+        fused.append(scores(observe_recording(robot, together, recording), recording, *true)["moving"])
+    plain = "{:.2f} / {:.2f}".format(*ARMS[folder.name])
+    return row(own) | {"fused, right / moved, N": "{:.2f} / {:.2f}".format(*fused), "true parameters, N": plain}
+
+
+def twin(variant: str, seed: int) -> dict[str, str]:
+    """Return the row of a twin."""
+    run, robot = twin_run(variant, seed), armed(ROBOT)
+    observer = WrenchObserver(robot, calibrated(run, robot)[0])
+    observer.threshold = contact_threshold(robot, observer, free_recordings(run))
+    recording, *true = press_twin(robot, variant, seed)
+    found = scores(observe_recording(robot, observer, recording), recording, *true)
+    return row(found) | {"fused, right / moved, N": "", "true parameters, N": ""}
+
+
+def twin_run(variant: str, seed: int) -> Path:
+    """Return the run folder of a twin's identification."""
+    return ROOT / "runs" / "identify" / f"wrench_{variant}_{seed}"
+
+
+def row(r: dict) -> dict[str, str]:
+    """Return the cells of measures."""
+    return {
+        "moving, N": f"{r['moving']:.2f}",
+        "at rest, N": f"{r['rest']:.2f}",
+        "impact, N": f"{r['impact']:.2f}",
+        "inside 95 %, moving / rest": f"{r['moving inside']:.0f} / {r['rest inside']:.0f} %",
+        "detected after 5 N, ms": ", ".join("none" if d is None else str(d) for d in r["delays"]),
+        "false alarms": f"{r['false']} in {r['free']:.0f} s",
     }
 
 
 def main() -> None:
     """Write the table."""
-    from common import RESULTS, markdown, stamp
-
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT.parent / "shared/data/contact_arms")
-    names = sys.argv[2].split(",") if len(sys.argv) > 2 else [a for a in ARMS if (folder / a).is_dir()]
-    if not names:
-        sys.exit(f"error: {folder} holds none of {', '.join(ARMS)}")
-    rows = []
-    for name in names:
-        r = evaluate((folder / name).resolve(), identified((folder / name).resolve(), ROOT / "runs"))
-        rows.append(row(name, r))
-        print(", ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    if len(names) < len(ARMS):
-        return
-    table = markdown(pd.DataFrame(rows).set_index("arm"))
-    head = f"# Force without a sensor\n\n{stamp('python benchmarks/wrench.py')}\n\n{NOTE}\n\n"
-    (RESULTS / "wrench.md").write_text(head + table + "\n")
-
-
-def row(name: str, r: dict) -> dict[str, str]:
-    """Return the row of an arm."""
-    true_moving, true_rest = ARMS[name]
-    late = ", ".join("none" if d is None else str(d) for d in r["delays after 5 N, ms"])
-    return {
-        "arm": name,
-        "RMSE moving, N": f"{r['moving']:.2f}",
-        "RMSE at rest, N": f"{r['rest']:.2f}",
-        "momentum observer, true parameters, N": f"{true_moving:.2f} / {true_rest:.2f}",
-        "inside 95 %, moving / rest": f"{r['moving inside']:.0f} / {r['rest inside']:.0f} %",
-        "detected after 5 N, ms": late,
-        "false alarms": f"{r['false alarms'] + r['false alarms in ramps']} in {r['free, s'] + r['ramps, s']:.0f} s",
-    }
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--arms", type=Path, default=ROOT.parent / "shared/data/contact_arms")
+    parser.add_argument("--twins", default="rigid_0,rigid_1,rigid_2,elastic_0,elastic_1,elastic_2")
+    options = parser.parse_args()
+    rows = {}
+    for name in ARMS if options.arms.is_dir() else ():
+        rows[name] = arm((options.arms / name).resolve())
+        print(name, rows[name], flush=True)
+    twins = [(v, int(s)) for v, s in (word.split("_") for word in options.twins.split(",") if word)]
+    identify_twins([(v, s, twin_run(v, s)) for v, s in twins], ROOT / "runs")
+    for variant, seed in twins:
+        judged = " (judging)" if seed in JUDGING[variant] else ""
+        rows[f"{variant} twin {seed}{judged}"] = twin(variant, seed)
+        print(variant, seed, rows[f"{variant} twin {seed}{judged}"], flush=True)
+    command = "python benchmarks/wrench.py" + f" --twins {options.twins}" * (
+        options.twins != parser.get_default("twins")
+    )
+    write_page("wrench", "Force without a sensor", command, [NOTE, markdown_rows(rows, "arm")])
 
 
 if __name__ == "__main__":

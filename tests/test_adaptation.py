@@ -440,7 +440,10 @@ def test_the_stage_estimates_from_a_recording(tmp_path, capsys):
     estimate(config("data.torque=commanded"), [])
     folder = tmp_path / "estimate" / "w"
     assert "kg" in capsys.readouterr().out
-    assert all((folder / name).is_file() for name in ("estimate.csv", "recording.rrd", "figures/payload.png"))
+    written = ("estimate.csv", "wrench.csv", "recording.rrd", "figures/payload.png", "figures/wrench.png")
+    assert all((folder / name).is_file() for name in written)
+    with pytest.raises(UserError, match=r"^robot\.tool: estimate\.surface needs the tip that touches"):
+        estimate(config("data.torque=commanded", f"estimate.surface={tmp_path}"), [])
     rows = pd.read_csv(folder / "estimate.csv")
     before = rows.iloc[round(1.9 / (SPAN * SIM_DT))]
     # without calibration= no delay is known: 3 ms of it cause torque errors in every acceleration

@@ -9,10 +9,12 @@ import pandas as pd
 import pytest
 from conftest import conf
 
+from r2s.adaptation import tuning
 from r2s.adaptation.adapters import AdapterContext, observer
+from r2s.adaptation.estimator import Estimator
 from r2s.adaptation.momentum import BODY
-from r2s.adaptation.wrench import WrenchObserver, contact_threshold, contacts
-from r2s.adaptation.wrench_fusion import TRUSTED, FusedWrench, SurfaceLaw, fuse
+from r2s.adaptation.wrench import WrenchObserver, contact_threshold, contacts, observe_recording
+from r2s.adaptation.wrench_fusion import TRUSTED, FusedWrench, fuse, surface_law
 from r2s.arm.command_loop import CommandLoop
 from r2s.arm.driver import Driver
 from r2s.arm.simulated import SimulatedArm
@@ -20,9 +22,11 @@ from r2s.errors import UserError
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.kinematics import POSE, hand_kinematics
 from r2s.physics.payload import ee_pose, payload_of
+from r2s.physics.rigid_body import mass_matrix
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.surface import Surface, Tool
 from r2s.recordings.recording import Recording
+from r2s.reporting.wrench_page import METRES, cone
 
 DATA = Path(__file__).parents[2] / "shared/data/contact_arms"
 TOOL = Tool(np.array([0.0, 0.01, 0.09]), 0.01)
@@ -186,26 +190,64 @@ def test_an_adapter_does_not_push_against_a_contact():
     assert added[False] < 0.1 * added[True]
 
 
-@pytest.mark.parametrize(("off", "trusted"), [(0.0, True), (5e-4, False)])
-def test_a_surface_sharpens_the_force_unless_it_errs(off, trusted):
-    """Force of 1 N error and a surface of 0.2 N: the right one leaves 0.1 N, one 0.5 mm off is refused."""
-    normal = np.array([0.0, 0.6, 0.8])
-    law = SurfaceLaw(off * normal, normal, 1e4, 1.0, 0.0, 0.01, 0.0, 0.2)
-    memory, fused, P = np.zeros(6), np.zeros(3), np.zeros((3, 3))
+NORMAL = np.array([0.0, 0.6, 0.8])
+SOFT = Surface(np.zeros(3), NORMAL, 1e4, exponent=1.0)
+
+
+def fused(surface, draws=(), error=1.0, cycles=500):
+    """Return force, covariance, and whether trusted, at 10 N on SOFT with a momentum that errs along its normal."""
+    law = surface_law(surface, draws, 0.01, 2e-5)
+    memory, force, P = np.zeros(6), np.zeros(3), np.zeros((3, 3))
     memory[TRUSTED] = 1.0
-    true, error = 10.0 * normal, 1.0 * normal * trusted
-    tip = (0.01 - 1e-3) * normal  # 1 mm deep: 10 N
-    for _ in range(500):
-        fuse(law, true + error, np.eye(3), tip, memory, fused, P)
-    assert bool(memory[TRUSTED]) == trusted
-    if trusted:
-        np.testing.assert_allclose(fused, true, atol=0.1)
-        assert normal @ P @ normal == pytest.approx(1 / (1 + 1 / 0.2**2))  # of two independent measurements
-    else:
-        np.testing.assert_array_equal(fused, true)
+    tip = (0.01 - 1e-3) * NORMAL  # 1 mm deep: 10 N
+    for _ in range(cycles):
+        fuse(law, (10.0 + error) * NORMAL, np.eye(3), tip, np.zeros((6, 7)), memory, force, P)
+    return force, P, bool(memory[TRUSTED])
+
+
+def test_a_surface_sharpens_the_force_as_far_as_it_is_known():
+    """Two independent measurements: weights and variance follow from theirs, with the posterior of the surface."""
+    own = np.hypot(tuning.SURFACE_FLOOR, tuning.SURFACE_SHARE * 10.0)
+    for draws, spread in (((), 0.0), ([replace(SOFT, point=s * 1e-4 * NORMAL) for s in (-1.0, 1.0)], 1.0)):
+        variance = own**2 + spread**2  # 0.1 mm at 1e4 N/m is 1 N
+        force, P, trusted = fused(SOFT, draws)
+        assert trusted
+        np.testing.assert_allclose(NORMAL @ force, 10.0 + variance / (1.0 + variance), rtol=1e-6)
+        np.testing.assert_allclose(NORMAL @ P @ NORMAL, variance / (1.0 + variance), rtol=1e-6)
+
+
+def test_a_surface_that_was_never_identified_changes_nothing():
+    """One 0.5 mm off contradicts the momentum by 5 N, one twice as stiff by 10 N: both are refused."""
+    for wrong in (replace(SOFT, point=5e-4 * NORMAL), replace(SOFT, stiffness=2e4)):
+        force, P, trusted = fused(wrong, error=0.0)
+        assert not trusted
+        np.testing.assert_array_equal(force, 10.0 * NORMAL)
         np.testing.assert_array_equal(P, np.eye(3))
     with pytest.raises(UserError, match=r"^robot\.tool: a force from a surface needs the tip"):
-        FusedWrench(WrenchObserver(replace(ROBOT, tool=None), truth()), Surface(np.zeros(3), normal, 1e4))
+        FusedWrench(replace(ROBOT, tool=None), truth(), SOFT)
+
+
+def test_a_payload_hung_on_in_the_air_is_no_contact_and_a_press_no_payload():
+    """Both pull with 10 N from 1.5 s on, the payload down, the press up: mass is found for the first alone."""
+    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03], "on_s": 1.5})
+    push = lambda t: np.array([0.0, 0.0, 9.81 if t > 1.5 else 0.0])  # noqa: E731
+    for recording, hung in ((swing(lambda t: np.zeros(3), payload=load), True), (swing(push), False)):
+        estimator = Estimator(*AdapterContext(ROBOT, truth()).corrected)
+        table = observe_recording(ROBOT, calibrated(), recording, estimator)
+        assert bool(table["in_contact"][1700:].any()) != hung
+        assert estimator.now.mass == pytest.approx(1.0 if hung else 0.0, abs=0.1)
+
+
+def test_gears_that_vibrate_pull_at_nothing():
+    """A vibration of 20 Nm at 55 Hz in the measured speeds: the force stays within its interval, and no contact."""
+    calm = free(3)
+    inertia = mass_matrix(ROBOT, ROBOT.q_home[None])[0]
+    shaken = np.linalg.solve(inertia, np.full(7, 20.0)) / (2 * np.pi * 55.0)
+    wave = np.sin(2 * np.pi * 55.0 * calm.t) * np.clip(calm.t / 0.3, 0, 1)
+    recording = replace(calm, dq=calm.dq + 0.2 * wave[:, None] * shaken)
+    found, half, touches = run(calibrated(), recording)
+    assert not touches.any()
+    assert (np.abs(found) < half)[500:].mean() > 0.9
 
 
 def test_the_same_motion_gives_the_same_numbers_and_wrong_input_one_line():
@@ -222,6 +264,16 @@ def test_the_same_motion_gives_the_same_numbers_and_wrong_input_one_line():
         contact_threshold(ROBOT, observer, [short])
 
 
+def test_the_cone_ends_at_the_interval():
+    """With one half width in all directions the edge is a circle of that radius about the arrow's head."""
+    tip, force = np.array([0.4, 0.1, 0.3]), np.array([3.0, -4.0, 12.0])
+    edge, *lines = cone(tip, force, np.full(3, 2.0))
+    off = edge - (tip + METRES * force)
+    np.testing.assert_allclose(np.linalg.norm(off, axis=1), METRES * 2.0, rtol=1e-9)
+    np.testing.assert_allclose(off @ force, 0.0, atol=1e-9)
+    assert all((line[0] == tip).all() for line in lines)
+
+
 def test_contacts_are_listed_with_their_largest_force():
     table = pd.DataFrame({"t": np.arange(6.0), "in_contact": [0, 1, 1, 0, 0, 1]})
     table[["force_x_N", "force_y_N", "force_z_N"]] = np.outer([9.0, 3.0, 5.0, 9.0, 9.0, 2.0], [0.6, 0.0, 0.8])
@@ -235,14 +287,14 @@ def test_contacts_are_listed_with_their_largest_force():
 @pytest.mark.parametrize(
     ("name", "moving", "rest"), [("sigmoid", 0.6, 0.7), ("coulomb", 0.6, 1.0), ("stribeck", 0.9, 1.6)]
 )
-def test_the_normal_force_on_independent_arms(name, moving, rest, tmp_path):
+def test_the_normal_force_on_independent_arms(name, moving, rest):
     """From a model identified with defaults: RMSE in motion and at rest, and intervals of at least 90 %."""
     import sys
 
     sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-    from wrench import evaluate, identified
+    from wrench import arm
 
-    row = evaluate(DATA / name, identified(DATA / name, tmp_path))
-    assert row["moving"] <= moving
-    assert row["rest"] <= rest
-    assert min(row["moving inside"], row["rest inside"]) >= 90.0
+    row = arm((DATA / name).resolve())
+    assert float(row["moving, N"]) <= moving
+    assert float(row["at rest, N"]) <= rest
+    assert min(int(x) for x in row["inside 95 %, moving / rest"].removesuffix(" %").split(" / ")) >= 90

@@ -76,25 +76,28 @@ FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which
 BLENDING = -np.expm1(-SIM_DT / T)  # per cycle: a new estimate enters over one span
 ACCELERATION_S = 1 / RATE  # s, low-pass of accelerations: a loop of this rate tolerates the latency of an arm
 
-# wrench (wrench_filter.py, contact.py); benchmarks/wrench.py measures the room on independent arms in contact
+# wrench (wrench_filter.py, wrench.py); benchmarks/wrench.py measures them on independent arms and twins in contact
 SPEED_NOISE, ANGLE_NOISE = 3e-3, 2e-5  # rad/s, rad: sensors of a Panda, where no recording shows them
 ANGLE_RATE = 60.0  # 1/s: below, angles give the better speed; above, measured speeds
 SLOW_RATE, FAST_RATE = 40.0, 200.0  # 1/s, low-passes of the speed: for rest, for friction
+LAG = SLOW_RATE / (FAST_RATE - SLOW_RATE)  # of the difference of both: lag of the fast one at constant acceleration
 # shares of the speed noise: a joint moves above the first (four standard deviations of the slow speed), rests below
-# the second, or after STILL cycles with the fast speed below the third
+# the second, or after STILL cycles, with the fast speed below the third
 MOVES, RESTS, STILL_SPEED, STILL = 0.4, 0.2, 1.2, 25
 REVERSES = 1.2  # of the speed noise: a fast speed beyond decides on the side of friction
-REVERSING = 2.0  # of the speed noise: friction of a joint with a smaller fast speed is anywhere between its edges
+SIDE_NOISE = 1.0  # of the speed noise: standard deviation of the speed that decides on the side of friction
 CREPT, CREEP_RATE = 1.5, 50.0  # of the angle noise: displacement of a creeping joint; 1/s, of its low-pass
+BRISTLES = 0.06  # of the edges' distance squared: variance of friction in the middle of presliding
 MOMENTUM_NOISE = 1.33  # of the speed noise: white noise of momenta from filtered speeds
+# 1/s, of the high-pass of momenta; 1/s, of its mean square; times that: noise of momenta on vibrating gears
+SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation of the friction model's error
 WRENCH_FRICTION, WRENCH_FRICTION_FLOOR = 1.5, 0.03  # of the model error; of the friction level
 INERTIA_SHARE = 0.05  # of a joint's net torque: error of the inertia
-STOP_DRIFT = 10.0  # 1/sqrt(s), of the friction noise: friction of a resting joint beside its equilibrium
 STIFFNESS = 4e4  # N/m, of what may be touched: force per motion of the tip
-FORCE_RATE, FORCE_RATE_S = 40.0, 0.03  # N/s and s: the most that this makes a force change, and its correlation
+FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s and s: the most that this makes a force change, and its correlation
 TOUCH_RATE, TOUCH, TOUCH_SHARE = 300.0, 3.0, 0.1  # N/s after innovations above TOUCH variances; share of a cycle
-HAND_RATE = 1.0  # N/sqrt(s), force on an arm at rest, until stiction hides no more
+HAND_RATE = 0.3  # N/sqrt(s), force on an arm at rest
 EDGE_SHARE = 0.7  # per cycle: friction of a resting joint beyond its edge is put back
 CREEP_SHARE = 0.3  # of the force variance that a creeping tip makes in a stiff environment
 MOMENT_ARM = 0.1  # m, of a force on an arm without a tool: scale of its moment
@@ -104,4 +107,13 @@ CONFIRMED, RELEASED = 15, 50  # cycles above and below, after which a contact be
 RELEASE = 0.25  # of the threshold
 BLOCK_S, TAIL = 0.5, 0.2  # s, one maximum each; share of the largest maxima that give the tail
 ALARMS_PER_HOUR = 1.0
+# m, path of the tip after which a force that points down is a weight; share of it that may be horizontal; path lost
+# per path with another force
+WEIGHT_PATH, WEIGHT_SHARE, WEIGHT_LOSS = 0.05, 0.3, 5.0
 UNCALIBRATED = 2.0  # times the threshold of Gaussian noise, without recordings of free motion
+
+# wrench with a surface (wrench_fusion.py)
+DIFFERENCE_RATE, TEST_RATE, DEPTH_RATE = 50.0, 10.0, 100.0  # 1/s, low-passes: of both forces, tested, of the depth
+REFUSED = 3.0  # standard deviations of the tested difference: an error of momentum lasts for seconds
+SURFACE_DRAWS = 16  # of the posterior
+SURFACE_SHARE, SURFACE_FLOOR = 0.02, 0.15  # of the force; N: error of a law on presses that it was not fitted to

@@ -6,10 +6,10 @@
 
 The force acts at the tip of `robot.tool`; without a tool it acts at the end effector, with a moment. wrench_filter.py
 describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
-while two joints move.
-The threshold comes from motion without contact: the largest values of half seconds have an exponential tail (extreme
-values of a chi-square variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3),
-which is continued to one false alarm an hour.
+while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold stands for one false alarm
+an hour. It is at least that of independent normal errors in each cycle. If motion without contact errs more, its tail
+counts: the largest values of half seconds have an exponential tail (extreme values of a chi-square variable:
+Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is continued to an hour.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,8 @@ from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
 from r2s.adaptation.offline_estimation import at_rate
-from r2s.adaptation.wrench_filter import REST, SQUARE, TOUCHES, WrenchNoise, WrenchState, update_wrench
+from r2s.adaptation.wrench_filter import update_wrench
+from r2s.adaptation.wrench_state import HANGING, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import ee_pose
@@ -30,6 +31,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 Z = 1.96  # standard deviations of a 95 % interval
+GAUSSIAN = float(chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
 
 
 class WrenchObserver:
@@ -52,8 +54,7 @@ class WrenchObserver:
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
         self._noise = noise if noise is not None else default_wrench_noise(robot, dynamics)
-        gaussian = chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3)
-        self.threshold = float(tuning.UNCALIBRATED * gaussian if threshold is None else threshold)
+        self.threshold = tuning.UNCALIBRATED * GAUSSIAN if threshold is None else threshold
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
         self.begin()
         zero = np.zeros(robot.n)
@@ -90,8 +91,13 @@ class WrenchObserver:
 
     @property
     def in_contact(self) -> bool:
-        """Whether the arm touches something."""
-        return bool(self._state.contact[TOUCHES] > 0.0)
+        """Whether the arm touches something; False once the force proves to be a payload's weight."""
+        return bool(self._state.contact[TOUCHES] > 0.0) and not self.hangs
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the force is the weight of a payload: it points down through 5 cm of motion."""
+        return bool(self._state.contact[HANGING] > tuning.WEIGHT_PATH)
 
     @property
     def wrench(self) -> np.ndarray:
@@ -142,7 +148,9 @@ def default_wrench_noise(robot: Robot, dynamics: Dynamics, model: np.ndarray | N
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
-    return WrenchNoise(friction, np.ascontiguousarray(edges), tuning.SPEED_NOISE, tuning.ANGLE_NOISE)
+    presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
+    sensors = tuning.SPEED_NOISE, tuning.ANGLE_NOISE
+    return WrenchNoise(friction, np.ascontiguousarray(edges), presliding, tuning.INERTIA_SHARE, *sensors)
 
 
 def observe_recording(
@@ -159,11 +167,13 @@ def observe_recording(
         report: gets each estimate at once.
     """
     recording = at_rate(robot, recording)
-    rows = np.empty((len(recording.t), 2 * len(observer.wrench) + 6))
+    touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
+    rows = np.empty((len(recording.t), touch + 5))
     for stretch in recording.stretches:
         observer.begin()
         if estimator is not None:
             estimator.begin()
+        begun = stretch.start
         for k in range(stretch.start, stretch.stop):
             sample = recording.q[k], recording.dq[k], recording.tau[k]
             touches = observer(*sample)
@@ -175,6 +185,10 @@ def observe_recording(
                         report(estimator.now)
             values = np.stack([observer.wrench, observer.wrench_half], -1).ravel()
             rows[k] = np.concatenate([[recording.t[k]], values, [touches, observer.square], observer.tip])
+            if touches and not (k > stretch.start and rows[k - 1, touch]):
+                begun = k
+            if observer.hangs:  # no contact after all, from its begin
+                rows[begun:k, touch] = 0.0
     names = [f"force_{c}_N" for c in "xyz"] + [f"moment_{c}_Nm" for c in "xyz"]
     columns = [c for name in names[: len(observer.wrench)] for c in (name, f"{name}_half")]
     table = pd.DataFrame(rows, columns=["t", *columns, "in_contact", "square", "tip_x_m", "tip_y_m", "tip_z_m"])
@@ -209,4 +223,4 @@ def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Rec
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean([m - level for m in maxima if m >= level])
     blocks_per_hour = 3600.0 / tuning.BLOCK_S
-    return float(level + excess * np.log(tuning.TAIL * blocks_per_hour / tuning.ALARMS_PER_HOUR))
+    return max(GAUSSIAN, float(level + excess * np.log(tuning.TAIL * blocks_per_hour / tuning.ALARMS_PER_HOUR)))

@@ -1,8 +1,9 @@
-"""External force from momentum and from a known surface together.
+"""External force from momentum and from an identified surface together.
 
-Encoders tell how deep the tip is in an identified surface, and its law (r2s/physics/surface.py) gives the normal
-force F_s. The momentum's force F has other errors, so that one update of a Kalman filter combines both:
-F' = F + P n (F_s - n . F) / (n . P n + s^2). The difference passes a low-pass first, because angles have noise.
+Encoders show how deep the tip is in the surface, and its law (r2s/physics/surface.py) gives the normal force F_s. Its
+variance s^2 is that of the surface's posterior, of the encoders, and of what the law leaves out. Momentum's force F
+has other errors, so one update of a Kalman filter combines both: F' = F + P n (F_s - n . F) / (n . P n + s^2). The
+difference passes a low-pass first, because angles have noise.
 
 A surface that was never identified, has moved or is another one gives a wrong F_s. So the difference is tested: its
 low-passed mean, in standard deviations, may not exceed REFUSED (innovation test: Bar-Shalom, Li and Kirubarajan,
@@ -10,79 +11,94 @@ Estimation with Applications to Tracking, 2001, 5.4). A refused surface changes 
 small force would agree with any.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from r2s.adaptation.wrench import WrenchObserver, Z
+from r2s.adaptation import tuning
+from r2s.adaptation.wrench import WrenchObserver
+from r2s.adaptation.wrench_state import WrenchNoise
 from r2s.compiled import njit
-from r2s.errors import UserError, check_number
-from r2s.physics.robot import SIM_DT
+from r2s.errors import UserError
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface, normal_force
 
-DIFFERENCE_RATE = 50.0  # 1/s, low-pass of the difference of both forces
-TEST_RATE = 10.0  # 1/s, low-pass of the tested difference
-REFUSED = 2.2  # standard deviations
-RATE_RATE = 100.0  # 1/s, low-pass of the penetration's rate
 DIFFERENCE, TESTED, TRUSTED, DEPTH, RATE, SINCE = range(6)  # `memory`
+LAW_K, LAW_EXPONENT, LAW_DAMPING, LAW_POINT, LAW_NORMAL, LAW = 0, 1, 2, 3, 6, 9  # columns of `SurfaceLaw.law`
 
 
 class SurfaceLaw(NamedTuple):
     """A surface as numbers for compiled code."""
 
-    point: np.ndarray  # (3,) m
-    normal: np.ndarray  # (3,)
-    K: float  # N/m^e
-    exponent: float
-    damping: float  # s/m
+    law: np.ndarray  # (1 + S, LAW): the estimate, then S draws of its posterior
     radius: float  # m, of the tip
-    share: float  # standard deviation of F_s, of F_s
-    floor: float  # N, the same at any force
+    angle: float  # rad, noise of measured angles
 
 
-class FusedWrench:
-    """Force of a `WrenchObserver` together with that of a surface, cycle by cycle.
+def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle: float) -> SurfaceLaw:
+    """Return the numbers of a surface and of up to `tuning.SURFACE_DRAWS` draws of its posterior."""
+    each = [surface, *draws[: tuning.SURFACE_DRAWS]]
+    law = [np.concatenate([[s.coefficient, s.exponent, s.damping], s.point, s.normal]) for s in each]
+    return SurfaceLaw(np.array(law, dtype=float), float(radius), float(angle))
 
-    Attributes:
-        force: (3,) N on the arm at the tip, base axes. covariance: (3, 3) N^2, of it.
+
+class FusedWrench(WrenchObserver):
+    """A `WrenchObserver` whose force is combined with that of a surface; contact is decided by momentum alone.
 
     Args:
-        observer: its robot has a tool. surface: identified. share, floor: standard deviation of the surface's force,
-            relative and in N, such as its error on presses that it was not identified from.
+        surface, draws: identified, and its posterior (r2s/identification/contact/contact_file.py).
 
     Raises:
-        UserError: no tool, or share and floor below 0.
+        UserError: the robot has no tool.
     """
 
-    def __init__(self, observer: WrenchObserver, surface: Surface, share: float = 0.03, floor: float = 0.3):
-        if observer.tool is None:
+    def __init__(
+        self,
+        robot: Robot,
+        dynamics: Dynamics,
+        surface: Surface,
+        draws: Sequence[Surface] = (),
+        noise: WrenchNoise | None = None,
+        threshold: float | None = None,
+    ):
+        if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
-        check_number("share", share, "[0, inf)")
-        check_number("floor", floor, "(0, inf)")
-        self.observer = observer
-        point, normal = np.array(surface.point, dtype=float), np.array(surface.normal, dtype=float)
-        law = (surface.coefficient, surface.exponent, surface.damping, observer.tool.radius, share, floor)
-        self._law = SurfaceLaw(point, normal, *map(float, law))
-        self.force, self.covariance = np.zeros(3), np.zeros((3, 3))
-        self.begin()
+        self._law = surface_law(surface, draws, robot.tool.radius, tuning.ANGLE_NOISE)
+        self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
+        super().__init__(robot, dynamics, noise, threshold)
 
     def begin(self) -> None:
         """Begin a motion from rest; the surface is trusted until it errs."""
-        self.observer.begin()
+        super().begin()
         self._memory = np.zeros(6)
         self._memory[TRUSTED] = 1.0
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
         """Process a cycle; see `WrenchObserver`."""
-        touches = self.observer(q, dq, tau)
-        observer = self.observer
-        fuse(self._law, observer.force, observer.covariance, observer.tip, self._memory, self.force, self.covariance)
+        touches, state = super().__call__(q, dq, tau), self._state
+        fuse(
+            self._law,
+            state.x,
+            state.P,
+            state.place,
+            state.jacobian,
+            self._memory,
+            self._fused,
+            self._fused_covariance,
+        )
         return touches
 
     @property
-    def force_half(self) -> np.ndarray:
-        """(3,) N, half widths of the 95 % intervals of `force`."""
-        return Z * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+    def wrench(self) -> np.ndarray:
+        """(3,) N on the arm at the tip, base axes."""
+        return self._fused
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of `wrench`."""
+        return self._fused_covariance
 
     @property
     def trusted(self) -> bool:
@@ -91,33 +107,53 @@ class FusedWrench:
 
 
 @njit(cache=True, error_model="numpy")
-def fuse(law, force, covariance, tip, memory, fused, fused_covariance):
-    """Write the fused force (3,) N and its covariance (3, 3) N^2; memory: (6,), of `FusedWrench`."""
-    fused[:] = force
-    fused_covariance[:] = covariance[:3, :3]
-    depth, momentum_force = law.radius, 0.0
+def surface_force(law, k, tip, rate):
+    """Return normal force, N, and depth, m, of the k-th surface for a tip at (3,) m and a rate of the depth, m/s."""
+    row = law.law[k]
+    depth = law.radius
     for c in range(3):
-        depth -= (tip[c] - law.point[c]) * law.normal[c]
-        momentum_force += law.normal[c] * force[c]
+        depth -= (tip[c] - row[LAW_POINT + c]) * row[LAW_NORMAL + c]
+    return normal_force(row[LAW_K], row[LAW_EXPONENT], row[LAW_DAMPING], depth, rate), depth
+
+
+@njit(cache=True, error_model="numpy")
+def surface_variance(law, force, depth, tip, rate, jacobian):
+    """Return the variance, N^2, of the surface's force: its posterior, the encoders, and what no law describes."""
+    square, count = (tuning.SURFACE_SHARE * force) ** 2 + tuning.SURFACE_FLOOR**2, len(law.law) - 1
+    for k in range(1, count + 1):
+        square += (surface_force(law, k, tip, rate)[0] - force) ** 2 / count
+    normal, slope = law.law[0, LAW_NORMAL : LAW_NORMAL + 3], force * law.law[0, LAW_EXPONENT] / depth
+    smooth = 0.5 * SIM_DT * tuning.DIFFERENCE_RATE  # of the variance of white noise, behind the low-pass
+    for j in range(jacobian.shape[1]):
+        lever = normal[0] * jacobian[0, j] + normal[1] * jacobian[1, j] + normal[2] * jacobian[2, j]
+        square += smooth * (slope * lever * law.angle) ** 2
+    return square
+
+
+@njit(cache=True, error_model="numpy")
+def fuse(law, force, covariance, tip, jacobian, memory, fused, fused_covariance):
+    """Write the fused force (3,) N and its covariance (3, 3) N^2; memory: (6,), of `FusedWrench`."""
+    fused[:] = force[:3]
+    fused_covariance[:] = covariance[:3, :3]
+    normal = law.law[0, LAW_NORMAL : LAW_NORMAL + 3]
+    pressing, depth = surface_force(law, 0, tip, memory[RATE])
     if memory[SINCE] > 0.0:
-        memory[RATE] += SIM_DT * RATE_RATE * ((depth - memory[DEPTH]) / SIM_DT - memory[RATE])
-    memory[DEPTH] = depth
-    surface_force = normal_force(law.K, law.exponent, law.damping, depth, memory[RATE])
-    if surface_force <= 0.0:  # the tip is away: something else may touch the arm
-        memory[DIFFERENCE], memory[SINCE] = 0.0, 1.0
+        memory[RATE] += SIM_DT * tuning.DEPTH_RATE * ((depth - memory[DEPTH]) / SIM_DT - memory[RATE])
+    memory[DEPTH], memory[SINCE] = depth, 1.0
+    if pressing <= 0.0:  # the tip is away: something else may touch the arm
+        memory[DIFFERENCE] = 0.0
         return
-    gain = np.zeros(3)
-    variance = (law.share * surface_force) ** 2 + law.floor**2
+    own = surface_variance(law, pressing, depth, tip, memory[RATE], jacobian)
+    gain, variance, difference = np.zeros(3), own, pressing
     for i in range(3):
         for k in range(3):
-            gain[i] += covariance[i, k] * law.normal[k]
-        variance += law.normal[i] * gain[i]
-    difference = surface_force - momentum_force
-    memory[DIFFERENCE] += SIM_DT * DIFFERENCE_RATE * (difference - memory[DIFFERENCE])
-    memory[TESTED] += SIM_DT * TEST_RATE * (difference / np.sqrt(variance) - memory[TESTED])
-    if abs(memory[TESTED]) > REFUSED:
+            gain[i] += covariance[i, k] * normal[k]
+        variance += normal[i] * gain[i]
+        difference -= normal[i] * force[i]
+    memory[DIFFERENCE] += SIM_DT * tuning.DIFFERENCE_RATE * (difference - memory[DIFFERENCE])
+    memory[TESTED] += SIM_DT * tuning.TEST_RATE * (difference / np.sqrt(variance) - memory[TESTED])
+    if abs(memory[TESTED]) > tuning.REFUSED:
         memory[TRUSTED] = 0.0
-    memory[SINCE] = 1.0
     if memory[TRUSTED] == 0.0:
         return
     for i in range(3):

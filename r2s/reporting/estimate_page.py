@@ -5,11 +5,16 @@ from pathlib import Path
 
 import pandas as pd
 import rerun as rr
+import rerun.blueprint as rrb
 
 from r2s.files import atomic_write
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
 from r2s.reporting.figures.colours import colours
+from r2s.reporting.figures.log_rows import at_rate
 from r2s.reporting.figures.panels import panels
 from r2s.reporting.viewer.layout import log_series
+from r2s.reporting.wrench_page import DRAWN_HZ, FORCES, log_wrench
 
 LINE_WIDTH, EDGE_WIDTH = 1.6, 0.6  # of the estimate and of the edges of its interval, in rerun
 
@@ -41,23 +46,49 @@ def draw_estimate(payload: Path, friction: Path, rows: pd.DataFrame, changes: Se
     return [payload, friction]
 
 
-def write_estimate_recording(path: Path, rows: pd.DataFrame) -> Path:
-    """Write a rerun recording: each column of the table over `time`, with the edges of its interval."""
+def write_estimate_recording(
+    path: Path, robot: Robot, recording: Recording, rows: pd.DataFrame, wrench: pd.DataFrame
+) -> Path:
+    """Write a rerun recording: the arm with its force, and each column of the table with the edges of its interval.
+
+    Args:
+        rows: of stage=estimate. wrench: of `observe_recording`.
+    """
     stream = rr.RecordingStream(f"r2s {path.absolute().parent.name.replace('.', '-')}")
-    index = [rr.TimeColumn("time", duration=rows["t"].to_numpy())]
-    colour = colours(["estimate"])["estimate"]
+    shown = [n for n in rows.columns if n not in wrench.columns and not n.endswith("_half")]
     with atomic_write(path) as part:
-        stream.save(part)
-        for name in rows.columns:
-            if name == "t" or name.endswith("_half"):
-                continue
-            x = rows[name].to_numpy(dtype=float)
-            lines = {"estimate": (x, LINE_WIDTH)}
-            if f"{name}_half" in rows:
-                half = rows[f"{name}_half"].to_numpy()
-                lines |= {"low": (x - half, EDGE_WIDTH), "high": (x + half, EDGE_WIDTH)}
-            for label, (values, width) in lines.items():
-                log_series(stream, f"{name}/{label}", index, values, label, colour, width)
+        stream.save(part, default_blueprint=_layout(shown))
+        log_wrench(stream, robot, recording, wrench)
+        _log_columns(stream, wrench.iloc[at_rate(wrench["t"].to_numpy(), DRAWN_HZ)], [*FORCES, "in_contact"])
+        _log_columns(stream, rows, shown)
         stream.flush()
         stream.disconnect()
     return path
+
+
+def _log_columns(stream: rr.RecordingStream, table: pd.DataFrame, names: Sequence[str]) -> None:
+    """Log columns of a table over its `t`, with the edges of their intervals."""
+    index = [rr.TimeColumn("time", duration=table["t"].to_numpy())]
+    colour = colours(["estimate"])["estimate"]
+    for name in names:
+        x = table[name].to_numpy(dtype=float)
+        lines = {"estimate": (x, LINE_WIDTH)}
+        if f"{name}_half" in table:
+            half = table[f"{name}_half"].to_numpy()
+            lines |= {"low": (x - half, EDGE_WIDTH), "high": (x + half, EDGE_WIDTH)}
+        for label, (values, width) in lines.items():
+            log_series(stream, f"{name}/{label}", index, values, label, colour, width)
+
+
+def _layout(names: Sequence[str]) -> rrb.Blueprint:
+    """Return the arm beside its force, and a tab with a plot per column."""
+    eye = rrb.EyeControls3D(position=[1.5, -1.1, 0.9], look_target=[0.35, 0.0, 0.4])
+    legend = rrb.PlotLegend(visible=False)
+    force = [rrb.TimeSeriesView(origin=f, name=f"force along {f[6]}, N", plot_legend=legend) for f in FORCES]
+    touch = rrb.TimeSeriesView(origin="in_contact", name="contact", plot_legend=legend)
+    scene = rrb.Spatial3DView(origin="arm", name="force on the arm, 1 cm per N", eye_controls=eye)
+    first = rrb.Horizontal(scene, rrb.Vertical(*force, touch, row_shares=[3, 3, 3, 2]), name="force")
+    rest = rrb.Grid(*[rrb.TimeSeriesView(origin=n, name=n) for n in names], name="estimates")
+    sides = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
+    time = rrb.TimePanel(state="collapsed", timeline="time", play_state="playing")
+    return rrb.Blueprint(rrb.Tabs(first, rest, active_tab=0), *sides, time)

@@ -37,6 +37,7 @@ def estimate(cfg, overrides):
     from r2s.adaptation.wrench import contacts, observe_recording
     from r2s.physics.robot import SIM_DT
     from r2s.reporting.estimate_page import draw_estimate, write_estimate_recording
+    from r2s.reporting.wrench_page import draw_wrench
 
     check_number("estimate.every_s", cfg.estimate.every_s, "(0, inf)")
     robot = make_robot(cfg)
@@ -46,6 +47,7 @@ def estimate(cfg, overrides):
         dynamics, posterior, unloaded = calibrated(cfg.calibration, robot)
     if cfg.data.kind == "arm":
         dynamics = with_declared_payload(cfg, robot, dynamics)
+    surface = identified_surface(cfg, robot)
     inputs = [str(located(cfg.data.path))] if recording is not None else []
     parents = [str(cfg.calibration)] if cfg.calibration else []
     with open_run(cfg, overrides, inputs, parents=parents) as run:
@@ -53,7 +55,7 @@ def estimate(cfg, overrides):
             recording = record_arm(cfg, robot)
             recording.save(run.folder / "recording.npz")
         estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
-        observer, threshold_from = wrench_observer(cfg, robot, dynamics)
+        observer, threshold_from = wrench_observer(cfg, robot, dynamics, surface)
         printed, estimates = -float("inf"), []
 
         def report(now):
@@ -79,19 +81,35 @@ def estimate(cfg, overrides):
             | summary(last, estimator.changes)
             | {"noise_from": source}
             | {"contacts": touched, "contact_threshold": observer.threshold, "threshold_from": threshold_from}
+            | ({} if surface is None else {"surface_trusted": observer.trusted})
         )
         draw_estimate(run.figure("payload"), run.figure("friction"), rows, estimator.changes)
-        write_estimate_recording(run.folder / "recording.rrd", rows)
+        draw_wrench(run.figure("wrench"), wrench, recording, touched)
+        write_estimate_recording(run.folder / "recording.rrd", robot, recording, rows, wrench)
         print(format_estimate(last))
         print(format_contacts(touched))
     print(f"written: {run.folder}")
 
 
-def wrench_observer(cfg, robot, dynamics):
+def identified_surface(cfg, robot):
+    """Return the `IdentifiedSurface` of estimate.surface, None without; raise UserError if no tip could touch it."""
+    if not cfg.estimate.surface:
+        return None
+    from r2s.identification.contact.contact_file import load_contact
+
+    if robot.tool is None:
+        raise UserError("robot.tool: estimate.surface needs the tip that touches: robot.tool=TOOL.json")
+    return load_contact(cfg.estimate.surface, "estimate.surface")
+
+
+def wrench_observer(cfg, robot, dynamics, surface):
     """Return the wrench observer of the arm, and what its contact threshold comes from: "recordings" or "noise"."""
     from r2s.adaptation.wrench import WrenchObserver, contact_threshold
+    from r2s.adaptation.wrench_fusion import FusedWrench
 
     observer = WrenchObserver(robot, dynamics)
+    if surface is not None:
+        observer = FusedWrench(robot, dynamics, surface.surface, surface.draws)
     free = free_recordings(cfg.calibration) if cfg.calibration else []
     if free:
         observer.threshold = contact_threshold(robot, observer, free)

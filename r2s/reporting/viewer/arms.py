@@ -65,6 +65,18 @@ def log_arms(
         _plots(arm, label, error)
 
 
+def log_moving_robot(
+    stream: rr.RecordingStream, robot: Robot, base: str, colour: str, t: np.ndarray, q: np.ndarray
+) -> None:
+    """Log the links of one arm at `base`, and their poses at q (T, n) rad over t (T,) s."""
+    stream.log(base, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    model, index = robot.model(gravity=False), rr.TimeColumn("time", duration=t)
+    for body, (position, quaternion) in _poses(model, q).items():
+        _shapes(stream, model, body, _link(base, model, body), colour)
+        columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
+        stream.send_columns(_link(base, model, body), indexes=[index], columns=columns)
+
+
 def _plots(arm: _Arm, label: str, error: Measure) -> None:
     """Log the error and the torque of each joint; a nan after each episode interrupts the line."""
     ends = [np.append(clock, clock[-1] + 1 / FRAMES_HZ) for clock in arm.clocks()]

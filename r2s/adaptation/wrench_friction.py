@@ -1,0 +1,170 @@
+"""What the wrench filter knows about friction: which joints rest, on which side the others slide; compiled.
+
+A joint at rest is held: its speed stays 0, so that friction is what balances all other torques. With A = M_rs M_ss^-1
+of the joints at rest (r) and the sliding ones (s), the momentum of a joint at rest follows from theirs,
+dp_r/dt = A (dp_s/dt - M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
+"""
+
+import numpy as np
+
+from r2s.adaptation import tuning
+from r2s.adaptation.arm_model import friction_torque
+from r2s.adaptation.wrench_state import (
+    ANCHOR,
+    ANGLE,
+    CREEP,
+    CYCLE,
+    DEFLECTION,
+    FAST,
+    FRICTION,
+    FRICTION_BEFORE,
+    KNOWN,
+    MOMENTUM_NOISE,
+    MOTOR_MEAN,
+    MOVED,
+    QUIET,
+    REST,
+    SLOW,
+    TORQUE,
+)  # fmt: skip
+from r2s.compiled import njit
+from r2s.physics.newton_euler import equations
+from r2s.physics.robot import SIM_DT
+
+MASS_EVERY = 20  # cycles between two mass matrices
+
+
+@njit(cache=True, error_model="numpy")
+def masses(arm, noise, state, q):
+    """Write the mass matrix, its rate, and the variances of the measured momenta."""
+    n = len(q)
+    mass, before, rest = state.mass, state.mass.copy(), np.zeros(n)
+    equations(arm.links, arm.gravity, q, rest, mass, np.empty(n), state.work)
+    for j in range(n):
+        mass[j, j] += arm.armature[j]
+        square = 0.0
+        for i in range(n):
+            square += mass[j, i] ** 2
+            if state.counts[CYCLE] > 0:
+                state.mass_rate[j, i] = (mass[j, i] - before[j, i]) / (MASS_EVERY * SIM_DT)
+        state.joints[MOMENTUM_NOISE, j] = square * (tuning.MOMENTUM_NOISE * noise.speed) ** 2
+
+
+@njit(cache=True, error_model="numpy")
+def couple(state):
+    """Write M_rs M_ss^-1 of the joints at rest (r) and the sliding ones (s)."""
+    rest, mass = state.joints[REST], state.mass
+    state.coupling[:] = 0.0
+    sliding, resting = np.flatnonzero(rest == 0.0), np.flatnonzero(rest == 1.0)
+    if len(sliding) == 0 or len(resting) == 0:
+        return
+    own, cross = np.empty((len(sliding), len(sliding))), np.empty((len(sliding), len(resting)))
+    for a in range(len(sliding)):
+        for b in range(len(sliding)):
+            own[a, b] = mass[sliding[a], sliding[b]]
+        for b in range(len(resting)):
+            cross[a, b] = mass[sliding[a], resting[b]]
+    share = np.linalg.solve(own, cross)
+    for a in range(len(sliding)):
+        for b in range(len(resting)):
+            state.coupling[resting[b], sliding[a]] = share[a, b]
+
+
+@njit(cache=True, error_model="numpy")
+def known_torque(arm, noise, state, q):
+    """Decide which joints rest, and write friction models and known torques."""
+    joints, terms, x, P = state.joints, state.terms, state.x, state.P
+    n = len(q)
+    b = len(x) - 2 * n
+    for j in range(n):
+        rested = joints[REST, j] == 1.0
+        _rest_or_motion(noise, joints, j, q[j])
+        if joints[REST, j] == 0.0:
+            side = joints[CREEP, j]
+            now = _unlagged(joints, j)
+            if side == 0.0:  # the slow speed has less noise, but reverses late
+                side = now if abs(now) > tuning.REVERSES * noise.speed else joints[SLOW, j]
+            side = 1.0 if side > 0.0 else -1.0
+            speed = side * max(side * now, 0.0)
+            sin, cos = np.sin(q[j]), np.cos(q[j])
+            level = arm.load[j] * abs(terms.compensated[j])
+            level += arm.angle_friction[j, 0] * sin + arm.angle_friction[j, 1] * cos
+            z, moved = side, abs(joints[CREEP, j]) if joints[CREEP, j] != 0.0 else abs(speed) * SIM_DT
+            if noise.presliding[j] > 0.0:
+                z += (joints[DEFLECTION, j] - side) * np.exp(-moved / noise.presliding[j])
+            joints[DEFLECTION, j] = z
+            model = friction_torque(arm.table[j], arm.max_speed[j], speed, z) + level * z
+            if rested:
+                joints[FRICTION_BEFORE, j] = model
+                P[b + j, b + j] = noise.friction[j] ** 2
+            joints[FRICTION, j] = model
+        elif not rested:  # friction is what balances the rest
+            x[b + j] = 0.0
+            P[b + j] = 0.0
+            P[:, b + j] = 0.0
+        torque = arm.offset[j] + arm.drag[j, 0] * np.sin(q[j]) + arm.drag[j, 1] * np.cos(q[j])
+        torque += terms.coriolis[j] - terms.uncompensated[j]
+        friction = 0.5 * (joints[FRICTION, j] + joints[FRICTION_BEFORE, j])
+        joints[KNOWN, j] = joints[MOTOR_MEAN, j] + 0.5 * (torque + joints[TORQUE, j]) - friction
+        joints[FRICTION_BEFORE, j], joints[TORQUE, j] = joints[FRICTION, j], torque
+
+
+@njit(cache=True, error_model="numpy")
+def _rest_or_motion(noise, joints, j, q):
+    """Decide whether joint j rests; a joint that has crept since it came to rest slides for this cycle."""
+    joints[CREEP, j] = 0.0
+    if joints[REST, j] == 1.0:
+        joints[MOVED, j] += SIM_DT * tuning.CREEP_RATE * (q - joints[ANCHOR, j] - joints[MOVED, j])
+        if abs(joints[SLOW, j]) > tuning.MOVES * noise.speed:
+            joints[REST, j] = 0.0
+        elif abs(joints[MOVED, j]) > tuning.CREPT * noise.angle:
+            joints[REST, j], joints[CREEP, j] = 0.0, joints[MOVED, j]
+        return
+    still = abs(joints[FAST, j]) < tuning.STILL_SPEED * noise.speed
+    joints[QUIET, j] = joints[QUIET, j] + 1.0 if still else 0.0
+    stopped = joints[QUIET, j] >= tuning.STILL
+    if stopped or (still and abs(joints[SLOW, j]) < tuning.RESTS * noise.speed):
+        if stopped:
+            joints[SLOW, j] = joints[FAST, j]
+        joints[REST, j], joints[QUIET, j], joints[ANCHOR, j], joints[MOVED, j] = 1.0, 0.0, joints[ANGLE, j], 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _unlagged(joints, j):
+    """Return the speed of joint j, rad/s, without the lag of its low-passes at a constant acceleration."""
+    return joints[FAST, j] + tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
+
+
+@njit(cache=True, error_model="numpy")
+def side_variance(noise, joints, j):
+    """Return the variance, Nm^2, of friction whose side is known through a noisy speed: 4 f^2 p (1 - p)."""
+    lag = tuning.LAG * (joints[FAST, j] - joints[SLOW, j])
+    sd = np.sqrt((tuning.SIDE_NOISE * noise.speed) ** 2 + lag**2)
+    p = 1.0 / (1.0 + np.exp(min(1.7 * abs(_unlagged(joints, j)) / sd, 50.0)))  # logistic for the normal distribution
+    unbent = tuning.BRISTLES * (1.0 - joints[DEFLECTION, j] ** 2)  # of a bristle whose law is known roughly
+    return (noise.edges[j, 1] - noise.edges[j, 0]) ** 2 * (p * (1.0 - p) + unbent)
+
+
+@njit(cache=True, error_model="numpy")
+def balance(state, j, gain):
+    """Return the friction, Nm, that holds joint j at rest; write its derivative by the state in `gain` (N,)."""
+    x, joints, J = state.x, state.joints, state.jacobian
+    n = joints.shape[1]
+    w = len(x) - 2 * n
+    gain[:] = 0.0
+    friction = joints[TORQUE, j] + joints[MOTOR_MEAN, j]
+    for c in range(w):
+        gain[c] = J[c, j]
+    for s in range(n):
+        if joints[REST, s] == 0.0:
+            A, known = state.coupling[j, s], joints[KNOWN, s]
+            for i in range(n):
+                if joints[REST, i] == 0.0:
+                    known -= state.mass_rate[s, i] * joints[FAST, i]
+            friction -= A * known + state.mass_rate[j, s] * joints[FAST, s]
+            gain[w + s] = A
+            for c in range(w):
+                gain[c] -= A * J[c, s]
+    for i in range(w + n):
+        friction += gain[i] * x[i]
+    return friction

@@ -1,0 +1,75 @@
+"""Memory of the wrench filter from cycle to cycle, and the uncertainty that it is given."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from r2s.adaptation.momentum import BODY, MOMENTUM_WORK, MomentumTerms
+from r2s.physics.actuation import SLOTS
+from r2s.physics.kinematics import POSE
+from r2s.physics.newton_euler import WORK
+
+COMMAND, CYCLE = range(2)  # `WrenchState.counts`
+# `WrenchState.contact`: low-passed squared innovations per joint, in variances; squared force in variances, 0 unless
+# a joint moves; 1 in contact; cycles of the square above the threshold, and below the threshold of release; path of
+# the tip, m, through which the force was a weight
+SURPRISE, SQUARE, TOUCHES, ABOVE, BELOW, HANGING = range(6)
+# rows of `joints`: filtered angle rad; slow and fast speed rad/s; 1 at rest; cycles of little speed; angle where it
+# came to rest, motion since, and creep of this cycle, rad; friction model, and that of the cycle before, Nm; known
+# torque without motor and friction of the cycle before, known torque of the cycle before, mean known torque of the
+# last cycle with friction, motor torque, and its mean in the coming cycle, Nm; variance of the momentum (Nm s)^2
+ANGLE, SLOW, FAST, REST, QUIET, ANCHOR, MOVED, CREEP, FRICTION, FRICTION_BEFORE, TORQUE, KNOWN = range(12)
+MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = range(12, 20)
+
+
+class WrenchNoise(NamedTuple):
+    """Uncertainty of n joints' friction, and the sensors' noise."""
+
+    friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a sliding joint
+    edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway edge, of all torques but friction
+    presliding: np.ndarray  # (n,) rad, 0: a joint sticks until it breaks away
+    inertia: float  # error of the inertia: share of a joint's net torque
+    speed: float  # rad/s, white noise of measured speeds
+    angle: float  # rad, of measured angles
+
+
+class WrenchState(NamedTuple):
+    """Memory from cycle to cycle."""
+
+    x: np.ndarray  # (N,)
+    P: np.ndarray  # (N, N)
+    joints: np.ndarray  # (ROWS, n)
+    counts: np.ndarray  # (2,)
+    contact: np.ndarray  # (6,), see SURPRISE to HANGING
+    payload: np.ndarray  # (10,), carried beside the model's links, payload frame (momentum.py)
+    commands: np.ndarray  # (SLOTS, n) Nm
+    place: np.ndarray  # (3,) m, tip in the base frame
+    jacobian: np.ndarray  # (6, n): of the tip's position, and of the rotation
+    frames: np.ndarray  # (n, POSE)
+    terms: MomentumTerms
+    work: np.ndarray
+    column: np.ndarray  # (N,)
+    mass: np.ndarray  # (n, n) kg m^2
+    coupling: np.ndarray  # (n, n): momentum rate of a joint at rest (row) per net torque of a sliding one (column)
+    mass_rate: np.ndarray  # (n, n) kg m^2/s
+
+    @staticmethod
+    def fresh(n: int, components: int) -> "WrenchState":
+        """Return the state before the first cycle; components: 3 (force) or 6 (with moment)."""
+        N = components + 2 * n
+        joints = np.zeros((ROWS, n))
+        joints[REST] = 1.0
+        arrays = (
+            np.zeros(6),
+            np.zeros(BODY),
+            np.zeros((SLOTS, n)),
+            np.zeros(3),
+            np.zeros((6, n)),
+            np.zeros((n, POSE)),
+        )
+        work = np.zeros((n, max(MOMENTUM_WORK, WORK)))
+        counts = np.array([SLOTS, 0])
+        return WrenchState(
+            np.zeros(N), np.zeros((N, N)), joints, counts, *arrays, MomentumTerms.empty(n), work, np.zeros(N),
+            np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)),
+        )  # fmt: skip
