@@ -99,7 +99,7 @@ def test_mjcf_comes_back(arm, tmp_path):
     check(robot, reference(robot, dynamics), statics(robot, model, "ee"))
     coulomb, viscous = coulomb_viscous(robot, dynamics)
     np.testing.assert_allclose(model.dof_frictionloss, coulomb, atol=1e-9)
-    np.testing.assert_allclose(model.dof_damping, viscous + robot.model(gravity=False).dof_damping, atol=1e-9)
+    np.testing.assert_allclose(model.dof_damping, viscous, atol=1e-9)
     np.testing.assert_allclose(model.jnt_range, np.stack([robot.q_min, robot.q_max], -1), atol=1e-6)
     again = load_robot(str(tmp_path / "arm.xml"))
     np.testing.assert_allclose(again.tau_max, robot.tau_max)
@@ -142,10 +142,9 @@ def limits(robot, dynamics, skeleton):
     """Check limits and friction as DART read them."""
     joints = [j for j in skeleton.getJoints() if j.getNumDofs()]
     coulomb, viscous = coulomb_viscous(robot, dynamics)
-    own = robot.model(gravity=False).dof_damping
     np.testing.assert_allclose([j.getPositionLowerLimit(0) for j in joints], robot.q_min)
     np.testing.assert_allclose([j.getPositionUpperLimit(0) for j in joints], robot.q_max)
-    np.testing.assert_allclose([j.getDampingCoefficient(0) for j in joints], own + viscous, atol=1e-12)
+    np.testing.assert_allclose([j.getDampingCoefficient(0) for j in joints], viscous, atol=1e-12)
     np.testing.assert_allclose([j.getCoulombFriction(0) for j in joints], coulomb, atol=1e-12)
 
 

@@ -172,11 +172,11 @@ def test_it_goes_through_the_file(result, path, arm, tmp_path):
 def test_scales_and_optional_parameters_are_the_records(path, arm):
     """Logarithmic ones have their geometric mean in the middle of the cube; a term brings the optional one in."""
     own = with_family(nominal_dynamics(arm, **conf("friction/uniform")), path)
-    motion = SimpleNamespace(torque="commanded")
+    motion = SimpleNamespace(torque="commanded", tau=np.zeros((1, arm.n)))
     space = search_space(arm, own, BOUNDS, ["viscous"], motion)
     middle = space.from_unit(np.full(6, 0.5))
     np.testing.assert_allclose(space.block(middle, "width"), np.sqrt(0.005 * 0.5))
-    np.testing.assert_allclose(space.block(middle, "viscous"), 5.0)
+    np.testing.assert_allclose(space.block(middle, "viscous"), 0.5 * BOUNDS["viscous"][1] * arm.tau_max)
     narrow = search_space(arm, own, BOUNDS | {"width": [0.01, 0.1]}, ["viscous"], motion)
     np.testing.assert_allclose(narrow.block(narrow.upper, "width"), 0.1)
     for terms, blocks in ((["offset"], 3), (["viscous", "offset"], 4)):

@@ -136,7 +136,7 @@ def test_other_motion_is_predicted_to_the_noise(arm, start, truth, motion):
 
 
 def test_beliefs_and_bounds_grow_with_the_arm(arm, start, motion):
-    """Shares of the joint's largest torque, the file's or the recorded one; of commands only rotors are."""
+    """Shares of the joint's largest torque, the file's or the recorded one, whatever the kind of torque."""
     arm = replace(arm, tau_max=np.array([150.0, 1.0, 60.0]))  # a limit that the recording proves wrong
     largest = np.maximum(arm.tau_max, np.abs(motion.tau).max(0))
     prior = SETTINGS["prior"]["motor"]
@@ -148,12 +148,10 @@ def test_beliefs_and_bounds_grow_with_the_arm(arm, start, motion):
     assert np.all(space.upper >= np.tile(np.minimum(largest, 0.05), len(space.blocks)))
     np.testing.assert_allclose(space.block(space.lower, "offset"), -largest)
     other = replace(motion, torque="commanded")
-    commanded = scaled_prior(prior, arm, other)
-    np.testing.assert_allclose(commanded.pop("armature"), prior["armature"] * largest)
-    assert commanded == {name: sigma for name, sigma in prior.items() if name != "armature"}
+    np.testing.assert_equal(scaled_prior(prior, arm, other), own)
     space = search_space(arm, start, SETTINGS["bounds"], ["offset"], other)
-    np.testing.assert_allclose(space.block(space.upper, "offset"), SETTINGS["bounds"]["offset"][1])
-    assert len(Problem.of(*[TorqueResidual(space, other)] * 2, prior).sigma) == len(space.start)
+    np.testing.assert_allclose(space.block(space.upper, "offset"), SETTINGS["bounds"]["offset"][1] * largest)
+    assert len(Problem.of(*[TorqueResidual(space, other)] * 2, own).sigma) == len(space.start)
 
 
 def test_a_link_side_sensor_does_not_feel_rotors(arm, start, truth):

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from r2s.errors import UserError
 from r2s.identification.link_inertia import CHOLESKY, LINK, inertia_scale, links, log_cholesky, pseudo_inertia
 from r2s.identification.parameter_file import load_parameters, load_posterior, save_parameters
-from r2s.identification.parameters import WHOLE_ARM, ParameterEstimate, parameter_space, units
+from r2s.identification.parameters import WHOLE_ARM, ParameterEstimate, parameter_space, torque_like, units
 from r2s.learning.randomization import PosteriorRandomization, UniformRandomization, physical
 from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import FAMILIES, STRIBECK
 from r2s.physics.robot import load_robot
 
-ALL = conf("identify/default")["bounds"]
+ALL = {k: np.multiply(v, 20.0 if k in torque_like() else 1.0) for k, v in conf("identify/default")["bounds"].items()}
 EDGES = {"breakaway_positive": [0.0, 1.5], "breakaway_negative": [-1.5, 0.0]}
 PAPER = {k: ALL[k] for k in ("phi1", "phi2", "phi3", "inertia_scale", "offset")}
 REST = {k: ALL[k] for k in ("offset", *LINK, "delay", "lag", "load", "drag_sin", "drag_cos", "gain")}
@@ -89,14 +89,14 @@ def test_outside_of_the_cube_is_its_edge(either):
 def test_logarithmic_coordinates_have_their_geometric_mean_in_the_middle(space, whole):
     """What spans decades is searched by ratio, the rest by difference; `width` is the width in that coordinate."""
     middle = space.from_unit(np.full(len(space.start), 0.5))
-    np.testing.assert_allclose(space.block(middle, "phi1"), np.sqrt(0.05 * 10.0))
+    np.testing.assert_allclose(space.block(middle, "phi1"), np.sqrt(ALL["phi1"].prod()))
     np.testing.assert_allclose(space.block(middle, "inertia_scale"), np.sqrt(0.3 * 3.0))
     np.testing.assert_allclose(space.block(middle, "phi3"), 0.0, atol=1e-15)
     middle = whole.from_unit(np.full(len(whole.start), 0.5))
     np.testing.assert_allclose(whole.block(middle, "stribeck_velocity"), np.sqrt(0.01 * 0.5))
     np.testing.assert_allclose(whole.block(middle, "delay"), [0.005])
-    np.testing.assert_allclose(whole.block(whole.width, "coulomb"), np.log(10.0 / 0.02))
-    np.testing.assert_allclose(whole.block(whole.width, "drag_sin"), 2.0)
+    np.testing.assert_allclose(whole.block(whole.width, "coulomb"), np.log(ALL["coulomb"][1] / ALL["coulomb"][0]))
+    np.testing.assert_allclose(whole.block(whole.width, "drag_sin"), np.ptp(ALL["drag_sin"]))
 
 
 def test_the_start_is_the_nominal_arm(space, whole, paper):

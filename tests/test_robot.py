@@ -120,11 +120,12 @@ def test_the_files_limits_are_read(arm):
 
 
 def test_the_compiled_arm_keeps_the_limits_and_drops_the_motors(arm):
-    """In `model` ranges are those of the Robot in rad, actuators are gone, damping and armature stay."""
+    """In `model` ranges are those of the Robot in rad, actuators are gone, armature stays, damping is of the law."""
     model = arm.model(gravity=False)
     np.testing.assert_allclose(model.jnt_range, np.stack([arm.q_min, arm.q_max], -1))
     assert model.nu == 0
-    np.testing.assert_allclose(model.dof_damping, [0, 0, 0.05])
+    assert not model.dof_damping.any()
+    np.testing.assert_allclose(arm.damping, [0, 0, 0.05])
     np.testing.assert_allclose(model.dof_armature, [0, 0.01, 0])
 
 
@@ -143,7 +144,7 @@ def test_what_is_given_goes_over_the_file(write):
 
 def test_another_arm_goes_through_environment_and_identification(arm):
     """Three joints: an episode starts and steps, an excitation keeps its limits, a residual is computed."""
-    nominal = nominal_dynamics(arm, **conf("friction/uniform"))
+    nominal = nominal_dynamics(arm, **conf("friction/uniform") | {"family": "sigmoid"})
     env = TaskEnv(arm, ReachTask(reach=(0.1, 0.5)), lambda rng, m: nominal, 4, nthread=1)
     state = env.reset()
     state["action"] = env.action_spec.rand()

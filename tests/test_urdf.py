@@ -149,7 +149,7 @@ def test_a_urdf_is_the_mjcf_of_the_same_arm(write):
     np.testing.assert_allclose(urdf.mass[:2], mjcf.mass[:2], atol=1e-9)
     np.testing.assert_allclose(urdf.com[:2], mjcf.com[:2], atol=1e-9)
     np.testing.assert_allclose(urdf.inertia[:2], mjcf.inertia[:2], atol=1e-9)
-    np.testing.assert_array_equal(urdf.model(gravity=True).dof_damping, [0.2, 0, 0])
+    np.testing.assert_array_equal(urdf.damping, [0.2, 0, 0])
     names = [urdf.model(gravity=True).joint(i).name for i in range(3)]
     assert names == ["yaw", "pitch", "roll"]
 

@@ -21,7 +21,7 @@ class DartEngine:
     """One arm without contacts. A command lasts one step and is clipped to the torque limits.
 
     Args:
-        robot: the arm; its MJCF defines kinematics, inertia, damping and limits.
+        robot: the arm; its MJCF defines kinematics, inertia and limits.
         gravity: False is libfranka's convention (the arm compensates it).
         masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
             axes; each replaces the MJCF's values of the n moving links.
@@ -55,8 +55,8 @@ class DartEngine:
         # DART has no armature A. Damping A/h plus the torque (A/h) v is exactly equivalent: the implicit step solves
         # (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
         self._armature = np.array(robot.armature if armature is None else armature, dtype=float)
-        self._damping = model.dof_damping + self._armature / dt
-        self._counter = self._armature / dt if self._armature.any() else None
+        self._damping = self._armature / dt
+        self._counter = self._damping if self._armature.any() else None
         self._low, self._high = -robot.tau_max, robot.tau_max
         self._skeleton = dart.dynamics.Skeleton(robot.name)
         self._joints = []
@@ -97,7 +97,6 @@ class DartEngine:
             raise UserError(f"robot.mjcf: link '{model.body(body).name}' has no mass")
         link.setInertia(dart.dynamics.Inertia(mass, com, inertia))
         joint.setDampingCoefficient(0, float(self._damping[i]))
-        joint.setCoulombFriction(0, float(model.dof_frictionloss[i]))
         joint.setSpringStiffness(0, float(model.jnt_stiffness[i]))
         joint.setRestPosition(0, float(model.qpos_spring[i]))
         joint.setLimitEnforcement(True)  # off by default in dartpy
@@ -124,7 +123,7 @@ class DartEngine:
         Args:
             tau: (n,) Nm, the command; clipped to the torque limits.
             passive: (n,) Nm, joint torque that is not clipped: friction, offsets.
-            damping: (n,) Nm s/rad, implicit damping of this step in addition to the MJCF's.
+            damping: (n,) Nm s/rad, implicit damping of this step.
         """
         drive = np.minimum(np.maximum(tau, self._low), self._high)
         if passive is not None:

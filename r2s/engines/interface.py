@@ -45,7 +45,6 @@ class FrictionTorque:
     def __init__(self, robot: Robot, dynamics: Dynamics):
         self._model = single_arm(robot, dynamics)
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # the engine has its own stops
-        self._file_damping = robot.model(gravity=False).dof_damping
         self._data = mujoco.MjData(self._model)
         self._mass = np.empty((robot.n, robot.n))
         self.contact = None
@@ -63,5 +62,4 @@ class FrictionTorque:
         slope = m.opt.timestep * m.dof_damping
         drive = d.qfrc_applied + d.qfrc_passive - d.qfrc_bias
         ddq = np.linalg.solve(self._mass + np.diag(slope), drive)
-        own = m.opt.timestep * self._file_damping  # the engine itself applies the file's damping
-        return d.qfrc_passive + self._file_damping * dq - (slope - own) * ddq
+        return d.qfrc_passive - slope * ddq

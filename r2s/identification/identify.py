@@ -156,7 +156,7 @@ def identify(
         UserError: the recording does not fit the arm or hardly moves.
     """
     check_motion(robot, recording)
-    prior, history = scaled_prior(settings.prior, robot, recording), History(report, memo)
+    prior, history = scaled_prior(settings.prior, robot, recording, nominal), History(report, memo)
     s = State(robot, nominal, recording, searches, settings, ramps, prior, history, settings.terms)
     for step in STEPS:
         s = step(s)

@@ -25,6 +25,8 @@ OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
 OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
 TIMING = ("delay", "lag")
+# standard deviation of a parameter among arms by its unit, of torque-like ones per Nm of tau_max; 1 of a logarithm
+USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
 OF_LINKS = ("inertia_scale", *LINK)
 PER_JOINT = ("offset", "armature", "load", "gain")  # blocks that are fields of Dynamics
@@ -42,8 +44,13 @@ def logarithmic() -> set[str]:
 
 
 def torque_like() -> set[str]:
-    """Return the parameters that scale with the size of an arm: those in Nm and Nm s/rad, and the rotors."""
+    """Return the parameters per joint that scale with an arm: those in Nm and Nm s/rad, and the rotors."""
     return {name for name, unit in units().items() if unit.startswith("Nm")} | {"armature"}
+
+
+def sizes(largest: np.ndarray) -> dict[str, Any]:
+    """Return {torque-like parameter: the largest torque (n,) Nm of its joint, or of the arm for a payload}."""
+    return dict.fromkeys(torque_like(), largest) | {PAYLOAD[0]: largest.max()}
 
 
 @dataclass(frozen=True)
@@ -123,6 +130,13 @@ class ParameterSpace:
     def width(self) -> np.ndarray:
         """(P,) width of the bounds in SI units, or of their logarithm for logarithmic coordinates."""
         return self._warp(self.upper) - self._warp(self.lower)
+
+    @property
+    def usual(self) -> np.ndarray:
+        """(P,) standard deviation of each value among arms, like `width`; inf for a unit without one."""
+        unit, size = units(), sizes(self.robot.tau_max)
+        usual = {b: USUAL.get(unit[b], np.inf) * size.get(b, 1.0) for b in self.blocks}
+        return np.where(self._log, 1.0, self.expand(usual, np.inf))
 
     def _warp(self, x: np.ndarray) -> np.ndarray:
         return np.where(self._log, np.log(np.where(self._log, x, 1.0)), x)

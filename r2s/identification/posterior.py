@@ -52,7 +52,8 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
     score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
     rest = jacobian[rows:]
-    prior = rest.T @ rest
+    # a flat prior has no row; the bounds alone leave a variance of 1/12
+    prior = rest.T @ rest + np.diag(np.where(rest.any(0), 0.0, 12.0))
     counts = j.any(1)  # padding rows have neither a residual nor a slope
     factor = max(1.0, float(np.sqrt(np.mean(r[counts] ** 2)))) if counts.any() else 1.0
     information = gram.sum(0)

@@ -15,7 +15,9 @@ from r2s.identification.search.levenberg_marquardt import minimize
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
-FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
+UNIFORM = 12**-0.5  # standard deviation of a uniform distribution, of its width
+FIXED = 1.0001e-4  # prior sigma of a fixed value, relative to the width of its bounds
+TAIL = 25.0  # degrees of freedom of the prior, plus 1
 # implicit friction: least significance of its effect in standard deviations, and size relative to the expected one
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; nominal friction of a motor may be off by tens of Nm
@@ -38,7 +40,8 @@ class Problem:
     Attributes:
         data: the residual to minimize.
         torque_data: the torque residual, for a fast start; may be `data` itself.
-        sigma: (P,) prior standard deviation about the nominal value (of the logarithm for logarithmic coordinates).
+        sigma: (P,) prior standard deviation about the nominal value (of the logarithm for logarithmic coordinates);
+            inf: flat.
         extra: further residuals.
     """
 
@@ -55,9 +58,8 @@ class Problem:
         prior: Mapping[str, ArrayLike],
         extra: Sequence[ExtraResidual] = (),
     ) -> "Problem":
-        """Return the problem with prior {"offset": sigma or (n,), ...}; other blocks are uniform in their bounds."""
-        uniform = data.space.width / np.sqrt(12)
-        return cls(data, torque_data, np.minimum(data.space.expand(prior, np.inf), uniform), tuple(extra))
+        """Return the problem with prior {"offset": sigma or (n,), ...}, SI units; that of other blocks is flat."""
+        return cls(data, torque_data, data.space.expand(prior, np.inf).astype(float), tuple(extra))
 
     @property
     def space(self) -> ParameterSpace:
@@ -78,6 +80,16 @@ class Problem:
     def uses_replays(self) -> bool:
         """Whether the data are replayed windows instead of torques."""
         return self.data is not self.torque_data
+
+    @property
+    def prior_width(self) -> np.ndarray:
+        """(P,) on the unit cube, the standard deviation that the data's is compared with: the prior's.
+
+        Of a flat prior it is that among arms in general (`ParameterSpace.usual`). Bounds count where they are
+        narrower: wider ones change nothing.
+        """
+        stated = np.where(np.isinf(self.sigma), self.space.usual, self.sigma)
+        return np.minimum(stated / self.space.width, UNIFORM)
 
     @property
     def weight(self) -> np.ndarray:
@@ -135,7 +147,11 @@ class Problem:
         return np.concatenate([data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def _prior(self, u: np.ndarray) -> np.ndarray:
-        prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
+        z, x = (u - self.start) * self.weight, self.space.from_unit(u)
+        # heavy tails: data that clearly contradict a prior outvote it, as Student's t lets an outlier (Lange et al.,
+        # J. Am. Stat. Assoc. 84(408), 1989); near the nominal value it is normal
+        heavy = np.sign(z) * np.sqrt(TAIL * np.log1p(z**2 / TAIL))
+        prior = np.where(self.sigma > FIXED * self.space.width, heavy, z)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
 
 

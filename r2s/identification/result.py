@@ -10,13 +10,14 @@ from scipy.stats import t as student
 
 from r2s.identification.friction.breakaway import Breakaway
 from r2s.identification.friction.repeatability import certainty
-from r2s.identification.parameters import ParameterEstimate, ParameterSpace
+from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterEstimate, ParameterSpace, units
 from r2s.identification.problem import Problem
 from r2s.physics.dynamics import Dynamics
 
-MAX_BREAKAWAY = 10.0  # Nm, bound of a breakaway torque
+EDGE = 5e-4  # share of a parameter's range that counts as its bound
+RIDGE = 1e-6  # on the unit cube, information on a value with a flat prior that no data show
 UNSEEN = 0.9  # posterior over prior sigma above which the data hardly determine a value
-SHARPER = 4.0  # a parameter is identifiable if half its interval is less than its prior sigma over this
+SHARPER = 4.0  # a parameter is identifiable if half its interval is less than its prior's sigma over this
 NULL_SHARE = 0.5  # posterior over prior sigma above which a direction is listed as decided by the prior
 LISTED_PARTS, LEAST_PART = 6, 0.2  # parameters of such a direction: at most so many, with at least that part
 
@@ -56,11 +57,28 @@ class IdentificationResult:
         return self.space.dynamics(self.found.x)
 
     @property
+    def at_bounds(self) -> list[str]:
+        """A line for each value at a bound of the search other than 0: the best value may lie beyond it."""
+        s, u, unit, lines = self.space, self.space.to_unit(self.found.x), units(), []
+        for block in s.blocks:
+            for k, at in enumerate(s.where(block)):
+                side, edge = ("upper", s.upper[at]) if u[at] > 0.5 else ("lower", s.lower[at])
+                if EDGE < u[at] < 1.0 - EDGE or edge == 0.0 or s.names[at] in self.unseen:
+                    continue
+                joint = "" if block in WHOLE_ARM else f" of {'link' if block in OF_LINKS else 'joint'} {k + 1}"
+                lines.append(
+                    f"identify.bounds.{block}: {block}{joint} is {self.x[at]:.4g} {unit[block]}, its {side} bound; "
+                    "the data may want more, so widen it"
+                )
+        return lines
+
+    @property
     def note(self) -> dict[str, Any]:
         """Entries of parameters.yaml about the identification itself."""
         null = [{"share_of_prior_left": round(s, 2), **parts} for s, parts in self.null_directions]
         out = {"unseen_and_left_nominal": self.unseen, "decided_by_the_prior": null}
         out |= {"families_compared": self.families, "replays_refused": self.refused}
+        out |= {"at_bounds": self.at_bounds} if self.at_bounds else {}
         unknown = self.edges.unknown if self.edges is not None else {}
         return out | ({"breakaway_unknown": unknown} if unknown else {})
 
@@ -74,7 +92,7 @@ class IdentificationResult:
         """
         if self.edges is None:
             return self.space, self.found
-        f, n = self.found, self.space.n
+        f = self.found
         x = self.dynamics.breakaway
         sigma, freedom = certainty(self.edges, self.space.robot.tau_max)
         got, scale = np.isfinite(sigma), np.nan_to_num(sigma)
@@ -87,13 +105,13 @@ class IdentificationResult:
         edges = np.stack([np.minimum(edges[..., 0], 0.0), np.maximum(edges[..., 1], 0.0)], -1)
         half = np.hypot(most * scale, moves)
         held = self.edges.held + self.dynamics.offset[:, None]
-        low, high = np.where(got, x - half, held), np.where(got, x + half, held)
-        low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -MAX_BREAKAWAY), np.minimum(high[:, 0], 0.0)
-        high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], MAX_BREAKAWAY), np.maximum(low[:, 1], 0.0)
+        low, high = np.where(got, x - half, np.minimum(held, x)), np.where(got, x + half, np.maximum(held, x))
+        limit = np.maximum(self.space.robot.tau_max, np.abs([x, low, high]).max((0, 2)))
+        low[:, 0], high[:, 0] = np.where(got[:, 0], low[:, 0], -limit), np.minimum(high[:, 0], 0.0)
+        high[:, 1], low[:, 1] = np.where(got[:, 1], high[:, 1], limit), np.maximum(low[:, 1], 0.0)
         zone = 0.5 * np.ptp(x, axis=1)[:, None]  # half the dead zone is the scale of identifiability
         columns = [[a[..., 0], a[..., 1]] for a in (x, low, high, got & (half < zone / SHARPER), edges)]
         own = f.x, f.low, f.high, f.identifiable, f.samples
-        limit = np.full(n, MAX_BREAKAWAY)
         space = replace(
             self.space,
             blocks=(*self.space.blocks, "breakaway_negative", "breakaway_positive"),
@@ -115,18 +133,23 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     """
     u = np.array(sure["u"], dtype=float)
     steps, information = np.asarray(sure["steps"]), np.asarray(sure["information"])
-    prior = problem.sigma / space.width  # on the unit cube
-    u, unseen = _settle(u, problem.start, information + problem.prior_information(u), steps.std(0) / prior)
-    low, high = (space.from_unit(u + np.quantile(steps, s, axis=0)) for s in (0.025, 0.975))
-    half = 0.5 * (np.quantile(steps, 0.975, axis=0) - np.quantile(steps, 0.025, axis=0))
-    found = ParameterEstimate(space.from_unit(u), low, high, half < prior / SHARPER, space.from_unit(u + steps))
+    prior, h = problem.prior_width, information + problem.prior_information(u)
+    u, unseen = _settle(u, problem.start, h + RIDGE * np.eye(len(u)), steps.std(0) / prior)
+    steps = np.clip(u + steps, 0.0, 1.0) - u
+    low, high = (np.minimum(0.0, np.quantile(sign * steps, 0.025, axis=0)) for sign in (1.0, -1.0))
+    inside = (u > EDGE) & (u < 1.0 - EDGE)  # at a bound the interval says nothing about the other side
+    seen = inside & (-0.5 * (low + high) < prior / SHARPER)
+    ends = space.from_unit(u + low), space.from_unit(u - high)
+    found = ParameterEstimate(space.from_unit(u), *ends, seen, space.from_unit(u + steps))
     # in units of the prior: a direction without further information has an eigenvalue of 1
-    gained, directions = np.linalg.eigh(prior[:, None] * (information + problem.prior_information(u)) * prior)
+    h = h + np.diag(np.where(np.isinf(problem.sigma), prior**-2.0, 0.0))
+    gained, directions = np.linalg.eigh(prior[:, None] * h * prior)
     null = []
     for g, v in zip(gained, directions.T, strict=True):
         if g < NULL_SHARE**-2:
             parts = sorted(zip(space.names, v.tolist(), strict=True), key=lambda p: -abs(p[1]))[:LISTED_PARTS]
-            null.append((float(g**-0.5), {name: round(part, 2) for name, part in parts if abs(part) > LEAST_PART}))
+            shown = {name: round(part, 2) for name, part in parts if abs(part) > LEAST_PART}
+            null.append((min(float(g**-0.5), 1.0), shown))
     names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
     return IdentificationResult(space, found, null_directions=null, unseen=names, **story)
 

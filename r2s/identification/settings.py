@@ -16,15 +16,16 @@ class Settings:
     """Settings of `identify`: those of conf/identify, with terms and prior for one kind of torque.
 
     Attributes:
-        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; an end is a number or (n,).
-        prior: {"inertia_scale": sigma, ...}, see `Problem`.
+        bounds: {"phi1": [low, high], ...} of every parameter that may be estimated; an end is a number or (n,), for
+            torque-like parameters of tau_max (terms.py: `scaled_bounds`).
+        prior: {"inertia_scale": sigma or None (flat), ...} in the same units, see `scaled_prior` and `Problem`.
         terms: estimated beside friction, see terms.py.
         family: of friction; auto selects it by cross-validation.
         window_s: s, length of replayed windows (commanded torque).
         stride: ms, averaging of compared angles (commanded torque).
         cutoff_hz: of the zero-phase filter of torque.
-        breakaway: Nm, upper limit of the scan for breakaway torques without ramps (commanded torque; a link-side
-            sensor does not measure the motor's breakaway). None keeps the nominal ones.
+        breakaway: upper limit of the scan for breakaway torques without ramps, over the identified friction
+            (commanded torque; a link-side sensor does not measure the motor's). None keeps the nominal ones.
         folds: of the cross-validation within the recording.
         candidate_terms: terms that enter if they improve held-out prediction; `link` replaces `inertia_scale`.
         prunable_terms: terms that are removed if held-out prediction stays as good.
@@ -36,7 +37,7 @@ class Settings:
     """
 
     bounds: Mapping[str, Sequence[ArrayLike]]
-    prior: Mapping[str, ArrayLike]
+    prior: Mapping[str, ArrayLike | None]
     terms: Sequence[str]
     family: str = "sigmoid"
     window_s: float = 0.2

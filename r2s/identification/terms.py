@@ -1,15 +1,16 @@
 """Terms of the model beside friction: which parameters they estimate, with which bounds and prior."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.link_inertia import LINK, PAYLOAD
-from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, parameter_space, torque_like
+from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, parameter_space, sizes
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.friction import known_families
+from r2s.physics.friction import VISCOUS, known_families
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
@@ -35,12 +36,12 @@ def check_terms(where: str, terms: Sequence[str]) -> None:
             raise UserError(f"{where}: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
 
 
-def check_prior(prior: Mapping[str, ArrayLike]) -> None:
+def check_prior(prior: Mapping[str, ArrayLike | None]) -> None:
     """Raise UserError for an unknown parameter or a standard deviation that is not positive."""
     check_parameters("prior", prior)
     for name, sigma in prior.items():
-        if isinstance(sigma, str) or not np.all(np.greater(sigma, 0)):
-            raise UserError(f"prior.{name}: {sigma!s} is not a positive standard deviation")
+        if sigma is not None and (isinstance(sigma, str) or not np.all(np.greater(sigma, 0))):
+            raise UserError(f"prior.{name}: {sigma!s} is not a positive standard deviation, nor null for none")
 
 
 def blocks_of(term: str) -> tuple[str, ...]:
@@ -62,52 +63,63 @@ def search_space(
 ) -> ParameterSpace:
     """Return the space of the friction family's parameters and of the terms that act on the recorded torque.
 
-    The family's own bounds fill in for parameters without `bounds`.
+    bounds: as in `scaled_bounds`; the family's own bounds, in SI units, fill in for parameters without.
 
     Raises:
         UserError: a term without bounds.
     """
     left_out = set(nominal.family.optional) - set(terms)
     own = [name for name in nominal.family.names if name not in left_out]
-    bounds = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | dict(bounds)
-    if not set(own) & set(bounds):
+    given = scaled_bounds(bounds, robot, recording)
+    given = dict(zip(nominal.family.names, nominal.family.bounds, strict=False)) | given
+    if not set(own) & set(given):
         raise UserError(f"identify.bounds: none for {choices(own)} of friction family '{nominal.family.name}'")
-    bounds = _scaled_bounds(bounds, robot, recording)
-    names = [name for name in own if name in bounds]
+    names = [name for name in own if name in given]
     for term in terms:
         if term not in NO_EFFECT[recording.torque] and term not in optional_friction():
             names += blocks_of(term)
-    if missing := [name for name in names if name not in bounds]:
+    if missing := [name for name in names if name not in given]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
-    return parameter_space(robot, nominal, {name: bounds[name] for name in names})
+    return parameter_space(robot, nominal, {name: given[name] for name in names})
 
 
-def _scaled_bounds(
+def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Return bounds that fit an arm of any size: for motor torque those in Nm reach up to the joint's torque limit.
+    """Return bounds in SI units; those of torque-like parameters are given as shares of the largest torque.
 
-    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm.
+    Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. For it
+    they reach at least up to that torque.
     """
     out = dict(bounds)
-    if recording.torque == "motor":
-        reach = _largest_torque(robot, recording)
-        for name in out.keys() & torque_like():
+    for name, size in _sizes(robot, recording).items():
+        if name in out:
             low, high = (np.asarray(end, dtype=float) for end in out[name])
-            out[name] = [np.where(low < 0.0, np.minimum(low, -reach), low), np.maximum(high, reach)]
+            if recording.torque == "motor":
+                low, high = np.where(low < 0.0, np.minimum(low, -1.0), low), np.maximum(high, 1.0)
+            out[name] = [low * size, high * size]
     return out
 
 
-def scaled_prior(prior: Mapping[str, ArrayLike], robot: Robot, recording: Recording) -> dict[str, ArrayLike]:
-    """Return standard deviations in SI units.
+def scaled_prior(
+    prior: Mapping[str, ArrayLike | None], robot: Robot, recording: Recording, nominal: Dynamics | None = None
+) -> dict[str, ArrayLike]:
+    """Return standard deviations in SI units, without the flat priors (None).
 
-    The prior of rotors, and for motor torque of every parameter in Nm, is a share of each joint's torque limit.
+    Those of torque-like parameters are given as shares of the largest torque; logarithmic ones have no unit. A
+    viscous coefficient of the arm's file is a guess: the prior is at least as wide as the nominal value.
     """
-    shares = torque_like() - logarithmic() if recording.torque == "motor" else {"armature"}
-    reach = _largest_torque(robot, recording)
-    return {name: sigma * reach if name in shares else sigma for name, sigma in prior.items()}
+    out = {name: sigma for name, sigma in prior.items() if sigma is not None}
+    for name, size in _sizes(robot, recording).items():
+        if recording.torque == "measured":  # a Panda's wrist has sensor offsets and cables like its shoulder
+            size = np.max(size)
+        if name in out and name not in logarithmic():
+            out[name] = np.asarray(out[name], dtype=float) * size
+    if nominal is not None and VISCOUS in out and VISCOUS in nominal.family.names[: nominal.phi.shape[-1]]:
+        out[VISCOUS] = np.maximum(out[VISCOUS], nominal.phi[:, nominal.family.names.index(VISCOUS)])
+    return out
 
 
-def _largest_torque(robot: Robot, recording: Recording) -> np.ndarray:
-    """Return (n,) Nm: the torque limit, or the recorded torque if that is larger."""
-    return np.maximum(robot.tau_max, np.abs(recording.tau).max(0))
+def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
+    """Return the unit of torque-like bounds and priors: the torque limit, or the recorded torque if it is larger."""
+    return sizes(np.maximum(robot.tau_max, np.abs(recording.tau).max(0)))

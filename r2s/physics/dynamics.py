@@ -4,14 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, check_number, choices, nearest
-from r2s.physics.friction import SIGMOID, Family
+from r2s.physics.friction import COULOMB, SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
 from r2s.physics.surface import Surface
 
 STICTION_MODELS = ("command", "net")
+PHI1 = 0.02  # of tau_max, friction (twice the Coulomb torque) of a joint of which nothing is known
 MAX_PARAMETER = 1e4  # Nm, s/rad, rad/s: beyond the friction parameters of any arm
 
 
@@ -115,25 +117,28 @@ def nominal_dynamics(
     robot: Robot,
     *,
     family: str = "sigmoid",
-    phi1: Sequence[float] | float,
+    phi1: Sequence[float] | float | None,
     phi2: Sequence[float] | float,
     phi3: Sequence[float] | float,
     offset: Sequence[float] | float = 0.0,
-    breakaway_positive: Sequence[float] | float = 0.0,
-    breakaway_negative: Sequence[float] | float = 0.0,
+    breakaway_positive: Sequence[float] | float | None = 0.0,
+    breakaway_negative: Sequence[float] | float | None = 0.0,
     dq_min: float = 0.01,
     stiction_model: str = "command",
     inertia_scale: Sequence[float] | float = 1.0,
 ) -> Dynamics:
     """Return the dynamics of `conf/friction` and `conf/inertia`; a value per joint, or one for all.
 
-    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid.
+    A family other than the sigmoid gets the sigmoid's friction at 1 rad/s; "auto" starts with the sigmoid. phi1=None
+    takes the arm's file at its word: its frictionloss and damping are Coulomb and viscous friction, "auto" starts
+    with that law, and a joint for which the file gives neither has PHI1 of its torque limit. The file's frictionloss
+    is also a breakaway torque of None.
 
     Raises:
         UserError: a list of the wrong length, or a value out of its physical range.
     """
 
-    def joints(name: str, value: Sequence[float] | float) -> np.ndarray:
+    def joints(name: str, value: ArrayLike) -> np.ndarray:
         array = per_joint(name, value, robot.n, f"the {robot.n} joints of {robot.name}")
         if not np.all(np.isfinite(array)):
             raise UserError(f"{name}: expected finite values, got {array.tolist()}")
@@ -141,22 +146,27 @@ def nominal_dynamics(
             raise UserError(f"{name}: expected values of at most {MAX_PARAMETER:g}, got {array.tolist()}")
         return array
 
-    phi = np.stack([joints("friction.phi1", phi1), joints("friction.phi2", phi2)], -1)
+    declared = phi1 is None and bool(robot.damping.any() or robot.frictionloss.any())
+    slow, fast = robot.frictionloss, robot.damping
+    guess = np.where(slow + fast > 0, 2.0 * (slow + fast), PHI1 * robot.tau_max)  # the sigmoid's at 1 rad/s
+    phi = np.stack([joints("friction.phi1", guess if phi1 is None else phi1), joints("friction.phi2", phi2)], -1)
     scale = joints("inertia.scale", inertia_scale)
     for name, values in (("friction.phi1", phi[:, 0]), ("friction.phi2", phi[:, 1])):
         if np.any(values < 0):
             raise UserError(f"{name}: expected values of 0 or more (friction dissipates), got {values.min():g}")
     if np.any(scale <= 0):
         raise UserError(f"inertia.scale: expected positive values, got {scale.min():g}")
-    low = joints("friction.breakaway_negative", breakaway_negative)
-    high = joints("friction.breakaway_positive", breakaway_positive)
+    low = joints("friction.breakaway_negative", -slow if breakaway_negative is None else breakaway_negative)
+    high = joints("friction.breakaway_positive", slow if breakaway_positive is None else breakaway_positive)
     if np.any(low > 0) or np.any(high < 0):
         raise UserError("friction.breakaway: expected negative edges <= 0 and positive edges >= 0")
     check_number("friction.dq_min", dq_min, "[0, 10]")
-    named = SIGMOID if family == "auto" else friction_family(family)
-    phi = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1)
+    phi, law = np.concatenate([phi, joints("friction.phi3", phi3)[:, None]], -1), SIGMOID
+    if declared:
+        phi, law = np.stack([np.where(slow + fast > 0, slow, phi[:, 0] / 2), 0 * fast, fast], -1), COULOMB
+    named = law if family == "auto" else friction_family(family)
     return replace(
-        Dynamics.of(robot, named.matched_to(SIGMOID, phi), named, float(dq_min)),
+        Dynamics.of(robot, named.matched_to(law, phi), named, float(dq_min)),
         offset=joints("friction.offset", offset),
         breakaway=np.stack([low, high], -1),
         inertia=robot.inertia * scale[:, None, None],

@@ -17,6 +17,7 @@ WIDTH_DQ = 0.01  # rad/s, width of the sign change of Coulomb friction; equal to
 PRESLIDING = 1e-3  # rad, presliding distance if it is not identified; typical of a Panda's joints
 MICRO_DAMPING = 5e-3  # s, damping over stiffness of the bristles, damps their oscillation within a few periods
 PHI = 8  # maximum number of parameters of a family
+VISCOUS = "viscous"  # the parameter that every family names so, Nm s/rad
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,19 @@ class Family:
         return 0.5 * (self.torque(dq_max, phi) - self.torque(-dq_max, phi))
 
     def matched_to(self, other: "Family", phi: np.ndarray) -> np.ndarray:
-        """Return parameters (..., n, K) with the friction at 1 rad/s of phi (..., n, K') of another family."""
+        """Return parameters (..., n, K) with the friction at 1 rad/s of phi (..., n, K') of another family.
+
+        A viscous part that both laws have stays apart.
+        """
         if other == self:
             return phi
-        return np.stack(self.start(other.level(phi, np.ones(phi.shape[:-1]))), -1)
+        level, shared = other.level(phi, np.ones(phi.shape[:-1])), self.names[: len(self.names) - len(self.optional)]
+        if VISCOUS not in shared or VISCOUS not in other.names[: phi.shape[-1]]:
+            return np.stack(self.start(level), -1)
+        viscous = phi[..., other.names.index(VISCOUS)]
+        columns = self.start(level - viscous)
+        columns[self.names.index(VISCOUS)] = viscous
+        return np.stack(columns, -1)
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:

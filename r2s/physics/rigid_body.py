@@ -112,7 +112,7 @@ def rigid_body(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (rest (T, n) Nm, regressor (T, n, n, 10)): torque = rest + regressor @ standard parameters.
 
-    `rest` is the torque of the file's armature, damping and welded bodies. For the arguments see `regressor`.
+    `rest` is the torque of the file's armature and welded bodies. For the arguments see `regressor`.
     """
     model = robot.model(gravity=gravity is not None)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)

@@ -1,7 +1,9 @@
 """The arm: kinematics, inertia and gravity of an MJCF or URDF file, limits of the file or the config.
 
-r2s commands joint torques, so it uses a file's joints, links, armature and damping, and drops actuators, sensors,
-keyframes, free objects, gravity compensation and contacts. Any serial arm of hinge joints works: `robot.mjcf=FILE`.
+r2s commands joint torques, so it uses a file's joints and links, and drops actuators, sensors, keyframes, free
+objects, gravity compensation and contacts. The file's damping and frictionloss are nominal values of the friction law
+(dynamics.py), as its armature is that of the rotors; the rigid model has neither. Any serial arm of hinge joints
+works: `robot.mjcf=FILE`.
 """
 
 from collections.abc import Mapping
@@ -44,6 +46,7 @@ class Robot:
         mass: (n,) kg and com: (n, 3) m of each moving link, nominal, link frame.
         inertia: (n, 3, 3) kg m^2, nominal tensor of each moving link about its centre of mass, link axes.
         armature: (n,) kg m^2, nominal rotor inertia reflected to the joint.
+        damping: (n,) Nm s/rad and frictionloss: (n,) Nm of the file; 0: it gives none.
         velocity_envelope: deceleration (n,) rad/s^2 and offset (n,) rad/s of an FR3's velocity limit, sqrt(2
             deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
         tool: the tip that touches; None: a bare end effector.
@@ -65,6 +68,8 @@ class Robot:
     com: np.ndarray
     inertia: np.ndarray
     armature: np.ndarray
+    damping: np.ndarray
+    frictionloss: np.ndarray
     velocity_envelope: tuple[np.ndarray, np.ndarray] | None = None
     tool: Tool | None = None
     lock: Mapping[str, float] = field(default_factory=dict)
@@ -103,7 +108,8 @@ class Robot:
             spec.body(self.ee_site).add_site(name=self.ee_site)
         unit = np.degrees(1.0) if spec.compiler.degree else 1.0
         for joint, limits, rotor in zip(joints, np.stack([self.q_min, self.q_max], -1), self.armature, strict=True):
-            joint.armature = rotor
+            joint.armature, joint.frictionloss = rotor, 0.0
+            joint.damping = [0.0, *np.atleast_1d(joint.damping)[1:]]  # polynomial damping stays
             joint.limited = int(np.isfinite(limits).all())
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -210,6 +216,8 @@ def load_robot(
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=_tensors(model),
         armature=each("armature", armature, rotors(model)),
+        damping=model.dof_damping.copy(),
+        frictionloss=model.dof_frictionloss.copy(),
         tool=None if tool is None else load_tool(tool),
         lock=dict(lock or {}),
     )

@@ -133,7 +133,9 @@ def from_table(table: Table, how: Options) -> Recording:
     signals = {k: v for k, v in table.items() if k in SIGNALS} if saved else {}
     period = notes.get("period") if saved and how.period is None else how.period
     name = notes["name"] if saved else how.name
-    recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals, notes=tuple(repairs))
+    held = notes.get("command_period") if saved else None
+    recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)  # type: ignore[arg-type]
+    recording = replace(recording, notes=tuple(repairs), command_period=held)
     if how.max_gap_s is not None and not saved:
         recording = recording.split_at_gaps(how.max_gap_s)
     if repair:

@@ -38,6 +38,7 @@ class Recording:
         trajectory: (T,) index of the continuous stretch of each row; None: all rows are one stretch.
         period: s, the excitation repeats itself in `t` with this period (see `split`); None: it does not.
         notes: what the reader repaired, a line each.
+        command_period: s, for which a command is held; None: from row to row.
     """
 
     t: np.ndarray
@@ -50,6 +51,7 @@ class Recording:
     name: str = ""
     signals: Mapping[str, np.ndarray] = None  # type: ignore[assignment]
     notes: tuple[str, ...] = ()
+    command_period: float | None = None
 
     def __post_init__(self):
         for field in FIELDS[:4]:
@@ -59,6 +61,8 @@ class Recording:
         object.__setattr__(self, "torque", declared_torque(self.torque))
         if self.period is not None:
             object.__setattr__(self, "period", _positive("period", self.period, "s"))
+        if self.command_period is not None:
+            _positive("command_period", self.command_period, "s")
         self._check_shapes()
         for field in FIELDS:
             _check_finite(field, getattr(self, field))
@@ -164,6 +168,7 @@ class Recording:
     def resample(self, dt: float) -> "Recording":
         """Interpolate each trajectory linearly onto a uniform grid of `dt` s from its first logged time.
 
+        A command acts until the next one: of commands, `tau` is the mean over each step of the grid.
         No anti-aliasing: for a lower rate, resample at the logged rate, `smooth`, then resample again. Signals keep
         their last logged value, because flags and poses cannot be interpolated.
         Trajectories shorter than `dt` are dropped.
@@ -182,10 +187,32 @@ class Recording:
             for field in ("q", "dq", "tau"):
                 x = getattr(self, field)[s]
                 columns[field].append(np.stack([np.interp(grid, t, column) for column in x.T], axis=1))
+            if self.torque == "commanded":
+                columns["tau"][-1] = self._held(s, grid, dt)
         if not columns["t"]:
             raise UserError(f"no trajectory is as long as dt={dt:g} s; the recording lasts {self.duration:g} s")
         signals = {name: x[np.concatenate(rows)] for name, x in self.signals.items()}
         return replace(self, signals=signals, **{f: np.concatenate(parts) for f, parts in columns.items()})  # type: ignore[arg-type]
+
+    def _held(self, s: slice, grid: np.ndarray, dt: float) -> np.ndarray:
+        """Return (G, n) Nm, means over [grid, grid + dt) of the commands in rows `s`, each held until the next one.
+
+        Between rows that are several command periods apart, the commands are interpolated.
+        """
+        t, tau, period = self.t[s], self.tau[s], self.command_period or 1.0 / self.rate_hz
+        if len(grid) == len(t) and np.abs(grid - t).max() < 1e-6 * dt and period > 0.9 * dt:
+            return tau
+        parts = np.maximum(np.rint(np.diff(t) / period), 1).astype(int)
+        row = np.append(np.repeat(np.arange(len(parts)) - (np.cumsum(parts) - parts) / parts, parts), 0.0)
+        row[:-1] += np.arange(len(row) - 1) / np.repeat(parts, parts)
+        row[-1] = len(t) - 1
+        sent = np.interp(row, np.arange(len(t)), t)
+        edges, ends = np.append(grid, grid[-1] + dt), np.append(sent, max(sent[-1] + period, grid[-1] + dt))
+        out = np.empty((len(grid), tau.shape[1]))
+        for j, column in enumerate(tau.T):
+            held = np.interp(row, np.arange(len(t)), column)
+            out[:, j] = np.diff(np.interp(edges, ends, np.append(0.0, np.cumsum(held * np.diff(ends))))) / dt
+        return out
 
     def smooth(self, cutoff_hz: float) -> "Recording":
         """Low-pass q, dq and tau with a zero-phase filter: a Butterworth of order 4, run forwards and backwards.
@@ -302,7 +329,7 @@ class Recording:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays of the file, by name."""
-        period = {} if self.period is None else {"period": np.asarray(self.period)}
+        period = {k: np.asarray(v) for k in ("period", "command_period") if (v := getattr(self, k)) is not None}
         own = {field: np.asarray(getattr(self, field)) for field in (*FIELDS, "torque", "name")}
         return {**own, **period, **self.signals}
 

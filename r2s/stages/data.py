@@ -10,6 +10,7 @@ from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
+SLOW_MS = 1.5  # ms between rows, from which the hold of a command is printed
 MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as the path to a start
 
 
@@ -85,6 +86,7 @@ class FileData:
     columns: dict[str, str | None]
     topic: str | None
     joints: list[str] | None
+    command_hz: float | None = None
     contact: str | None = None
     contact_validation: str | None = None
 
@@ -92,6 +94,16 @@ class FileData:
         check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
         if self.period is not None:
             check_number("data.period", self.period, "(0, inf)")
+        if self.command_hz is not None:
+            check_number("data.command_hz", self.command_hz, "(0, inf)")
+
+    def held(self, recording):
+        """Return a recording of commands with the period of data.command_hz."""
+        if self.command_hz is not None:
+            return replace(recording, command_period=1 / self.command_hz)
+        if recording.torque == "commanded" and (hold := 1e3 / recording.rate_hz) > SLOW_MS:
+            print(f"commands are held for {hold:.3g} ms, from row to row; data.command_hz= states another rate")
+        return recording
 
     @property
     def files(self) -> list[Path | str]:
@@ -135,7 +147,7 @@ def read_file(robot, file, path, torque=None):
     out = read(path, **how, n_joints=robot.n, model_joints=names if all(names) else None, limits=limits)
     for note in out.notes:
         print(f"{path}: {note}")
-    return out
+    return file.held(out)
 
 
 def read_motion(robot, file, share):
@@ -198,7 +210,7 @@ def read_user_ramps(robot, file):
         columns["tau"] = None  # it names another torque; ramps are of the command
     ramps = read_ramps(file.ramps, columns=columns, n_joints=robot.n, max_gap_s=file.max_gap_s)
     check_ramps(robot, ramps)
-    return ramps
+    return replace(ramps, recording=file.held(ramps.recording))
 
 
 def check_data(cfg):

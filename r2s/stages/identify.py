@@ -130,6 +130,8 @@ def identify(cfg, overrides):
             robot, nominal, train, made.searches, settings, ramps=ramps, report=report, memo=run.memo
         )
         progress.close()
+        for line in found.at_bounds:
+            print(f"warning: {line}")
         how = {"window_s": settings.window_s, "cutoff_hz": settings.cutoff_hz}
         summary = {
             side: prediction_errors(robot, nominal, found.dynamics, data, **how, nthread=cfg.threads)

@@ -34,7 +34,7 @@ ENCODER = 2e-5  # rad, scale of position residuals: encoder noise of a Panda
 RELEASE_S = 2e-3  # s, accuracy of the moment of release
 STEP = 1e-3  # s, longest integration step
 # bounds of log kappa, log z (rad), log lambda (1/s), jump (rad/s^2), rest (rad) and drift (rad/s)
-LOW = np.log(1e-2), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
+LOW = np.log(1e-5), np.log(2e-6), np.log(0.1), 0.0, -0.1, -0.1
 HIGH = np.log(1e4), np.log(3e-3), np.log(1e3), 1e3, 0.1, 0.1
 RIGID = 1e-8  # rad, creep length of a joint that does not creep
 DRIFT = 3e-4  # rad/s, prior sigma of a drift: a resting joint may still settle
@@ -115,7 +115,7 @@ def estimate_breakaway(
     Args:
         ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
             for an encoder of 2e-5 rad, largest for the largest inertia.
-        delay, lag: s, of the command; each shifts the result.
+        delay, lag: s, of the command, beyond its hold; each shifts the result.
         moved: rad from the first position, well beyond creep; rows after that are not used.
         slide: sliding motion by an identified model.
 
@@ -125,7 +125,9 @@ def estimate_breakaway(
     check_number("breakaway: delay", delay, "[0, 0.1)")
     check_number("breakaway: lag", lag, "[0, 0.1)")
     check_number("breakaway: moved", moved, f"[{10 * ENCODER:g}, 0.1)")
-    count = len(ramps.recording.stretches)
+    r = ramps.recording
+    count, hold = len(r.stretches), r.command_period or 1.0 / r.rate_hz
+    delay += 0.5 * hold  # of a command that is held until the next one
     value, misfit = (np.full(count, np.nan) for _ in range(2))
     held, blur = np.zeros(count), np.zeros(count)
     for k, (t, x, u) in enumerate(_in_direction(ramps)):

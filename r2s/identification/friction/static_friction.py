@@ -11,7 +11,7 @@ from r2s.recordings.ramps import Ramps
 
 # of its level: standard deviation between breakaway command and friction at standstill, from creep and onset
 SIGMA = 0.03
-MIN_COMMAND = 0.05  # Nm, level below which the deviation no longer shrinks
+LEAST = 1e-3  # of tau_max, level of a command below which the deviation no longer shrinks
 
 
 class StaticFriction:
@@ -30,7 +30,7 @@ class StaticFriction:
         gravity = regressor(robot, q, still, still, robot.gravity)[own, self.joint].reshape(len(kept), -1)
         self._gravity, self._nominal = gravity, LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
         self._load = np.abs(gravity @ self._nominal)
-        self._q = q[own, self.joint]
+        self._q, self._least = q[own, self.joint], LEAST * robot.tau_max[self.joint]
         unit = np.eye(robot.n)[self.joint]
         self._inertia = regressor(robot, q, still, unit)[own, self.joint].reshape(len(kept), -1)
 
@@ -68,4 +68,4 @@ class StaticFriction:
         sign, still = np.where(self.side, 1.0, -1.0), np.zeros(d.phi.shape[:-1])
         sides = np.stack([d.friction(still, still - 1.0), d.friction(still, still + 1.0)], -1)
         friction = sides[..., self.joint, self.side] + sign * d.load[..., self.joint] * self._load
-        return (self.net_torque(d) - friction) / (SIGMA * np.maximum(np.abs(self.command), MIN_COMMAND))
+        return (self.net_torque(d) - friction) / (SIGMA * np.maximum(np.abs(self.command), self._least))

@@ -19,6 +19,7 @@ from r2s.recordings.recording import Recording
 CREEP = 2e-3  # rad/s, below which a joint may stick: above the rest of a stop after a 1 ms step, below any motion
 HORIZON, WINDOWS = 0.5, 60  # s and number of the replays that choose a model: long enough for stops
 SCAN_WINDOWS, PASSES, COARSE = 50, 6, 2  # of `scan_breakaway`: windows, passes, and coarse ones among them
+LEAST = 5e-4  # of tau_max, friction below which nothing sticks
 POINTS, FINE_POINTS, REFINE = 13, 2, 2.5  # points of a coarse pass, on each side of a fine one; finer by that factor
 
 
@@ -35,7 +36,7 @@ def choose_stiction(
 ) -> dict[str, np.ndarray | float]:
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
 
-    largest: Nm, upper limit of the breakaway torques to scan for; None if ramps gave them.
+    largest: upper limit of the breakaway torques to scan for, over the identified friction; None if ramps gave them.
     """
     scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=report)
     trials = []
@@ -43,7 +44,9 @@ def choose_stiction(
         dq_min = dynamics.dq_min if model == "command" else min(dynamics.dq_min, CREEP)
         trial = replace(dynamics, stiction_model=model, dq_min=dq_min)
         if largest is not None:  # each model has its own breakaway torques
-            trial = replace(trial, breakaway=scan(robot, trial, recording, largest))
+            friction = np.maximum(dynamics.level, np.abs(dynamics.family.at_rest(dynamics.phi)).max(-1))
+            limit = largest * np.maximum(friction, LEAST * robot.tau_max)
+            trial = replace(trial, breakaway=scan(robot, trial, recording, limit))
         trials.append(trial)
     windows = cut_windows(recording, HORIZON, limit=WINDOWS)
     error = np.stack([np.abs(replay(robot, t, windows, nthread) - windows.q).mean((0, 1)) for t in trials])
@@ -56,7 +59,7 @@ def scan_breakaway(
     robot: Robot,
     dynamics: Dynamics,
     recording: Recording,
-    largest: float,
+    largest: np.ndarray,
     *,
     window_s: float,
     stride: int,
@@ -66,21 +69,22 @@ def scan_breakaway(
     """Return the breakaway torques (n, 2) Nm that replay the recording best; all else is that of `dynamics`.
 
     The error jumps when a joint is released one step sooner. So all torques are scanned at once, each judged by its
-    own joint: first over [0, largest], then ever finer about the best value. The coarse scan runs twice, because
-    wrong torques of other joints disturb the first pass.
+    own joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The coarse scan runs twice,
+    because wrong torques of other joints disturb the first pass.
     """
     space = parameter_space(
         robot, dynamics, {"breakaway_negative": [-largest, 0.0], "breakaway_positive": [0.0, largest]}
     )
     windows = cut_windows(recording, window_s, limit=SCAN_WINDOWS)
     data = ReplayResidual(space, recording, windows, stride=stride, nthread=nthread)
-    x, step = space.start, largest / (POINTS - 1)
+    x, most = space.start, np.tile(largest, 2)[:, None]
+    step = most / (POINTS - 1)
     sign = np.repeat([-1.0, 1.0], robot.n)
     joint = np.tile(np.arange(robot.n), 2)
     evaluations = 1 + 3 * robot.n  # finite differences of the residual's weights
     for k in range(PASSES):
         coarse = k < COARSE
-        offsets = np.linspace(0, largest, POINTS) if coarse else step * np.arange(-FINE_POINTS, FINE_POINTS + 1)
+        offsets = most * np.linspace(0, 1, POINTS) if coarse else step * np.arange(-FINE_POINTS, FINE_POINTS + 1)
         base = np.zeros_like(x) if coarse else x
         trials = np.clip(base[:, None] + sign[:, None] * offsets, space.lower[:, None], space.upper[:, None])
         candidates = np.repeat(x[None], trials.size, axis=0).reshape(*trials.shape, -1)
@@ -88,7 +92,7 @@ def scan_breakaway(
         cost = data.joint_error(candidates.reshape(-1, len(x))).reshape(*trials.shape, robot.n)
         own = np.take_along_axis(cost, joint[:, None, None], axis=2)[..., 0]
         x = trials[np.arange(len(x)), own.argmin(1)]
-        step /= 1 if coarse else REFINE
+        step = step / (1 if coarse else REFINE)
         evaluations += trials.size
         row = {"pass": k + 1, "evaluations": evaluations, "done": k + 1, "total": PASSES}
         report(row | {"search": "breakaway"})

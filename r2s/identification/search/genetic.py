@@ -24,7 +24,8 @@ class Genetic:
     Attributes:
         population: individuals, all simulated at once.
         generations: G_max. minutes: time limit.
-        spread: standard deviation of the first population about the nominal model, on the unit cube.
+        spread: standard deviation of the first population about the nominal model, on the unit cube; at most the
+            prior's.
         patience, tolerance: the search ends if the best cost improved by less than `tolerance` (relative) over
             `patience` generations.
         seed: of every draw.
@@ -42,7 +43,8 @@ class Genetic:
     def __call__(self, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
         """Return u (P,) from `start` (P,)."""
         rng = np.random.default_rng(self.seed)
-        first = np.clip(start + self.spread * rng.normal(size=(self.population, len(start))), 0, 1)
+        spread = np.minimum(self.spread, problem.prior_width)
+        first = np.clip(start + spread * rng.normal(size=(self.population, len(start))), 0, 1)
         first[0] = start
 
         class Replay(Objective):

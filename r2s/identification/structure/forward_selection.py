@@ -11,7 +11,7 @@ import numpy as np
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Problem, fit_torque, implicit_friction
 from r2s.identification.structure.cross_validation import CrossValidation, Fold
-from r2s.identification.terms import blocks_of
+from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
@@ -67,17 +67,18 @@ class _LinearizedFold:
         fit = problem.torque_data
         names = [block for name in candidates for block in blocks_of(name)]
         found = space.dynamics(space.from_unit(u))
-        more = parameter_space(space.robot, found, {name: cv.bounds[name] for name in names})
+        bounds = scaled_bounds(cv.bounds, space.robot, cv.recording)
+        more = parameter_space(space.robot, found, {name: bounds[name] for name in names})
         fit_more = fit.on(more).weighted_like(fit)
         wide = Problem.of(fit_more, fit_more, cv.prior)
         at_test = test.on(space).weighted_like(fit), test.on(more).weighted_like(fit)
         self._own = len(u)
         self._where = {name: [more.where(block) for block in blocks_of(name)] for name in candidates}
-        r = problem.torque_residual(u[None])[0]
-        j = np.concatenate([fit.jacobian(u), fit_more.jacobian(wide.start)], 1)
-        prior = np.concatenate([problem.weight, wide.weight]) ** 2
-        pull = np.concatenate([problem.weight**2 * (u - problem.start), np.zeros(len(wide.start))])
-        self._hessian, self._gradient = j.T @ j + np.diag(prior), j.T @ r[: len(fit.clusters)] + pull
+        r, own, rows = problem.torque_residual(u[None])[0], problem.torque_jacobian(u), len(fit.clusters)
+        more_rows = np.concatenate([fit_more.jacobian(wide.start), np.zeros((len(r) - rows, len(wide.start)))])
+        j = np.concatenate([own, more_rows], 1)
+        prior = np.diag(np.concatenate([np.zeros(len(u)), wide.weight]) ** 2)
+        self._hessian, self._gradient = j.T @ j + prior, j.T @ r
         self._change = np.concatenate([at_test[0].jacobian(u), at_test[1].jacobian(wide.start)], 1)
         self._left = at_test[0](space.from_unit(u)[None])[0]
         self._joints, self._block = space.n, np.unique(test.clusters, return_inverse=True)[1]

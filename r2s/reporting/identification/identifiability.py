@@ -2,14 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from r2s.identification.link_inertia import LINK
 from r2s.identification.result import SHARPER, IdentificationResult
 from r2s.reporting.document import Item
 
 MOST_LINES = 10  # null directions listed
-EDGE = 5e-4  # share of a parameter's range that counts as its bound
 
 
 def identifiability(found: IdentificationResult) -> list[Item]:
@@ -30,14 +27,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
             "Kept at their nominal values, because the data hardly constrain them beyond the prior (or because the "
             f"joint's refit did not predict held-out motion better): {_grouped(found.unseen, space.n)}."
         )
-    u = space.to_unit(found.x)
-    edge = np.where(u < EDGE, space.lower, np.where(u > 1 - EDGE, space.upper, np.nan))
-    names = [n for n, e in zip(space.names, edge, strict=True) if np.isfinite(e) and e != 0 and n not in found.unseen]
-    if names:
-        items.append(
-            "At a bound of the search (identify.bounds), so that the best value may lie beyond it: "
-            f"{_grouped(names, space.n)}."
-        )
+    items += [f"{line[0].upper()}{line[1:]}." for line in found.at_bounds]
     return items + (_null_directions(found) if found.null_directions else [])
 
 

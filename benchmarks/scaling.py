@@ -1,0 +1,234 @@
+"""Identify synthetic arms of 2 to 8 joints and 5 to 400 Nm, logged at four rates, whose truth is known.
+
+`python benchmarks/scaling.py [FOLDER]` prints the figures of each row, beside those of the checkout in FOLDER (an
+earlier state of r2s), and writes benchmarks/results/scaling.md. `only=NAME` computes one row, `json` prints figures.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from common import conf, identify_settings, markdown_rows, searches, write_page
+
+from r2s.identification.identify import identify
+from r2s.identification.parameters import logarithmic
+from r2s.physics.actuation import Motors
+from r2s.physics.dynamics import Dynamics, nominal_dynamics
+from r2s.physics.friction import COULOMB
+from r2s.physics.rigid_body import set_links
+from r2s.physics.robot import load_robot
+from r2s.physics.simulator import Simulator
+from r2s.recordings.recording import Recording
+
+ARMS = (2, 5.0), (3, 20.0), (6, 87.0), (3, 400.0), (8, 400.0)  # joints, Nm of the largest
+RATES = 1000, 500, 250, 125  # Hz
+LINK = 0.25  # m
+LOAD = 0.25  # of tau_max, gravity torque of the stretched arm
+# shares of tau_max: Coulomb, viscous (per rad/s), offset, noise of a torque sensor
+COULOMB_SHARE, VISCOUS_SHARE, OFFSET_SHARE, NOISE_SHARE = 0.04, 0.01, 0.003, 0.002
+MASS = 1.15, 0.9, 1.1  # true masses over nominal ones, in turn
+DELAY = 2e-3  # s
+BANDWIDTH = 10.0  # 1/s, of the controller that follows the motion
+
+
+def arm(n, largest, file=""):
+    """Return a robot of n joints, the largest of `largest` Nm; `file`: attributes of its joints in the MJCF."""
+    tau = largest * 0.5 ** (np.arange(n) // 2)
+    mass = (2 * LOAD * tau / (9.81 * LINK * (n - np.arange(n)) ** 2)).min()
+    bodies, size = "", mass * LINK**2
+    for j in range(n):
+        axis = "0 0 1" if j % 3 == 0 else "0 1 0"
+        bodies += (
+            f'<body pos="0 0 {LINK if j else 0.3}"><inertial pos="0.02 0 {LINK / 2}" mass="{mass}" '
+            f'diaginertia="{0.1 * size} {0.1 * size} {0.02 * size}"/><joint axis="{axis}" range="-2 2" '
+            f'actuatorfrcrange="-{tau[j]} {tau[j]}" {file}/>'
+        )
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{bodies}<site name="tip" pos="0 0 {LINK}"/>'
+    path = Path(tempfile.mkdtemp()) / "arm.xml"
+    path.write_text(text + "</body>" * n + "</worldbody></mujoco>")
+    return load_robot(str(path))
+
+
+def truth_of(robot, friction=1.0, links=MASS):
+    """Return the true dynamics: `links` times the nominal tensors and, if torque shows them, masses."""
+    tau, n = robot.tau_max, robot.n
+    phi = np.stack([COULOMB_SHARE * tau * friction, np.zeros(n), VISCOUS_SHARE * tau * friction], -1)
+    mass = robot.mass * np.resize(links, n)
+    d = replace(
+        Dynamics.of(robot, phi, COULOMB), mass=mass, inertia=(mass / robot.mass)[:, None, None] * robot.inertia
+    )
+    return replace(d, offset=OFFSET_SHARE * tau * np.where(np.arange(n) % 2, -1, 1), delay=DELAY)
+
+
+def motion(robot, t, seed):
+    """Return q, dq, ddq (T, n) of a sum of sines about home."""
+    rng, n = np.random.default_rng(seed), robot.n
+    out = np.zeros((3, len(t), n))
+    for f in (0.15, 0.37, 0.83, 2.3):
+        w, a, phase = 2 * np.pi * f, 0.15 / f**0.7 * rng.uniform(0.5, 1.0, n), rng.uniform(0, 2 * np.pi, n)
+        s, c = a * np.sin(w * t[:, None] + phase), a * np.cos(w * t[:, None] + phase)
+        out += s, w * c, -(w**2) * s
+    out[0] += robot.q_home + 0.3
+    return out
+
+
+def log(robot, truth, torque, hz=1000, seconds=16.0, seed=0):
+    """Return a recording at `hz`; commands are held from row to row."""
+    t, rng, every = 1e-3 * np.arange(round(1e3 * seconds)), np.random.default_rng(seed), 1000 // hz
+    q, dq, ddq = motion(robot, t, seed)
+    model = robot.model(gravity=torque != "commanded")
+    set_links(model, truth.mass, truth.com, truth.inertia, truth.armature)
+    data, tau = mujoco.MjData(model), np.empty_like(q)
+    if torque != "commanded":
+        for k in range(len(t)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = q[k], dq[k], ddq[k]
+            mujoco.mj_inverse(model, data)
+            tau[k] = data.qfrc_inverse
+        tau += truth.friction(dq) - truth.offset + NOISE_SHARE * robot.tau_max * rng.normal(size=tau.shape)
+    else:
+        sim, motors = Simulator(robot, truth, 1, 1), Motors(1, robot.n, truth.delay, truth.lag)
+        sim.reset(q[:1], dq[:1])
+        for k in range(len(t)):
+            own, speed = sim.q[0].copy(), sim.dq[0].copy()
+            if k % every == 0:
+                data.qpos[:], data.qvel[:] = own, speed
+                data.qacc[:] = ddq[k] + 2 * BANDWIDTH * (dq[k] - speed) + BANDWIDTH**2 * (q[k] - own)
+                mujoco.mj_inverse(model, data)
+                command = data.qfrc_inverse + truth.friction(dq[k]) - truth.offset
+            q[k], dq[k], tau[k] = own, speed, command
+            sim.rollout(motors(tau[None, k : k + 1]))
+    q, dq = q + 2e-5 * rng.normal(size=q.shape), dq + 3e-3 * rng.normal(size=q.shape)
+    return Recording(*(x[::every] for x in (t, q, dq, tau)), torque)
+
+
+def found_in(robot, recording, change=lambda settings: settings, **more):
+    """Identify with the settings of stage=identify and Coulomb friction, without a scan for breakaway."""
+    how = identify_settings(recording.torque, family="coulomb", breakaway=None, candidate_terms=[], **more)
+    start = nominal_dynamics(robot, **conf("friction/uniform"))
+    return identify(robot, start, recording, searches("staged")[:1], change(how))
+
+
+def judge(found, truth):
+    """Return the worst errors of Coulomb and viscous friction, offset and mass, %, and intervals right and in all."""
+    d, tau = found.dynamics, found.space.robot.tau_max
+    true = replace(found.space, nominal=truth).start
+    inside = (true >= found.found.low - 1e-9) & (true <= found.found.high + 1e-9)
+    slow, fast = (np.abs(d.friction(v + 0 * tau) / truth.friction(v + 0 * tau) - 1) for v in (0.1, 1.0))
+    errors = {"friction, %": 100 * max(slow.max(), fast.max())}
+    errors |= {"offset, % of tau_max": 100 * (np.abs(d.offset - truth.offset) / tau).max()}
+    return errors | {"inside": int(inside.sum()), "of": len(inside)}
+
+
+def summed(results):
+    """Return the worst of the errors and the coverage over all arms."""
+    inside, of = (sum(r.pop(k) for r in results) for k in ("inside", "of"))
+    worst = {f"worst {k}": f"{max(r[k] for r in results):.2f}" for k in results[0]}
+    return worst | {"intervals with the truth": f"{inside}/{of} = {100 * inside / of:.0f} %"}
+
+
+def priors():
+    """Row 1: link-side torque of arms of any size."""
+    return summed([judge(found_in(r := arm(*a), log(r, t := truth_of(r), "measured")), t) for a in ARMS])
+
+
+def bounds():
+    """Row 2: commanded torque; and how many values at a bound count as identifiable."""
+    results, wrong = [], 0
+    for a in ARMS:
+        robot = arm(*a)
+        found = found_in(robot, log(robot, truth := truth_of(robot, 1.5, (1.0,)), "commanded"))
+        results.append(judge(found, truth))
+        edge = np.minimum(*np.abs(found.space.to_unit(found.x) - [[0.0], [1.0]])) < 1e-6
+        f = found.found
+        wrong += int((edge & f.identifiable).sum() + (f.low > f.x).sum() + (f.high < f.x).sum())
+    return summed(results) | {"values at a bound called identifiable, or outside their interval": str(wrong)}
+
+
+def file_friction():
+    """Row 3: damping and frictionloss of the file are five times and a third of the truth."""
+    results = []
+    for n, largest in (ARMS[1], ARMS[3]):
+        file = f'damping="{5 * VISCOUS_SHARE * largest}" frictionloss="{COULOMB_SHARE * largest / 3}"'
+        for torque in ("measured", "motor", "commanded"):
+            bare = arm(n, largest)
+            truth = truth_of(bare, links=(1.0,) if torque == "commanded" else MASS)
+            found = found_in(arm(n, largest, file), log(bare, truth, torque, seconds=10.0))
+            results.append(judge(found, truth))
+    return summed(results)
+
+
+def command_hold():
+    """Row 5: a delay of 2 ms, with a command in every row of the log."""
+    out = {}
+    for hz in RATES:
+        errors = []
+        for a in ARMS[1:2]:
+            robot = arm(*a)
+            found = found_in(robot, log(robot, truth_of(robot, links=(1.0,)), "commanded", hz, 10.0))
+            errors.append(1e3 * abs(float(found.dynamics.delay + found.dynamics.lag) - DELAY))
+        out[f"error of delay + lag at {hz} Hz, ms"] = f"{max(errors):.3f}"
+    return out
+
+
+def wider(settings):
+    """Return settings with three times wider bounds."""
+    out = {}
+    for name, (low, high) in settings.bounds.items():
+        ratio = high / low if name in logarithmic() else 1.0
+        out[name] = [low / ratio, high * ratio] if ratio > 1 else [3 * low, 3 * high]
+    return replace(settings, bounds=out)
+
+
+def identifiable():
+    """Row 12: parameters whose `identifiable` changes with three times wider bounds."""
+    changed, total = 0, 0
+    for n, largest in ARMS[:2]:
+        robot = arm(n, largest)
+        for torque in ("measured", "motor"):
+            recording = log(robot, truth_of(robot), torque, seconds=4.0)
+            seen = [found_in(robot, recording, change).found.identifiable for change in (lambda s: s, wider)]
+            changed, total = changed + int((seen[0] != seen[1]).sum()), total + len(seen[0])
+    return {"changed by wider bounds": f"{changed} of {total}"}
+
+
+ROWS = {"1 priors": priors, "2 bounds": bounds, "3 file": file_friction, "5 hold": command_hold}
+ROWS |= {"12 identifiable": identifiable}
+
+
+def main() -> None:
+    """Compute the rows here and in another checkout, and write the page."""
+    only = [a.removeprefix("only=") for a in sys.argv[1:] if a.startswith("only=")]
+    before: dict = {}
+    runs = []
+    for folder in (a for a in sys.argv[1:] if "=" not in a and a != "json"):
+        copy = shutil.copy(__file__, Path(folder) / "benchmarks")
+        command = [sys.executable, copy, "json", *(f"only={o}" for o in only)]
+        env = os.environ | {"PYTHONPATH": folder}
+        runs.append(subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE))
+    rows = {name: row() for name, row in ROWS.items() if not only or name in only}
+    if "json" in sys.argv:
+        print(json.dumps(rows))
+        return
+    for run in runs:
+        before = json.loads(run.communicate()[0].splitlines()[-1])
+    pairs = [(n, k, v) for n, r in rows.items() for k, v in r.items()]
+    lines = {f"{n}: {k}": {"before": before.get(n, {}).get(k, ""), "now": v} for n, k, v in pairs}
+    text = (
+        f"Arms of {', '.join(f'{n} joints and up to {t:g} Nm' for n, t in ARMS)}; friction, offset and masses are "
+        "known. `before`: commit 8bc76fa."
+    )
+    table = markdown_rows(lines, "row")
+    print(table)
+    if not only:
+        write_page("scaling", "Arms of any size", "python benchmarks/scaling.py FOLDER", [text, table])
+
+
+if __name__ == "__main__":
+    main()
