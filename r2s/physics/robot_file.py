@@ -64,12 +64,14 @@ def strip(spec: mujoco.MjSpec) -> None:
     spec.option.density = spec.option.viscosity = 0.0
 
 
-def rotors(model: mujoco.MjModel) -> np.ndarray:
-    """Return the rotor inertia (n,) kg m^2 of joints and motors, at the joints."""
-    armature = model.dof_armature[model.jnt_dofadr].copy()
+def rotors(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotor inertia (n,) kg m^2 and viscous damping (n,) Nm s/rad of joints and motors, at the joints."""
+    armature, damping = model.dof_armature[model.jnt_dofadr].copy(), model.dof_damping[model.jnt_dofadr].copy()
     for i in np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT):
-        armature[model.actuator_trnid[i, 0]] += model.actuator_gear[i, 0] ** 2 * model.actuator_armature[i]
-    return armature
+        joint, square = model.actuator_trnid[i, 0], model.actuator_gear[i, 0] ** 2
+        armature[joint] += square * model.actuator_armature[i]
+        damping[joint] += square * model.actuator_damping[i]
+    return armature, damping
 
 
 def _is_loose(body: mujoco.MjsBody) -> bool:
