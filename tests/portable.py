@@ -15,6 +15,7 @@ from pathlib import Path
 NUMERIC = (
     *("actuation", "physics", "regressor", "robot", "description", "driver", "engines", "oracle", "twin"),
     *("parameters", "recording", "breakaway", "identify", "tqc", "algorithms", "env", "excitation"),
+    *("contact_physics", "push_limit"),
 )
 # a million cycles, whose property is no matter of rounding; what torch compiles, for the processor that it finds
 LEFT_OUT = ("hostile_policy", "nor_those_of_an_fr3", "compiled_learns", "without_a_compiler")
