@@ -1,4 +1,8 @@
-"""`r2s list`, `r2s look`, `r2s export`: commands that read run folders; `r2s check`, which connects to an arm."""
+"""Commands without a run folder of their own.
+
+`r2s list`, `look` and `export` read run folders, `convert` writes a recording for ROS 2 or LeRobot, `check` connects
+to an arm.
+"""
 
 import os
 import sys
@@ -45,14 +49,23 @@ def run_command(words: Sequence[str]) -> None:
     checking = commands.add_parser("check", help="connect to an arm without moving it, and compare it with the model")
     checking.add_argument("override", nargs="+", metavar="KEY=VALUE", help="arm=panda arm.address=..., robot=...")
     checking.add_argument("--seconds", type=float, default=10.0, help="of reading states, default 10; 0: none")
-    typed, unknown = parser.parse_known_args([f"--{w}" if w.startswith(("to=", "trust=")) else w for w in words])
+    converting = commands.add_parser("convert", help="write a recording as MCAP (ROS 2) or as a LeRobotDataset")
+    converting.add_argument("file", type=Path, metavar="FILE", help="a recording, or episodes_*.npz of a transfer")
+    converting.add_argument("override", nargs="*", metavar="KEY=VALUE", help="robot=, data.torque=, data.columns.q=")
+    converting.add_argument(
+        "--to", type=Path, required=True, help="also to=FILE.mcap, or to=FOLDER, a LeRobotDataset"
+    )
+    converting.add_argument("--trust", help=TRUSTED)
+    options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first: KEY=VALUE has no fixed number
+    others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
+    typed, unknown = parser.parse_known_args([words[0], *options, *others])
     if unknown:
         own = commands.choices[typed.command].format_usage().replace("[", " ").replace("]", " ").split()
         options = [w for w in own if w.startswith("--")]
         raise UserError(
             f"{typed.command}: no argument '{unknown[0]}'; allowed: {choices(options)}{nearest(unknown[0], options)}"
         )
-    {"list": list_runs, "look": look, "export": export, "check": check}[typed.command](typed)
+    {"list": list_runs, "look": look, "export": export, "check": check, "convert": convert}[typed.command](typed)
 
 
 def list_runs(typed: Namespace) -> None:
@@ -152,6 +165,49 @@ def check(typed: Namespace) -> None:
     rows = {f.name: {"r2s": f.expected, "arm or computer": f.found, "": "REFUSED" * f.refused} for f in found}
     print_table(console(), DataFrame.from_dict(rows, orient="index"), f"arm={cfg.arm.name}, robot={arm.robot.name}")
     refuse(found, f"arm={cfg.arm.name} is refused")
+
+
+def convert(typed: Namespace) -> None:
+    """Write a recording, or the episodes of a transfer, as MCAP or as a LeRobotDataset."""
+    from hydra import compose, initialize_config_dir
+
+    from r2s.override_checks import check_overrides
+    from r2s.physics.description import chain
+    from r2s.recordings.lerobot import write_dataset
+    from r2s.recordings.ros_bag import write_mcap
+    from r2s.stages.build import CONF, make_dynamics, make_robot
+    from r2s.stages.data import file_data, read_episodes, read_file, read_reference
+    from r2s.stages.run_config import run_config
+
+    groups = ("robot", "data", "calibration", "friction", "inertia")
+    if other := [w for w in typed.override if w.split("=")[0].split(".")[0] not in groups]:
+        raise UserError(f"convert: expected {choices(f'{g}=' for g in groups)} and their keys, got '{other[0]}'")
+    if typed.to.suffix not in ("", ".mcap"):
+        raise UserError(f"to: expected FILE.mcap, or a folder for a LeRobotDataset, got {typed.to}")
+    if typed.to.exists():
+        raise UserError(f"to: {typed.to} exists")
+    sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
+    check_overrides(words := ["stage=identify", "data=recording", *typed.override], None)
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        cfg = compose("config", words)
+    if (typed.file.parent / "config.yaml").is_file() and not any(w.startswith("robot") for w in typed.override):
+        cfg.robot = run_config(typed.file.parent, typed.trust).robot
+    robot = make_robot(cfg)
+    dynamics, more = make_dynamics(cfg, robot), None
+    if typed.file.name.startswith("episodes_") and typed.file.suffix == ".npz":
+        recording, more = read_episodes(typed.file)
+    else:
+        recording = read_file(robot, file_data(cfg, str(typed.file)), str(typed.file))
+    typed.to.parent.mkdir(parents=True, exist_ok=True)
+    if typed.to.suffix:
+        notes = write_mcap(typed.to, robot, recording, dynamics, read_reference(typed.file, robot.n))
+    else:
+        joints = [link.joint for link in chain(robot, dynamics, friction=False)[0]]
+        notes = write_dataset(typed.to, recording, joints, robot.name, more)
+    for note in notes:
+        print(note)
+    print(f"{len(recording.t)} rows, {len(recording.stretches)} trajectories, {recording.torque} torque")
+    print(f"written: {typed.to}")
 
 
 def viewable(folder: Path) -> Path:

@@ -7,7 +7,7 @@ from typing import Any
 from r2s.errors import UserError, choices, nearest
 from r2s.stages.build import CONF, STAGES, unread
 
-COMMANDS = ("look", "list", "export", "check")
+COMMANDS = ("look", "list", "export", "check", "convert")
 OPTIONAL = ("tracker", "experiment")  # groups that may have no option
 EXTENSIBLE = ("tune.space",)  # keys that + may add to
 NO_OPTION = "base"  # a file that the options of a group share

@@ -78,7 +78,7 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
         wanted = [t for t in TRACKERS if any(w.startswith("tracker=") and t in w for w in words)]
         if [t for t in wanted if not find_spec(t)]:
             continue  # an extra that is not installed here
-        if words[0] not in ("list", "look", "export", "--help"):
+        if words[0] not in ("list", "look", "export", "convert", "--help"):
             words += TOY
             name = next((w.removeprefix("name=") for w in words if w.startswith("name=")), None)
             named = name and f"runs/identify/{name}/ramps.npz" in page.read_text()

@@ -171,6 +171,34 @@ def test_messages_before_the_first_stamp_are_left_out(tmp_path):
     assert_motion(read(joint_states(tmp_path, data=early, others="fixed"), torque="measured"), data)
 
 
+@pytest.mark.parametrize("absent", [NOTHING, np.full(7, np.nan)])
+def test_messages_before_the_first_values_are_left_out(tmp_path, absent):
+    """Broadcasters of ROS 2 send before the arm's interfaces have values."""
+    data, early = motion(), 5
+    wait = [np.concatenate([x[:early], x]) for x in data]
+    wait[0] = np.concatenate([data[0][:early] - data[0][early], data[0]])
+    path = joint_states(
+        tmp_path, data=wait, change=lambda k, q, dq, tau: (q, dq, absent if k < early else tau), others="fixed"
+    )
+    out = read(path, torque="measured")
+    assert_motion(out, data)
+    assert out.notes == ("the first 5 messages lack values and are left out",)
+
+
+def test_fingers_beside_the_arm_may_have_no_values(tmp_path):
+    """Names in any order, NaN for joints that are not the arm's, stamps of 0 at the start, a message that is late."""
+    names, data = ["panda_finger_joint1", *PANDA, "panda_finger_joint2"], motion(n=9)
+    for x in data[1:]:
+        x[:, [0, 8]] = np.nan
+    mixed = [np.concatenate([x[:3], x]) for x in data]
+    mixed[0][:3] = -EPOCH
+    for x in mixed:
+        x[[100, 101]] = x[[101, 100]]
+    out = read(joint_states(tmp_path, names=names, data=mixed), torque="measured", model_joints=PANDA, n_joints=7)
+    assert_motion(out, [data[0], *(x[:, 1:8] for x in data[1:])])
+    assert out.notes == ("3 messages with stamp 0 are left out",)
+
+
 def test_a_restarted_clock_is_refused(tmp_path):
     """Rows of two starts must not be shuffled into one another."""
     data = motion(step=0.02)

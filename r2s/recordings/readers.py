@@ -1,4 +1,4 @@
-"""Read a `Recording` from .csv, .npz, .parquet, HDF5 or a robot's log, with one mapping of column names."""
+"""Read a `Recording` from .csv, .npz, .parquet, HDF5, a LeRobotDataset or a robot's log, by names of columns."""
 
 import os
 import zipfile
@@ -15,6 +15,7 @@ from r2s.errors import UserError, choices, nearest
 from r2s.files import DAMAGED
 from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed, specs_of
 from r2s.recordings.csv_table import read_csv, without_units
+from r2s.recordings.lerobot import dataset_files, is_dataset, lerobot_table
 from r2s.recordings.recording import MIN_ROWS, SIGNALS, Recording, declared_torque
 from r2s.recordings.repairs import held, repair_rows, unwrap
 from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra, rostopic_table
@@ -60,7 +61,8 @@ def read(
     """Read the recording in `path`; the logs of libfranka and of Franka's ROS messages hold several torques.
 
     Args:
-        path: .csv, .npz, .parquet, .h5, or a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag).
+        path: .csv, .npz, .parquet, .h5, a bag (.bag, .db3, .mcap or the folder of a ROS 2 bag), or the folder of a
+            LeRobotDataset.
         torque: "measured", "commanded" or "motor", see `Recording`; None only if the file declares it.
         columns: names in the file of t (s), q (rad), dq (rad/s), tau (Nm, or A) and trajectory. The defaults are
             DEFAULT_COLUMNS, with TAU before tau. A name of q, dq or tau denotes a (T, n) array, or numbered columns
@@ -115,6 +117,7 @@ def from_table(table: Table, how: Options) -> Recording:
     saved = set(table) - set(SIGNALS) == set(DEFAULT_COLUMNS) and {"torque", "name"} <= set(notes)
     repair = how.repair and not saved
     arrays, repairs = repair_rows(arrays) if repair else (arrays, [])
+    repairs = [*([notes["reader_note"]] if "reader_note" in notes else []), *repairs]
     if how.restarts and "trajectory" not in arrays and (index := restart_index(arrays["t"])) is not None:
         arrays["trajectory"] = index
     if not saved:
@@ -229,8 +232,10 @@ def _numbers(table: Table, name: str) -> np.ndarray:
 
 
 def files_of(path: str | os.PathLike) -> list[Path]:
-    """Return the files of a recording: one, or all files in the folder of a ROS 2 bag."""
+    """Return the files of a recording: one, or all files of a ROS 2 bag or a LeRobotDataset."""
     path = Path(path).expanduser()
+    if is_dataset(path):
+        return dataset_files(path)
     return sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
 
 
@@ -240,10 +245,12 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")
         raise UserError(f"no file {path}{nearest(path.name, (p.name for p in path.parent.iterdir()))}")
-    if path.is_dir() and not is_bag(path):
-        raise UserError(f"{path}: expected a file ({choices(SUFFIXES)}) or a ROS 2 bag, got another folder")
+    if path.is_dir() and not is_bag(path) and not is_dataset(path):
+        raise UserError(
+            f"{path}: expected a file ({choices(SUFFIXES)}), a ROS 2 bag or a LeRobotDataset, got another folder"
+        )
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES and not is_bag(path):
+    if suffix not in SUFFIXES and not path.is_dir():
         raise UserError(
             f"{path}: unknown suffix '{path.suffix}'; allowed: {choices(SUFFIXES)}{nearest(suffix, SUFFIXES)}"
         )
@@ -252,13 +259,17 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
             return bag_table(path, **bag)
         for key in ("topic", "joints") if suffix in (".csv", ".parquet") else ("topic",):
             if bag[key] is not None:
-                raise UserError(f"data.{key}: expected null for {suffix}, got {bag[key]}: it is for {choices(BAGS)}")
+                kind = "a LeRobotDataset" if path.is_dir() else suffix
+                raise UserError(f"data.{key}: expected null for {kind}, got {bag[key]}: it is for {choices(BAGS)}")
+        if is_dataset(path):
+            return lerobot_table(path)
         return rostopic_table(libfranka_table(without_units(_columns(path, suffix))))
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     except DAMAGED as error:
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{path} cannot be read as {suffix[1:]}: {reason}") from None
+        kind = "a LeRobotDataset" if path.is_dir() else suffix[1:]
+        raise UserError(f"{path} cannot be read as {kind}: {reason}") from None
 
 
 def _columns(path: Path, suffix: str) -> Table:

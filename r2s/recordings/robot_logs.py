@@ -103,7 +103,8 @@ def bag_table(
     """Return t (T,) s and q, dq, tau (or tau_J and tau_J_d) (T, n) of one topic of a bag.
 
     t counts from the first message, by header stamps, or by bag time if all stamps are zero. Messages without one of
-    the joints (a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped.
+    the joints (a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped. The scalar
+    `reader_note` counts messages that were left out for a stamp of 0, or at the start for a lack of values.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.
@@ -123,9 +124,16 @@ def bag_table(
     stamp = np.array([s.stamp for s in kept])
     if not stamp.any():
         stamp = np.array([s.received for s in kept])
-    first = int(np.argmax(stamp != 0))  # a driver may send messages before it knows the time
-    stamp, table = stamp[first:], {field: x[first:] for field, x in table.items()}
-    stamp, table = _in_order(stamp, table)
+    use, notes = stamp != 0, []  # a driver may send messages before it knows the time
+    if not use.all():
+        notes.append(f"{int((~use).sum())} messages with stamp 0 are left out")
+    valued = ~np.any([np.isnan(x).any(axis=1) for x in table.values()], axis=0)
+    if valued.any() and (early := int(np.argmax(valued & use))) > (begin := int(np.argmax(use))):
+        notes.append(f"the first {early - begin} messages lack values and are left out")
+        use[:early] = False
+    stamp, table = _in_order(stamp[use], {field: x[use] for field, x in table.items()})
+    if notes:
+        table["reader_note"] = np.array("; ".join(notes))
     table["t"] = (stamp - stamp[0]) * 1e-9  # integer difference: an epoch in seconds has a resolution of 0.2 us
     if "tau_J_d" in table:
         table["tau_J_d"] = shift_command(table["t"], table["tau_J_d"])
@@ -299,6 +307,8 @@ def _stack(topic: str, samples: list[Sample], field: str, pick: Layouts) -> np.n
     for k, s in enumerate(samples):
         x, at = s.values[field], pick[s.names]
         expected = len(s.names) if s.names else len(samples[0].values["q"])
+        if not len(x):
+            x = np.full(expected, np.nan)
         if len(x) != expected:
             raise UserError(f"message {k} on '{topic}': expected {expected} values of {field}, got {len(x)}")
         rows.append(x if at is None else x[at])

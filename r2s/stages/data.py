@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from r2s.errors import Stopped, UserError, check_number
+from r2s.errors import Stopped, UserError, check_number, choices
 from r2s.files import located
 from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
@@ -148,6 +148,48 @@ def read_file(robot, file, path, torque=None):
     for note in out.notes:
         print(f"{path}: {note}")
     return file.held(out)
+
+
+def read_episodes(path):
+    """Return the episodes of a transfer (`Episodes`) as a recording of commands, and the rest by LeRobot's names.
+
+    Raises:
+        UserError: the file is not one of a transfer.
+    """
+    import numpy as np
+
+    from r2s.files import DAMAGED
+    from r2s.recordings.recording import Recording
+
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            e = {k: saved[k] for k in ("t", "q", "dq", "tau", "ee", "goal", "reward")}
+        count, steps = e["q"].shape[:2]
+        goal = np.broadcast_to(e["goal"] if e["goal"].ndim == 3 else e["goal"][:, None], e["ee"].shape)
+        more = {"observation.ee": e["ee"], "observation.goal": goal, "next.reward": e["reward"][..., None]}
+        rows = {
+            k: x.reshape(count * steps, -1) for k, x in {"q": e["q"], "dq": e["dq"], "tau": e["tau"], **more}.items()
+        }
+        index, t = np.repeat(np.arange(count), steps), np.tile(e["t"], count)
+        arrays = {k: rows.pop(k) for k in ("q", "dq", "tau")}
+        return Recording(t=t, **arrays, torque="commanded", trajectory=index, name=path.stem), rows
+    except DAMAGED as error:
+        raise UserError(f"{path}: expected episodes of a transfer: {' '.join(str(error).split())[:150]}") from None
+
+
+def read_reference(path, n):
+    """Return the motion that a recording of stage=identify follows, by names t, q, dq, ddq, or None without one."""
+    import numpy as np
+
+    from r2s.recordings.csv_table import read_csv
+
+    if not (motion := path.parent / f"excitation_{path.stem}.csv").is_file():
+        return None
+    table = read_csv(motion)
+    columns = {x: [f"{x}{j}" for j in range(1, n + 1)] for x in ("q", "dq", "ddq")}
+    if missing := [c for names in columns.values() for c in names if c not in table]:
+        raise UserError(f"{motion}: no column '{missing[0]}'; columns: {choices(table)}")
+    return {"t": table["t"], **{x: np.stack([table[c] for c in names], axis=1) for x, names in columns.items()}}
 
 
 def read_motion(robot, file, share):
