@@ -42,8 +42,7 @@ def test_the_motion_of_the_tip_is_that_of_its_jacobian():
     columns = replace(LIMIT, place=0.0, tilt=0.0).columns(PANDA)
     for _ in range(20):
         q, dq, row = rng.uniform(PANDA.q_min, PANDA.q_max), rng.normal(size=N), np.empty(N)
-        position, R, anchor, axis = kinematics(q)
-        height, speed, along, convective = _tip_motion(columns, position, R, anchor, axis, dq, row)
+        height, speed, along, convective = _tip_motion(columns, kinematics(q), dq, row)
         place, J = tip(q)
         after, before = (tip(q + s * h * dq)[1] @ dq for s in (1, -1))
         assert height == pytest.approx(UP @ (place - POINT) - PANDA.tool.radius, abs=1e-12)

@@ -20,7 +20,7 @@ import numpy as np
 from r2s.adaptation import tuning
 from r2s.adaptation.contact_detection import detect, weigh
 from r2s.adaptation.momentum import BODY, momentum
-from r2s.adaptation.wrench_friction import MASS_EVERY, balance, couple, known_torque, masses, side_variance
+from r2s.adaptation.wrench_friction import MASS_EVERY, couple, holding_friction, known_torque, masses, side_variance
 from r2s.adaptation.wrench_state import (
     ANCHOR,
     ANGLE,
@@ -226,7 +226,7 @@ def _keep_within_edges(noise, state):
     gain = np.empty(N)
     for j in range(n):
         if joints[REST, j] == 1.0:
-            friction = balance(state, j, gain)
+            friction = holding_friction(state, j, gain)
             variance = gain @ P @ gain
             beyond = min(max(friction, noise.edges[j, 0]), noise.edges[j, 1]) - friction
             hidden = _hidden(noise, j)

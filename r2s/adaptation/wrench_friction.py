@@ -146,7 +146,7 @@ def side_variance(noise, joints, j):
 
 
 @njit(cache=True, error_model="numpy")
-def balance(state, j, gain):
+def holding_friction(state, j, gain):
     """Return the friction, Nm, that holds joint j at rest; write its derivative by the state in `gain` (N,)."""
     x, joints, J = state.x, state.joints, state.jacobian
     n = joints.shape[1]

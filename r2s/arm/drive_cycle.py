@@ -188,8 +188,8 @@ def _push(limit, arm, share, model, last, out):
     n = len(out)
     frames, axes = np.empty((n, POSE)), np.empty((n, 3))
     link_frames(model.links, arm.q, frames, axes)
-    hand = frames[n - 1, :3], frames[n - 1, 3:]
-    return limit_pushes(limit, arm, hand, (frames, axes), last, share, model.friction, model.limits, out)
+    kinematics = frames[n - 1, :3], frames[n - 1, 3:], frames, axes
+    return limit_pushes(limit, arm, kinematics, last, share, model.friction, model.limits, out)
 
 
 def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):

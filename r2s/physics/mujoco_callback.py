@@ -11,7 +11,6 @@ tau_f to qfrc_passive and D to dof_damping, so implicit integrators solve with M
 and stable where an explicit force chatters (real wrist joints: slopes of 3-10 Nm s/rad on 0.004-0.012 kg m^2).
 """
 
-import ctypes
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
@@ -32,6 +31,7 @@ from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
 from r2s.physics.control_laws import chain, control_law, registered
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.linear_algebra import packed_element
+from r2s.physics.mujoco_layout import DATA_FIELDS, MODEL_FIELDS, struct_offsets
 from r2s.physics.push_limit import COLUMNS as PUSH_COLUMNS
 from r2s.physics.push_limit import limit_pushes
 from r2s.physics.safety_filter import COLUMNS, TAU_MAX, WORK, JointDynamics, fade, limit_acceleration, limit_rate
@@ -148,7 +148,7 @@ def _first_moment(mass, xpos, xmat, h):
 @cache
 def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) -> Any:
     """Compile the force with these friction and control laws, in the order of their numbers, and install it."""
-    force = _force_at(_struct_offsets())
+    force = _force_at(struct_offsets(WIDTH, KEPT))
     names = dict(globals())
     if own := laws[len(_BUILT_IN) :]:
         friction = FunctionType(_friction.py_func.__code__, {**globals(), "_law": _in_order(laws)})
@@ -172,9 +172,9 @@ def _force_at(at: dict[str, int]) -> Callable:
     nv_at, nbody_at, nuser_at = (at[k] // 8 for k in ("nv", "nbody", "nuser_jnt"))
     user_at, damping_at = (at[k] // 8 for k in ("jnt_user", "dof_damping"))
     q_at, dq_at, applied_at, passive_at, bias_at, mass_at, memory_at, xpos_at, xmat_at, anchor_at, axis_at = (
-        at[k] // 8 for k in _DATA_FIELDS
+        at[k] // 8 for k in DATA_FIELDS
     )
-    model_words, data_words = (max(at[k] for k in fields) // 8 + 1 for fields in (_MODEL_FIELDS, _DATA_FIELDS))
+    model_words, data_words = (max(at[k] for k in fields) // 8 + 1 for fields in (MODEL_FIELDS, DATA_FIELDS))
 
     def friction_force(model_ptr, data_ptr):
         model = carray(model_ptr, (model_words,))
@@ -332,8 +332,9 @@ def _push(limit, arm, body, places, last, bounds, sent):
     """Limit the push of the command `sent` (n,) Nm; see push_limit.py. places: xpos, xmat, xanchor, xaxis."""
     n = len(sent)
     xpos, xmat = carray(_as_doubles(places[0]), (body + 1, 3)), carray(_as_doubles(places[1]), (body + 1, 9))  # type: ignore[call-arg]
-    joints = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
-    return limit_pushes(limit, arm, (xpos[body], xmat[body]), joints, last, 1.0, bounds[0], bounds[1], sent)
+    anchor, axis = carray(_as_doubles(places[2]), (n, 3)), carray(_as_doubles(places[3]), (n, 3))  # type: ignore[call-arg]
+    kinematics = xpos[body], xmat[body], anchor, axis
+    return limit_pushes(limit, arm, kinematics, last, 1.0, bounds[0], bounds[1], sent)
 
 
 @njit(cache=True, error_model="numpy")
@@ -367,53 +368,3 @@ def _hold(forces, dq, user, joint, work, touch, touches):
         if change != 0.0:
             for j in range(n):
                 passive[j] += packed_element(mass, j, k) * change
-
-
-_MODEL_FIELDS = ("nv", "nbody", "nuser_jnt", "jnt_user", "dof_damping")
-_DATA_FIELDS = (  # in the order of `_force_at`
-    *("qpos", "qvel", "qfrc_applied", "qfrc_passive", "qfrc_bias", "M", "userdata"),
-    *("xpos", "xmat", "xanchor", "xaxis"),
-)
-
-
-def _struct_offsets() -> dict[str, int]:
-    """Return byte offsets within mjModel and mjData, found in live structs.
-
-    Pointers are found by the address of their NumPy view, sizes by their index in mjModel's introspection.
-    """
-    joints = "".join("<body><joint/><geom size='1'/>" for _ in range(3)) + "</body>" * 3
-    spec = mujoco.MjSpec.from_string(
-        f"<mujoco><size nuser_jnt='{WIDTH}' nuserdata='{3 * KEPT}'/><worldbody>{joints}</worldbody></mujoco>"
-    )
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    sizes = [f.name for f in _size_fields()]
-    offsets = {name: 8 * sizes.index(name) for name in ("nv", "nbody", "nuser_jnt")}
-
-    def scan(struct: Any, names: tuple[str, ...]) -> None:
-        word = ctypes.cast(struct._address, ctypes.POINTER(ctypes.c_int64))
-        missing = {getattr(struct, name).ctypes.data: name for name in names}
-        k = 0
-        while missing:  # ends: every array's address is in its struct
-            if name := missing.pop(word[k], None):
-                offsets[name] = 8 * k
-            k += 1
-
-    scan(model, ("jnt_user", "dof_damping"))
-    scan(data, _DATA_FIELDS)
-    seen = np.ctypeslib.as_array(ctypes.cast(model._address, ctypes.POINTER(ctypes.c_int64)), (len(sizes),))
-    if seen[sizes.index("nv")] != model.nv or seen[sizes.index("nuser_jnt")] != WIDTH:
-        raise RuntimeError(f"mujoco {mujoco.__version__}: mjModel is not laid out as its introspection says")
-    return offsets
-
-
-def _size_fields() -> list[Any]:
-    """Return mjModel's leading integer fields, all mjtSize (64 bit), in order."""
-    from mujoco.introspect import structs
-
-    fields: list[Any] = []
-    for field in structs.STRUCTS["mjModel"].fields:
-        if str(field.type) != "mjtSize":
-            break
-        fields.append(field)
-    return fields

@@ -126,11 +126,12 @@ def push_limit(
 
 
 @njit(cache=True, error_model="numpy")
-def _tip_motion(limit, position, R, anchor, axis, dq, row):
+def _tip_motion(limit, kinematics, dq, row):
     """Write how joints move the tip inwards, (n,) m/rad; return its height, speeds m/s, and dJ/dt dq m/s^2.
 
     Height: m, above the highest place of the true plane. Speeds: inwards, and along the plane.
     """
+    position, R, anchor, axis = kinematics
     a, b, c = limit[TIP], limit[TIP + 1], limit[TIP + 2]
     nx, ny, nz = limit[NORMAL], limit[NORMAL + 1], limit[NORMAL + 2]
     x = position[0] + R[0] * a + R[1] * b + R[2] * c
@@ -166,19 +167,20 @@ def _tip_motion(limit, position, R, anchor, axis, dq, row):
 
 
 @njit(cache=True, error_model="numpy")
-def push_bound(limit, arm, place, joints, last, friction, work):
+def push_bound(limit, arm, kinematics, last, friction, work):
     """Return how large an inward acceleration, m/s^2, a torque may cause, infinite far from the surface.
 
     Args:
         limit: (COLUMNS,) of `PushLimit.columns`, updated.
-        arm: `JointDynamics`, finite. place: position (3,) m and rotation (9,) of the last link in the base frame.
-        joints: anchor and axis (n, 3) of the joints. last: (n,) Nm, the torque that the arm applied last.
+        arm: `JointDynamics`, finite. kinematics: position (3,) m and rotation (9,) of the last link, and anchors and
+            axes (n, 3) of the joints, in the base frame.
+        last: (n,) Nm, the torque that the arm applied last.
         friction: (n,) Nm, level of each joint's friction.
         work: (n + WORK, n), any content; row n becomes J, and row n + 1 J M^-1.
     """
     n = len(last)
     root, row, lever, none = work[:n], work[n], work[n + 1], work[n + 2]
-    height, speed, along, convective = _tip_motion(limit, place[0], place[1], joints[0], joints[1], arm.dq, row)
+    height, speed, along, convective = _tip_motion(limit, kinematics, arm.dq, row)
     if height > NEAR_M:
         limit[RESISTED], limit[BEGUN] = 0.0, 0.0
         return np.inf
@@ -205,14 +207,14 @@ def push_bound(limit, arm, place, joints, last, friction, work):
 
 
 @njit(cache=True, error_model="numpy")
-def limit_pushes(limit, arm, place, joints, last, share, friction, limits, out):
+def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     """Change the torques `out` (n,) Nm by the bounds of the joints, which see the contact, and by those of pushes.
 
     Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
     """
     n = len(out)
     own, work, effort = np.empty((n + WORK, n)), np.empty((2 * n + FILTER_WORK, n)), out.copy()
-    bound = push_bound(limit, arm, place, joints, last, friction, own)
+    bound = push_bound(limit, arm, kinematics, last, friction, own)
     row, lever, load = own[n], own[n + 1], own[n + 2]
     for j in range(n):
         load[j] = arm.bias[j] + max(limit[RESISTED], 0.0) * row[j]
