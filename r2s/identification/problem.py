@@ -16,8 +16,8 @@ from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
 
 UNIFORM = 12**-0.5  # standard deviation of a uniform distribution, of its width
-FIXED = 1.0001e-4  # prior sigma of a fixed value, relative to the width of its bounds
-TAIL = 25.0  # degrees of freedom of the prior, plus 1
+FIXED = 1e-4  # prior sigma of a fixed value, relative to the width of its bounds
+TAIL = 25.0  # degrees of freedom of the prior of link-side torque, plus 1
 # implicit friction: least significance of its effect in standard deviations, and size relative to the expected one
 SIGNIFICANT, EXPECTED = 3.0, (0.5, 2.0)
 ROUNDS, MOTOR_ROUNDS = 2, 4  # reweighted fits; nominal friction of a motor may be off by tens of Nm
@@ -147,11 +147,12 @@ class Problem:
         return np.concatenate([data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def _prior(self, u: np.ndarray) -> np.ndarray:
-        z, x = (u - self.start) * self.weight, self.space.from_unit(u)
-        # heavy tails: data that clearly contradict a prior outvote it, as Student's t lets an outlier (Lange et al.,
-        # J. Am. Stat. Assoc. 84(408), 1989); near the nominal value it is normal
-        heavy = np.sign(z) * np.sqrt(TAIL * np.log1p(z**2 / TAIL))
-        prior = np.where(self.sigma > FIXED * self.space.width, heavy, z)
+        prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
+        if not (self.torque_data.commanded or self.torque_data.at_motor):
+            # heavy tails: data that clearly contradict a narrow prior outvote it, as Student's t lets an outlier
+            # (Lange et al., J. Am. Stat. Assoc. 84(408), 1989); near the nominal value it is normal
+            heavy = np.sign(prior) * np.sqrt(TAIL * np.log1p(prior**2 / TAIL))
+            prior = np.where(self.sigma > 2 * FIXED * self.space.width, heavy, prior)
         return np.concatenate([prior, *(extra.residual(self.space, x) for extra in self.extra)], axis=1)
 
 
