@@ -52,7 +52,7 @@ def random_arm(folder, seed, plain):
             inside = f"<body {place(rng)}>{inertial(rng, 0.05)}{inside}</body>"
     path = folder / "arm.xml"
     path.write_text(f'<mujoco><compiler angle="radian"/><worldbody>{inside}</worldbody></mujoco>')
-    return load_robot(str(path), tau_max=[10.0] * n)
+    return load_robot(str(path), tau_max=[100.0] * n)
 
 
 def motion(robot, seed, samples=12):

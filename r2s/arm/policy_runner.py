@@ -59,8 +59,8 @@ def episode_driver(
     period = {"period_s": 1 / task.ctrl_hz, "cutoff_hz": task.cutoff_hz}
     own = {"soft_start_s": soft_start_s, "rotors": rotors, "control": task.control(robot)}
     fence = CollisionCheck(robot, table=None, may_touch=task.may_touch)
-    bounds = {"fence": fence, "speed_share": speed_share, "push_limit": task.push_limit}
-    return Driver(robot, task.torque_limit(robot), friction, **period, **own, **bounds)
+    bounds = {"speed_share": speed_share, "push_limit": task.push_limit}
+    return Driver(robot, task.torque_limit(robot), friction, **period, **own, **bounds, fence=fence)
 
 
 class PolicyRunner:
