@@ -91,8 +91,6 @@ def make_task(cfg, robot, dynamics, safety=None):
         task = task.controlled_by(part(cfg.control, "control", robot, task, dynamics))
     given = {k: v for k, v in (plain(safety) or {}).items() if v is not None}
     safety = {**(plain(cfg.get("safety")) or {}), **given}
-    if unknown := set(safety) - {"force_max", "speed_near"}:
-        raise UserError(f"safety: unknown key '{min(unknown)}'; force_max and speed_near are allowed")
     if not any(value is not None for value in safety.values()):
         return task
     return task.pushing_within(robot, dynamics.level, safety.get("force_max"), safety.get("speed_near"))
