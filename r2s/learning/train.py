@@ -171,7 +171,7 @@ class Training:
 
     Attributes:
         env_steps, updates: counters. next_eval: environment steps of the next evaluation.
-        factor: result of `Reward.adapt`. evaluation: the last row of evaluations.csv.
+        factor: result of `Reward.adapt`, or of Reward.factor. evaluation: the last row of evaluations.csv.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class Training:
         self._began = time.perf_counter()
         self._env, self._algo, self._evaluate, self._loop, self._dump = env, algo, evaluate, loop, dump
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
-        self.factor = 1.0
+        self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
         self._origin: dict[str, Any] = {}  # state of the environment before `_actions`, for a dump
@@ -250,7 +250,7 @@ class Training:
     def save(self, checkpoint: Checkpoint) -> None:
         """Write a checkpoint."""
         state: dict[str, Any] = {"env_steps": self.env_steps, "updates": self.updates, "next_eval": self.next_eval}
-        state |= {"factor": self.factor, "seconds": self.seconds, "evaluation": self.evaluation}
+        state |= {"factor": torch.as_tensor(self.factor), "seconds": self.seconds, "evaluation": self.evaluation}
         state |= {"terms": torch.tensor(np.array(self._terms)), "torch": torch.get_rng_state()}
         state |= {"algo": self._algo.state_dict(), "env": _tensors(self._env.state()), "state": self._state.to_dict()}
         checkpoint.save(state, self._replay, self.env_steps, self._loop.replay_size)
@@ -264,7 +264,7 @@ class Training:
         self._env.set_state(_arrays(saved["env"]))
         self._state = self._state.update(saved["state"])
         self.env_steps, self.updates, self.next_eval = saved["env_steps"], saved["updates"], saved["next_eval"]
-        self.factor, self.evaluation = saved["factor"], saved["evaluation"]
+        self.factor, self.evaluation = saved["factor"].numpy(), saved["evaluation"]
         self._terms = list(saved["terms"].numpy())
         self._began -= saved["seconds"]
         torch.set_rng_state(saved["torch"])

@@ -167,7 +167,9 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
         "nominal": step("train", "nominal", *budget, *choice, typed=bare),
     }
     if adapts:
-        reference = without("adapt", "algo", "dr", "reward", "evaluation.env_steps", "compile", "matmul", "device")
+        reference = without(
+            "adapt", "algo", "dr", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device"
+        )
         words = "algo=computed_torque", "dr=none", known
         trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=reference)
     transferred = {}

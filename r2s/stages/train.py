@@ -25,6 +25,7 @@ WHY = {
     "inertia": "the link parameters come from calibration=",
     "budget": "nothing is trained with this algo",
     "reward": "nothing is trained with this algo",
+    "costs": "nothing is trained with this algo",
     "adapt": "adapters work on an arm, with stage=transfer",
     "arm": "a training uses no arm; stage=transfer does",
     "simulator": "it trains in MuJoCo; stage=transfer uses other engines",
@@ -41,7 +42,7 @@ def reads(cfg):
     if not cfg.calibration:
         keys |= {"friction", "inertia"}
     if "n_envs" in cfg.algo:  # an algorithm that learns
-        keys |= {"budget", "reward", "evaluation", "compile", "matmul", "device"}
+        keys |= {"budget", "reward", "costs", "evaluation", "compile", "matmul", "device"}
     return keys
 
 
@@ -75,6 +76,7 @@ def make_parts(cfg):
     from r2s.learning.evaluate import SELECTION, make_evaluation
     from r2s.learning.policy import normalization
     from r2s.learning.train import Budget
+    from r2s.tasks.costs import ConstrainedReward
 
     episodes, learns = cfg.evaluation.episodes, is_learner(cfg)
     check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
@@ -87,6 +89,8 @@ def make_parts(cfg):
     if not learns:
         return Parts(robot, task, draw, episodes, make_controller(cfg, robot, task, center))
     reward = part(cfg.reward, "reward")
+    if limits := {k: v for k, v in plain(cfg.get("costs") or {}).items() if v is not None}:
+        reward = ConstrainedReward(reward, robot, limits)
     set_threads(cfg)
     env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True, reward=reward)
     evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)

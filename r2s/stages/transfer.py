@@ -30,7 +30,7 @@ from r2s.stages.parts import part
 from r2s.stages.run_config import run_config
 
 REST_GAP = 0.05  # share of the episodes; a larger gap in `rest` between prediction and arm raises a warning
-FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward")
+FROM_POLICY = ("robot", "friction", "inertia", "calibration", "dr", "task", "control", "algo", "reward", "costs")
 WHY = {k: "it comes from the policy's run" for k in FROM_POLICY}
 WHY |= {"budget": "nothing is trained", "evaluation.env_steps": "nothing is trained", "data": "nothing is recorded"}
 

@@ -333,6 +333,14 @@ class PressTask(BaseTask):
             raise UserError("task: press needs a model of the arm; call with_model first")
         return _tips(np.ascontiguousarray(q), self.parameters)
 
+    def tip_velocity(self, state: State) -> np.ndarray:
+        """Return (m, 3) m/s, the velocity of the tip's centre in base axes."""
+        return np.einsum("mkn,mn->mk", self._tip(state.q)[1], state.dq)
+
+    def normals(self, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 3), the outward normals of the nominal plane."""
+        return goals[:, NORMAL]
+
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m, 2) N, the force against the nominal normal, and the one asked for (a step)."""
         asked = np.where(state.t < self.step_s + 0.5 / self.ctrl_hz, goals[:, 6], goals[:, 7])

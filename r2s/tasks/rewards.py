@@ -68,7 +68,12 @@ MAX_FACTOR = 4.0  # largest penalty factor
 class Reward:
     """A weighted sum of named terms; `reward._target_` names a subclass, made with the other keys of its yaml. This
     base class has the task's own terms and weights: `reward=task`.
+
+    Attributes:
+        factor: what `weights` and `adapt` get at the start of a training, a number or an array.
     """
+
+    factor: Any = 1.0
 
     def terms(self, task: Any) -> tuple[str, ...]:
         """Return the names of the terms, in the order of `judge`."""
@@ -80,7 +85,7 @@ class Reward:
         """Return the distance (m,) m and the terms (m, k); arguments as in `Task.judge`."""
         return task.judge(state, ddq, goals, reference)
 
-    def weights(self, task: Any, progress: float, factor: float = 1.0) -> np.ndarray:
+    def weights(self, task: Any, progress: float, factor: Any = 1.0) -> np.ndarray:
         """Return the (k,) weights.
 
         Args:
@@ -88,8 +93,8 @@ class Reward:
         """
         return task.paper_weights
 
-    def adapt(self, factor: float, progress: float, seen: np.ndarray, env_steps: int) -> float:
-        """Return the factor after env_steps further steps with mean terms `seen` (k,); a training starts with 1."""
+    def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> Any:
+        """Return the factor after env_steps further steps with mean terms `seen` (k,)."""
         return factor
 
 

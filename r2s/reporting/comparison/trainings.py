@@ -16,7 +16,7 @@ from r2s.reporting.trackers.tracker import flat
 from r2s.tasks.measures import MeasureTable
 
 # config groups that a training reads, beside its seed; runs with equal values are seeds of one group
-READ = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward")
+READ = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward", "costs")
 ALIKE = ("robot", "task")  # config groups that comparable runs share
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
 MOST_BUDGETS = 2.0  # largest ratio of two comparable budgets: beyond it the longer training wins by its length
@@ -114,7 +114,7 @@ def _read(folder: Path) -> Trained:
     if config.get("calibration"):
         read -= {"friction", "inertia"}  # the calibration replaces them
     if name in CONTROLLERS:
-        read -= {"budget", "reward"}
+        read -= {"budget", "reward", "costs"}
     typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
     measures = measures_of(folder)
     curve, last = _evaluations(folder, measures)

@@ -1,0 +1,99 @@
+"""Costs beside a reward, each with a limit of its mean, and a Lagrange multiplier per cost that a training adapts.
+
+Maximize the mean reward r subject to mean costs c_k <= d_k (a constrained Markov decision process, Altman 1999):
+the policy maximizes r - sum_k lambda_k c_k / d_k, while lambda_k grows with c_k / d_k - 1 and stays at or above 0
+(Tessler, Mankowitz and Mannor, Reward Constrained Policy Optimization, ICLR 2019). The replay buffer stores the costs
+in their units, and an update weights them with the present multipliers, so one critic serves all four algorithms and
+no stored transition becomes stale. Means are over the steps of the training, exploration included.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from r2s.errors import UserError, check_number, choices
+from r2s.physics.robot import Robot
+from r2s.tasks.press_measures import TOUCH_N
+from r2s.tasks.rewards import Reward
+from r2s.tasks.task import State
+
+MARGIN_RAD = 0.1  # rad, from a position limit: where the safety filter starts to fade the torque
+PATIENCE = 50_000  # env steps in which a multiplier grows by 1 at twice its limit; a tenth of a minute of training
+MOST = 50.0  # largest multiplier: a cost that no policy holds may not silence the reward for the rest of the training
+
+
+def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
+    """Return (m,) N, the force on the surface beyond the one asked for."""
+    exerted = task.forces(state, goals)
+    return (exerted[:, 0] - exerted[:, 1]).clip(0.0)
+
+
+def impact_speed(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
+    """Return (m,) m/s, the speed of the tip into the surface while it touches, else 0."""
+    inwards = -(task.tip_velocity(state) * task.normals(goals)).sum(1)
+    return np.where(task.forces(state, goals)[:, 0] > TOUCH_N, inwards.clip(0.0), 0.0)
+
+
+def limit_margin(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
+    """Return (m,) rad, by how much the nearest joint is closer than MARGIN_RAD to a position limit."""
+    low, high = robot.q_range
+    return (MARGIN_RAD - np.minimum(state.q - low, high - state.q).min(1)).clip(0.0)
+
+
+COSTS: dict[str, Callable[[Robot, Any, State, np.ndarray], np.ndarray]] = {
+    "excess_force": excess_force,
+    "impact_speed": impact_speed,
+    "limit_margin": limit_margin,
+}
+
+
+class ConstrainedReward(Reward):
+    """A reward with costs: terms of the reward, then the costs in their units, with weights -lambda / limit.
+
+    Args:
+        reward: what is maximized. robot: the arm. limits: {cost: mean that it may reach, in its unit}, of COSTS.
+
+    Raises:
+        UserError: an unknown cost, or a limit that is not positive.
+    """
+
+    def __init__(self, reward: Reward, robot: Robot, limits: Mapping[str, float]):
+        for name, limit in limits.items():
+            if name not in COSTS:
+                raise UserError(f"costs: {name} is not allowed; allowed: {choices(COSTS)}")
+            check_number(f"costs.{name}", limit, "(0, inf)")
+        self._reward, self._robot, self._names = reward, robot, tuple(limits)
+        self._limits = np.array([float(x) for x in limits.values()])
+
+    @property
+    def factor(self) -> np.ndarray:
+        """(1 + k,), at the start: the factor of the reward, and the multipliers."""
+        return np.array([self._reward.factor, *np.zeros(len(self._names))])
+
+    def terms(self, task: Any) -> tuple[str, ...]:
+        """Return the reward's terms and the costs; raise UserError for a cost that the task does not have."""
+        for name in self._names:
+            if name != "limit_margin" and not task.touches:
+                raise UserError(f"costs.{name}: {type(task).__name__} touches nothing; limit_margin is allowed")
+        return (*self._reward.terms(task), *self._names)
+
+    def judge(
+        self, task: Any, state: State, ddq: np.ndarray, goals: np.ndarray, reference: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance (m,) m, and terms and costs (m, k)."""
+        distance, terms = self._reward.judge(task, state, ddq, goals, reference)
+        costs = [COSTS[name](self._robot, task, state, goals) for name in self._names]
+        return distance, np.column_stack([terms, *costs])
+
+    def weights(self, task: Any, progress: float, factor: Any = None) -> np.ndarray:
+        """Return the weights (k,); factor: see `factor`."""
+        factor = self.factor if factor is None else factor
+        return np.array([*self._reward.weights(task, progress, factor[0]), *(-factor[1:] / self._limits)])
+
+    def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
+        """Return the reward's factor and the multipliers after `env_steps` steps with mean terms `seen` (k,)."""
+        own = len(seen) - len(self._names)
+        beyond = (seen[own:] / self._limits - 1.0).clip(-1.0, 1.0)  # one bad step does not wind a multiplier up
+        multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
+        return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])
