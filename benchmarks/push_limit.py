@@ -22,23 +22,25 @@ TOUCHING = 0.5  # N
 PUSHES = 150.0, 60.0, 30.0, -20.0  # N
 COLUMNS = [
     *("force_max, N", "speed_near, m/s", "delay, ms", "cycles in contact", "arms that touched", "largest force, N"),
-    *("largest share of its bound", "over"),
+    *("largest share of its bound", "over", "share, smooth", "over, smooth"),
 ]
 
 
 def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=True):
-    """Press m arms through the driver; return largest forces, their bounds, N, and cycles in contact, each (m,).
+    """Press m arms through the driver; return (m, 4): largest force and its bounds, N, and cycles in contact.
 
     On surfaces of 2e3 to 1e5 N/m, elsewhere than the plane by up to 5 mm and 5 degrees, by full torque, retreats,
     oscillations and noise, `delay` cycles late. An arm that the driver stops, for example at a position limit, counts
-    until its motion has ended. The bound is that of r2s/physics/push_limit.py in the posture of the largest force.
+    until its motion has ended. Bounds: `PushLimit.bound` in the posture of the largest force, with the surface's
+    friction and without.
     """
     rng, n, up = np.random.default_rng(seed), robot.n, limit.normal
     k = np.exp(rng.uniform(np.log(2e3), np.log(1e5), m))
     k[: m // 4] = 1e5
     normal = tilted(up, rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, 5, (m, 1))))
     place = limit.point + rng.uniform(-5e-3, 5e-3, (m, 1)) * up
-    surface = Surface(place, normal, k, rng.choice([1.0, 1.25], m), 0.5, rng.uniform(0, 0.5, m), 1e-4)
+    exponent, mu = rng.choice([1.0, 1.25], m), rng.uniform(0, 0.5, m)
+    surface = Surface(place, normal, k, exponent, 0.5, mu, 1e-4)
     sim, torque = Simulator(robot, replace(dynamics, surface=surface), m, 1), 0.3 * robot.tau_max
     driver = DriverBatch(robot, torque, m, friction=dynamics.level, push_limit=limit if limited else None)
     starts = PressTask().goals(robot, rng, m)[:, 9:]
@@ -58,8 +60,10 @@ def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=Tr
         pressing = (sim.contact_force * normal).sum(1) * ~driver.done
         at_peak[pressing > force] = sim.q[pressing > force]
         force, touched = np.maximum(force, pressing), touched + (pressing > TOUCHING)
-    mass = np.array([limit.at(robot, dynamics.level, q)[0] for q in at_peak])
-    return force, limit.force_max + limit.speed_near * np.sqrt(k * mass), touched
+    bounds = [
+        [limit.bound(robot, q, *how), limit.bound(robot, q, how[0])] for q, *how in zip(at_peak, k, mu, strict=True)
+    ]
+    return np.column_stack([force, bounds, touched])
 
 
 def main() -> None:
@@ -71,24 +75,26 @@ def main() -> None:
     while done < wanted:
         limit = PushLimit((20.0, 30.0, 60.0)[seed % 3], (0.02, 0.05)[seed % 2], point, up, 5e-3, np.radians(5.0))
         delay = (0, 4, 8)[seed // 3 % 3]
-        force, bound, touched = hostile(robot, NEW, limit, seed, 256, delay=delay)
+        force, bound, smooth, touched = hostile(robot, NEW, limit, seed, 256, delay=delay).T
         over, share = (force > bound).sum(), (force / bound).max()
+        shares = share, over, (force / smooth).max(), (force > smooth).sum()
         rows.append(
-            (limit.force_max, limit.speed_near, delay, touched.sum(), (touched > 0).sum(), force.max(), share, over)
+            (limit.force_max, limit.speed_near, delay, touched.sum(), (touched > 0).sum(), force.max(), *shares)
         )
         seed, done = seed + 1, done + int(touched.sum())
         print(
             f"{done:,} of {wanted:,} cycles in contact; largest share of a bound {share:.2f}, over it {over}",
             flush=True,
         )
-    free, bound, _ = hostile(robot, NEW, limit, seed, 256, cycles=500, limited=False)
+    free, bound, *_ = hostile(robot, NEW, limit, seed, 256, cycles=500, limited=False).T
     table = pd.DataFrame(rows, columns=COLUMNS).groupby(COLUMNS[:3], as_index=False).agg(
-        dict(zip(COLUMNS[3:], ("sum", "sum", "max", "max", "sum"), strict=True))
+        dict(zip(COLUMNS[3:], ("sum", "sum", "max", "max", "sum", "max", "sum"), strict=True))
     )  # fmt: skip
     text = (
         f"{done:,} cycles in contact of simulated Pandas (published friction) behind the driver in {seed * 256} "
-        f"motions of 3 s: {table['over'].sum():g} over force_max + speed_near sqrt(k m). Without a limit "
-        f"{100 * (free > bound).mean():.0f} % of 256 arms are over it within 0.5 s, the largest force is "
+        f"motions of 3 s: {table['over'].sum():g} over `PushLimit.bound`, which counts the surface's friction; "
+        f"{table['over, smooth'].sum():g} over force_max + speed_near sqrt(k m), that of a smooth surface. Without a "
+        f"limit {100 * (free > bound).mean():.0f} % of 256 arms are over it within 0.5 s, the largest force is "
         f"{free.max():.0f} N."
     )
     shown = markdown(table.map("{:.4g}".format).rename_axis("set"))

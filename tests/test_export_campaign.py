@@ -77,7 +77,7 @@ def hostile_stream(arm: SimulatedArm, torque: np.ndarray, seed: int) -> Iterator
 
 def obey(arm: SimulatedArm, exported: Exported, tau: np.ndarray) -> None:
     """Command an arm. After a lie about its torque, a command is too large a step, which an arm refuses: clip it."""
-    last, step = arm.read().tau_J_d, 1e-3 * exported.robot.dtau_max
+    last, step = arm.read().tau_J_d, (1 - 1e-9) * 1e-3 * exported.robot.dtau_max  # a whole step may be rounded up
     arm.command(last + np.clip(tau - last, -step, step))
 
 

@@ -55,10 +55,10 @@ def test_the_motion_of_the_tip_is_that_of_its_jacobian():
 @pytest.mark.parametrize("delay", [0, 8])
 def test_no_torque_presses_harder_than_the_limit(delay):
     """At the driver, immediately and 8 ms late; without a limit nearly all of these arms do."""
-    force, bound, touched = hostile(PANDA, TRUE, LIMIT, 1, 32, delay=delay)
+    force, bound, _, touched = hostile(PANDA, TRUE, LIMIT, 1, 32, delay=delay).T
     assert (force < bound).all()
     assert (touched > 100).mean() > 0.1
-    free, bound, _ = hostile(PANDA, TRUE, LIMIT, 1, 32, delay=delay, cycles=500, limited=False)
+    free, bound, *_ = hostile(PANDA, TRUE, LIMIT, 1, 32, delay=delay, cycles=500, limited=False).T
     assert (free > bound).mean() > 0.8
 
 

@@ -16,9 +16,10 @@ R is the momentum residual along the normal (De Luca et al., IROS 2006), a low-p
 has R = 0 and cannot accelerate beyond v_max; a tip that presses has R = P, so its force can rise. A tip faster than
 v_max, or that leaves the surface, has lost what resisted it: R = 0.
 
-So the force is at most force_max + speed_near sqrt(k m) on a surface of stiffness k: when it rises through force_max
-the tip moves at speed_near or slower, and from there on P + P_f - F brakes it. What the surface's own friction does
-to the tip in other directions is not counted.
+So the force is at most force_max + speed_near sqrt(k m) on a smooth surface of stiffness k: when it rises through
+force_max the tip moves at speed_near or slower, and from there on P + P_f - F brakes it. The friction mu F of a rough
+surface pushes a sliding tip inwards with up to mu c F, c = m |T J M^-1 J^T n| with T across the normal n. Then (1 -
+mu c) F takes the place of F: see `PushLimit.bound`.
 
 Both rules are half-spaces of torques with the same normal J M^-1. The limit sends the nearest torque by Gauss'
 principle, so it subtracts J^T f. The acceleration bounds of the joints (safety_filter.py) hold as well: the force f
@@ -86,6 +87,17 @@ class PushLimit:
         lever = InverseInertia(robot)(q[None])[0] @ row
         mass = 1.0 / float(row @ lever)
         return mass, mass * float(np.abs(lever) @ friction)
+
+    def bound(self, robot: Robot, q: np.ndarray, stiffness: float, friction: float = 0.0) -> float:
+        """Return the largest force, N, on a surface of `stiffness`, N/m, and Coulomb `friction` at q (n,) rad.
+
+        Infinite where the surface's friction can push a sliding tip inwards without limit.
+        """
+        jacobian = Tip(robot)(q)[1]
+        moved = jacobian @ InverseInertia(robot)(q[None])[0] @ jacobian.T @ self.normal  # 1/kg, by a force on the tip
+        mass = 1.0 / float(moved @ self.normal)
+        left = 1.0 - friction * mass * float(np.linalg.norm(moved - self.normal / mass))
+        return (self.force_max + self.speed_near * np.sqrt(left * stiffness * mass)) / left if left > 0.0 else np.inf
 
 
 def push_limit(
