@@ -1,6 +1,6 @@
 """task=press with costs (Lagrange multipliers), with the driver's limit of force, with both, and with neither.
 
-    python benchmarks/safe_learning.py [minutes=4]
+    python benchmarks/safe_learning.py
 
 Trains TQC under the four combinations and all algorithms with costs, then writes results/safe_learning.md and
 results/safe_learning.png. Finished runs are kept in runs/safe_learning and not repeated.
@@ -20,6 +20,7 @@ KEPT = tuple(f"costs.{name}={limit:g}" for name, (limit, _) in COSTS.items())
 MEASURED = tuple(f"costs.{name}=1e6" for name in COSTS)  # limits that nothing reaches
 WAYS = {"neither": MEASURED, "costs": KEPT, "limit of force": MEASURED + LIMITED, "both": KEPT + LIMITED}
 ALGORITHMS = "ddpg", "sac", "td3", "tqc"
+ENV_STEPS = 240_000  # of each training
 LAST = 0.25  # share of a training at its end, of which means are reported
 
 
@@ -68,8 +69,7 @@ def plot(names: dict[str, str]) -> None:
 
 def main() -> None:
     """Train what is missing and write the page."""
-    minutes = next((w.removeprefix("minutes=") for w in sys.argv[1:] if w.startswith("minutes=")), "4")
-    shared = "task=press", f"root={RUNS}", f"budget.minutes={minutes}"
+    shared = "task=press", f"root={RUNS}", "budget.minutes=null", f"budget.env_steps={ENV_STEPS}"
     runs = {(label, "tqc"): words for label, words in WAYS.items()} | {("costs", algo): KEPT for algo in ALGORITHMS}
     run_parallel(
         [*shared, f"algo={algo}", f"name={name_of(label, algo)}", *words] for (label, algo), words in runs.items()
@@ -78,7 +78,7 @@ def main() -> None:
     plot({algo: name_of("costs", algo) for algo in ALGORITHMS})
     table = markdown_rows(pd.DataFrame(rows).to_dict(), "training")
     text = (
-        f"Means over the last quarter of each training of {minutes} minutes on one core, exploration included. The "
+        f"Means over the last quarter of each training of {ENV_STEPS:,} env steps, exploration included. The "
         "last columns are of the saved policy on the goals of all reports. Costs are means over all steps. Limit of "
         f"force: {' '.join(LIMITED)}."
     )
