@@ -1,20 +1,25 @@
 """A stopped training continues; a value that is not finite stops it, and a dump reproduces it."""
 
 import time
+import zipfile
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from conftest import conf
+from tensordict import TensorDict
 from test_cli import r2s, server, started, succeed  # noqa: F401
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.errors import UserError
+from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import UniformRandomization
 from r2s.learning.tqc import TQC
-from r2s.learning.train import Budget, Loop, replay_dump, train
+from r2s.learning.train import Budget, Loop, generators, replay_dump, set_generators, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
@@ -111,6 +116,82 @@ def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
     again = r2s(f"resume={folders[1]}", at=tmp_path)
     assert again.returncode == 2
     assert again.stderr.strip().endswith("is finished")
+
+
+def filled(replay, seen, count):
+    """Put transitions number seen to seen + count - 1 into the buffer, each with its number."""
+    for k in range(seen, seen + count):
+        replay.extend(TensorDict({"action": torch.tensor([[float(k)]])}, batch_size=[1]))
+
+
+def new_buffer(size):
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(size), sampler=RandomSampler(), batch_size=64)
+
+
+@pytest.mark.parametrize("gaps", [[3] * 9, [7] * 5, [4, 9, 1, 10, 3], [10] * 3, [25, 1, 33, 2], [6, 30, 5]])
+def test_a_buffer_comes_back_to_the_row_at_any_gap(gaps, tmp_path):
+    """Row for row, cursor and draws included; the files hold the buffer and at most one gap more, below twice it."""
+    size, seen, replay = 10, 0, new_buffer(10)
+    checkpoint = Checkpoint(tmp_path)
+    for gap in gaps:
+        filled(replay, seen, gap)
+        seen += gap
+        checkpoint.save({}, replay, seen, size)
+        chunks = [torch.load(f, weights_only=True)["action"] for f in tmp_path.glob("replay_*.pt")]
+        assert sum(map(len, chunks)) <= min(seen, max(size, size - 1 + min(gap, size)))
+        again, back = new_buffer(size), Checkpoint(tmp_path)
+        assert back.load(again, size)["seen"] == seen
+        for step in range(2):  # as it was saved, and after more transitions
+            draws = []
+            for buffer in (replay, again):
+                torch.manual_seed(0)
+                draws.append(buffer.sample()["action"])
+            assert torch.equal(*draws)
+            assert torch.equal(replay[:]["action"], again[:]["action"])
+            if step == 0:
+                filled(replay, seen, 4)
+                filled(again, seen, 4)
+        back.save({}, again, seen + 4, size)  # goes on from what it loaded
+        seen, checkpoint = seen + 4, back
+
+
+def on_gpu(path, to):
+    """Copy a checkpoint file as a GPU writes it: each storage is labelled cuda:0 in the file's pickle."""
+    with zipfile.ZipFile(path) as file, zipfile.ZipFile(to, "w") as copy:
+        for name in file.namelist():
+            content = file.read(name)
+            if name.endswith("data.pkl"):
+                assert b"X\x03\x00\x00\x00cpu" in content
+                content = content.replace(b"X\x03\x00\x00\x00cpu", b"X\x06\x00\x00\x00cuda:0")
+            copy.writestr(name, content)
+
+
+def test_a_checkpoint_of_a_gpu_loads_without_one(panda, tmp_path):
+    """Weights and moments of the optimizer arrive on the processor, and the next update is the same."""
+    algo = make_algo(make_env(panda))
+    sizes = {"observation": len(algo.normalizer.mean), "action": 7}
+    batch = {k: torch.rand(8, v) for k, v in (sizes | {"next_observation": sizes["observation"]}).items()}
+    batch |= {"reward": torch.rand(8), "terminated": torch.zeros(8)}
+    algo.update(batch)
+    states = {"cuda": torch.zeros(16, dtype=torch.uint8)} | generators(torch.device("cpu"))  # of both devices
+    save_tensors(tmp_path / "cpu.pt", {"algo": algo.state_dict()} | states)
+    on_gpu(tmp_path / "cpu.pt", tmp_path / "gpu.pt")
+    saved, other = load_tensors(tmp_path / "gpu.pt", "resume"), make_algo(make_env(panda))
+    other.load_state_dict(saved["algo"])
+    set_generators(saved, torch.device("cpu"))
+    second = other.update(batch)
+    set_generators(states, torch.device("cpu"))
+    assert second == algo.update(batch)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no GPU")
+def test_noise_of_a_gpu_goes_on_where_it_stopped():
+    gpu = torch.device("cuda:0")
+    torch.cuda.manual_seed(0)
+    states = generators(gpu)
+    first = torch.randn(5, device=gpu)
+    set_generators(states, gpu)
+    assert torch.equal(first, torch.randn(5, device=gpu))
 
 
 def train_until_it_breaks(env, algo, dump):

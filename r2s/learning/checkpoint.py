@@ -1,7 +1,9 @@
 """Checkpoints of a training: its state in one file, and the transitions of the replay buffer in chunks beside it.
 
 Each transition is written once. The state names the chunks that belong to it, so an interrupted write leaves the
-previous checkpoint intact. Files hold tensors, numbers and names only, which torch.load(weights_only=True) reads.
+previous checkpoint intact. A chunk is removed when the buffer has overwritten all of it, so the files hold the buffer
+and at most one interval between checkpoints more. Files hold tensors, numbers and names only, which
+torch.load(weights_only=True) reads.
 """
 
 import errno
@@ -23,7 +25,7 @@ class Checkpoint:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._saved, self._chunks = 0, list[str]()  # number of saved transitions, names of their files
+        self._chunks = list[int]()  # transitions seen at the end of each chunk, which begins at the end before
 
     @property
     def env_steps(self) -> int:
@@ -32,23 +34,25 @@ class Checkpoint:
         return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 
     def save(self, state: dict[str, Any], replay: TensorDictReplayBuffer, seen: int, size: int) -> None:
-        """Write the state and the transitions since the last call.
+        """Write the state and the transitions since the last call; remove chunks that the buffer has overwritten.
 
         Args:
-            state: of the training. replay: buffer with the last `size` of `seen` transitions.
+            state: of the training.
+            replay: buffer with the last `size` of `seen` transitions, number k in row k % size.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        chunk = f"replay_{seen:012d}.pt"
-        if seen - self._saved < size:
-            rows, self._chunks = torch.arange(self._saved, seen) % size, [*self._chunks, chunk]
-        else:  # the buffer has overwritten all saved transitions
-            rows, self._chunks = torch.arange(size), [chunk]
-        save_tensors(self.folder / chunk, replay[rows].to_dict())
-        save_tensors(self.folder / "state.pt", state | {"seen": seen, "chunks": self._chunks})
-        self._saved = seen
+        begin = max(self._chunks[-1] if self._chunks else 0, seen - size)
+        save_tensors(self._path(seen), replay[torch.arange(begin, seen) % size].to_dict())
+        chunks = [*(end for end in self._chunks if end > seen - size), seen]
+        save_tensors(self.folder / "state.pt", state | {"seen": seen, "chunks": [self._path(k).name for k in chunks]})
+        self._chunks = chunks
+        for path in {*self.folder.glob("replay_*.pt")} - {*map(self._path, chunks)}:
+            path.unlink()
 
     def load(self, replay: TensorDictReplayBuffer, size: int) -> dict[str, Any] | None:
-        """Fill `replay` with the saved transitions and return the saved state; None if there is no checkpoint.
+        """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
+
+        Every transition has the row that it had, so a seed draws the same batches.
 
         Raises:
             UserError: a file of the checkpoint is missing or damaged.
@@ -57,12 +61,19 @@ class Checkpoint:
         if not path.is_file():
             return None
         state = load_tensors(path, "resume")
-        self._saved, self._chunks = state["seen"], state["chunks"]
-        for chunk in self._chunks:
-            rows = load_tensors(self.folder / chunk, "resume")
-            replay.extend(TensorDict(rows, batch_size=[len(rows["action"])]))
-        replay.writer.load_state_dict({"_cursor": self._saved % size})
+        seen, self._chunks = state["seen"], [int(Path(c).stem.removeprefix("replay_")) for c in state["chunks"]]
+        replay.writer.load_state_dict({"_cursor": max(0, seen - size) % size})
+        for end in self._chunks:
+            rows = load_tensors(self._path(end), "resume")
+            count = len(rows["action"])
+            overwritten = max(0, seen - size - (end - count))
+            if overwritten < count:
+                replay.extend(TensorDict(rows, batch_size=[count])[overwritten:])
         return state
+
+    def _path(self, end: int) -> Path:
+        """Return the file of the chunk that ends at this number of transitions."""
+        return self.folder / f"replay_{end:012d}.pt"
 
     def clear(self) -> None:
         """Remove the checkpoint of a finished training."""
@@ -91,7 +102,7 @@ def load_tensors(path: Path, option: str) -> dict[str, Any]:
         UserError: the file is missing or damaged; the line begins with `option`.
     """
     try:
-        content = torch.load(path, weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)  # perhaps written on a GPU
     except Exception as error:  # a damaged file may raise anything
         reason = " ".join(str(error).split())[:100]
         raise UserError(f"{option}: {path} cannot be read, it is missing or damaged ({reason})") from None

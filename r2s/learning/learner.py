@@ -106,15 +106,17 @@ class Learner(nn.Module, ABC):
         """
         mode = "reduce-overhead" if self.action_scale.is_cuda else "default"
         eager = {name: getattr(self, name) for name in self.compiled}
-        before, random = copy.deepcopy(self.state_dict()), torch.get_rng_state()
+        before = copy.deepcopy(self.state_dict())
         sizes = {"observation": len(self.normalizer.mean), "action": len(self.action_scale)}
         sizes["next_observation"] = sizes["observation"]
         batch = {k: torch.zeros(batch_size, size, device=self.action_scale.device) for k, size in sizes.items()}
         batch |= {k: torch.zeros(batch_size, device=self.action_scale.device) for k in ("reward", "terminated")}
+        devices = [self.action_scale.device] if self.action_scale.is_cuda else []
         try:
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
-            self.update(batch)
+            with torch.random.fork_rng(devices):  # the update draws noise
+                self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
             warnings.warn(f"the losses are not compiled, updates take about twice as long: {why}", stacklevel=2)
@@ -124,7 +126,6 @@ class Learner(nn.Module, ABC):
         finally:
             self.zero_grad(set_to_none=True)
             self.load_state_dict(before)
-            torch.set_rng_state(random)
         return True
 
     def descend(self, loss: Tensor) -> None:

@@ -9,7 +9,7 @@ import copy
 import ctypes
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,10 +220,10 @@ class Training:
         weights = torch.from_numpy(self._env.weights.astype(np.float32)).to(self._device)
         batch = self._replay.sample()
         batch["reward"] = batch["reward_terms"] @ weights
-        random, matmul = torch.get_rng_state(), self._loop.matmul
+        random, matmul = generators(self._device), self._loop.matmul
 
         def cause() -> dict[str, Any]:
-            return {"algo": self._algo.state_dict(), "batch": batch.to_dict(), "torch": random, "matmul": matmul}
+            return {"algo": self._algo.state_dict(), "batch": batch.to_dict(), "matmul": matmul} | random
 
         with self._dump_errors(cause), matmul_precision(matmul):
             losses = self._algo.update(batch)
@@ -251,7 +251,7 @@ class Training:
         """Write a checkpoint."""
         state: dict[str, Any] = {"env_steps": self.env_steps, "updates": self.updates, "next_eval": self.next_eval}
         state |= {"factor": torch.as_tensor(self.factor), "seconds": self.seconds, "evaluation": self.evaluation}
-        state |= {"terms": torch.tensor(np.array(self._terms)), "torch": torch.get_rng_state()}
+        state |= {"terms": torch.tensor(np.array(self._terms))} | generators(self._device)
         state |= {"algo": self._algo.state_dict(), "env": _tensors(self._env.state()), "state": self._state.to_dict()}
         checkpoint.save(state, self._replay, self.env_steps, self._loop.replay_size)
 
@@ -267,7 +267,7 @@ class Training:
         self.factor, self.evaluation = saved["factor"].numpy(), saved["evaluation"]
         self._terms = list(saved["terms"].numpy())
         self._began -= saved["seconds"]
-        torch.set_rng_state(saved["torch"])
+        set_generators(saved, self._device)
 
     @contextmanager
     def _dump_errors(self, cause: Callable[[], dict[str, Any]], when: str = "") -> Iterator[None]:
@@ -300,9 +300,10 @@ def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Pol
         if "batch" not in cause:
             evaluate(algo.policy)
             return
-        torch.set_rng_state(cause["torch"])
+        device = algo.action_scale.device
+        set_generators(cause, device)
         with matmul_precision(cause["matmul"]):
-            algo.update(cause["batch"])
+            algo.update({k: v.to(device) for k, v in cause["batch"].items()})
         return
     env.reset()
     env.set_state(_arrays(cause["env"]))
@@ -310,6 +311,19 @@ def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Pol
     for action in cause["actions"]:
         state["action"] = action
         _, state = env.step_and_maybe_reset(state)
+
+
+def generators(device: torch.device) -> dict[str, torch.Tensor]:
+    """Return the states of torch's generators that a training on this device draws from."""
+    states = {"torch": torch.get_rng_state()}
+    return states | {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else states
+
+
+def set_generators(states: Mapping[str, Any], device: torch.device) -> None:
+    """Restore what `generators` returned; a state of a generator that this device does not use is left out."""
+    torch.set_rng_state(states["torch"])
+    if device.type == "cuda" and "cuda" in states:
+        torch.cuda.set_rng_state(states["cuda"], device)
 
 
 def keep_memory() -> None:
