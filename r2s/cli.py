@@ -21,6 +21,9 @@ INTERRUPTED = 130
 RESUMABLE = ("identify", "train", "tune")
 PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
+ABSENT = "not there"
+# keys that may differ where skip_completed goes on: where a run is, how it is shown, on how many cores
+FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
 FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of its jobs
 
 
@@ -92,7 +95,7 @@ def run_job(cfg):
         check_paths(cfg)
         if cfg.resume:
             cfg, overrides = resumed(cfg, overrides)
-        elif cfg.skip_completed and is_completed(cfg, overrides):
+        elif cfg.skip_completed and is_completed(cfg):
             return
         getattr(import_module(f"r2s.stages.{cfg.stage}"), cfg.stage)(cfg, overrides)
 
@@ -117,7 +120,7 @@ def resumed(cfg, overrides):
     if not (folder / "config.yaml").is_file():
         names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
         raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
-    if extra := [o for o in overrides if not o.startswith(("resume=", "trust="))]:
+    if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)
     if before.stage == "tune":  # its trainings replay the overrides of the folder
@@ -127,10 +130,12 @@ def resumed(cfg, overrides):
     if is_done(folder):
         raise UserError(f"resume: {folder} is finished")
     before.resume = str(folder)
+    if any(o.startswith("device=") for o in overrides):  # a checkpoint of a GPU goes on without one
+        before.device = cfg.device
     return before, typed_overrides(folder)
 
 
-def is_completed(cfg, overrides):
+def is_completed(cfg):
     """Return whether the run folder of this job is finished; if it was stopped, set `resume` to it."""
     from r2s.runs import is_done
 
@@ -140,17 +145,26 @@ def is_completed(cfg, overrides):
     if not (folder / "meta.json").is_file():
         return False
 
-    def settings(words):
-        others = ("stage=", "name=", "root=", "threads=", "skip_completed=", "grid.", "tracker")
-        return {w for w in words if not w.startswith(others)}
-
-    if other := sorted(settings(typed_overrides(folder)) ^ settings(overrides)):
-        raise UserError(f"skip_completed: {folder} has other settings ({', '.join(other)}); give another name=")
+    if other := differing(loaded(folder / "config.yaml"), cfg):
+        raise UserError(f"skip_completed: {folder} has other settings: {'; '.join(other)}; give another name=")
     if is_done(folder):
         print(f"already finished: {folder}")
         return True
     cfg.resume = str(folder)
     return False
+
+
+def differing(saved, cfg, most=3):
+    """Return how a composed config differs from the saved one of a run folder, in `most` settings at most."""
+    from omegaconf import OmegaConf
+
+    from r2s.reporting.trackers.tracker import flat
+
+    both = (OmegaConf.to_container(c, resolve=True) for c in (saved, cfg))
+    before, now = (dict(flat({k: v for k, v in c.items() if k not in FREE})) for c in both)
+    keys = [k for k in dict.fromkeys([*before, *now]) if before.get(k) != now.get(k)]
+    words = [f"{k} was {str(before.get(k, ABSENT))[:60]}, is {str(now.get(k, ABSENT))[:60]}" for k in keys[:most]]
+    return words + [f"and {len(keys) - most} more"] * (len(keys) > most)
 
 
 def typed_overrides(folder):

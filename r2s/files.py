@@ -1,12 +1,15 @@
-"""Atomic file writes, and paths of the files that come with the package."""
+"""Atomic file writes, JSON, and paths of the files that come with the package."""
 
+import json
+import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
+from typing import Any
 
 # Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated, altered or foreign array file.
 DAMAGED = (
@@ -35,3 +38,17 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write JSON atomically; numbers that are not finite become null."""
+
+    def finite(node: Any) -> Any:
+        if isinstance(node, Mapping):
+            return {k: finite(v) for k, v in node.items()}
+        if isinstance(node, list):
+            return [finite(v) for v in node]
+        return None if isinstance(node, float) and not math.isfinite(node) else node
+
+    with atomic_write(path) as part:
+        part.write_text(json.dumps(finite(document), indent=1) + "\n")

@@ -48,8 +48,15 @@ def packages() -> dict[str, str | None]:
 
 
 def machine() -> dict[str, Any]:
-    """Return processor, number of cores and operating system."""
-    return {"cpu": cpu(), "cores": os.cpu_count(), "system": platform.platform(terse=True)}
+    """Return processor, number of cores, GPUs and operating system."""
+    return {"cpu": cpu(), "cores": os.cpu_count(), "gpus": gpus(), "system": platform.platform(terse=True)}
+
+
+def gpus() -> list[str]:
+    """Return the models of the NVIDIA GPUs, as the driver lists them."""
+    files = sorted(Path("/proc/driver/nvidia/gpus").glob("*/information"))
+    lines = [line for path in files for line in path.read_text().splitlines()]
+    return [line.split(":", 1)[1].strip() for line in lines if line.startswith("Model:")]
 
 
 def cpu() -> str:

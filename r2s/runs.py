@@ -23,8 +23,12 @@ from typing import Any, Self
 import numpy as np
 
 from r2s.errors import Stopped, UserError
-from r2s.files import DAMAGED, atomic_write
+from r2s.files import DAMAGED, atomic_write, write_json
 from r2s.provenance import git, machine, packages, sha256
+
+# of meta.json, for each part of a run that was resumed
+PART = ("start", "wall_clock_s", "status", "process", "threads", "device", "git", "packages", "machine")
+NOTE_S = 30.0  # between two writes of the wall clock into meta.json, so that a killed part keeps its time
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Job:
     Attributes:
         stage, name: the folder runs/<stage>/<name>; None: `default_name`. A used name gets a number.
         config: composed config, YAML. overrides: as typed.
-        seed: of the run. threads: requested, 0: all cores.
+        seed: of the run. threads: requested, 0: all cores. device: of the learner.
         inputs: files that the run reads, for their SHA-256. parents: run folders that it starts from.
     """
 
@@ -46,6 +50,7 @@ class Job:
     threads: int
     inputs: Sequence[str | Path] = ()
     parents: Sequence[str | Path] = ()
+    device: str = "cpu"
 
 
 class Run:
@@ -64,7 +69,8 @@ class Run:
     """
 
     def __init__(self, root: Path, job: Job, *, resume: str | Path | None = None, exact_name: bool = False):
-        self._began = time.monotonic()  # the wall clock may jump
+        self._began = self._noted = time.monotonic()  # the wall clock may jump
+        self._earlier: list[dict[str, Any]] = []  # the parts before this one
         self._tables: dict[str, Any] = {}
         self.tracker: Any = None
         self._meta: dict[str, Any] = {
@@ -74,6 +80,7 @@ class Run:
             "wall_clock_s": 0.0,
             "seed": job.seed,
             "threads": job.threads or os.cpu_count(),
+            "device": job.device,
             "process": {"host": platform.node(), "pid": os.getpid()},
             "git": git(),
             "packages": packages(),
@@ -82,8 +89,9 @@ class Run:
             "parents": [str(p) for p in job.parents],
             "typed": len(job.overrides),  # detects a truncated overrides.yaml
         }
+        self._start = self._meta["start"]
         if resume:
-            self._resume(Path(resume), job.config)
+            self._resume(Path(resume))
             return
         parent = root / job.stage
         try:
@@ -107,16 +115,20 @@ class Run:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def _resume(self, folder: Path, config: str) -> None:
+    def _resume(self, folder: Path) -> None:
+        """Lock a run folder and add a part to its meta.json; its config and overrides stay as they were written."""
         self.folder = folder
         self._lock = _lock(folder)
         try:
-            before = read_meta(folder)["inputs"]
+            before = read_meta(folder)
             for path, digest in self._meta["inputs"].items():
-                if before.get(path) != digest:
+                if before["inputs"].get(path, digest) != digest:
                     raise UserError(f"resume: {path} has changed since {folder} was started")
-            with atomic_write(folder / "config.yaml") as part:
-                part.write_text(config)
+            self._earlier = parts_of(before)
+            if self._earlier[-1]["status"] == "running":
+                self._earlier[-1]["status"] = "killed"
+            self._meta |= {k: before[k] for k in ("start", "parents", "typed") if k in before}
+            self._meta["inputs"] = before["inputs"] | self._meta["inputs"]
             self._write_meta()
         except BaseException:
             os.close(self._lock)
@@ -126,7 +138,6 @@ class Run:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
-        self._meta["wall_clock_s"] = round(time.monotonic() - self._began, 3)
         interrupted = kind in (KeyboardInterrupt, Stopped)
         self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
@@ -162,6 +173,7 @@ class Run:
             path.parent.mkdir(exist_ok=True)
             with atomic_write(path) as part:
                 np.savez(part, **done)  # type: ignore[arg-type]
+            self._write_meta()
         return load_arrays(path)
 
     def figure(self, name: str) -> Path:
@@ -183,6 +195,8 @@ class Run:
         writer, file = self._tables[table]
         writer.writerow({k: f"{v:.7g}" if isinstance(v, float) else v for k, v in rounded.items()})
         file.flush()
+        if time.monotonic() - self._noted > NOTE_S:
+            self._write_meta()
         self.track(table, row)
         return rounded
 
@@ -227,21 +241,14 @@ class Run:
             self.tracker.summary(document)
 
     def _write_meta(self) -> None:
+        """Write meta.json; of a resumed run its clock is the sum over its parts, which it lists."""
+        self._noted = time.monotonic()
+        own = round(self._noted - self._began, 3)
+        self._meta["wall_clock_s"] = round(own + sum(p["wall_clock_s"] for p in self._earlier), 3)
+        if self._earlier:
+            part = {k: self._meta.get(k) for k in PART} | {"start": self._start, "wall_clock_s": own}
+            self._meta["parts"] = [*self._earlier, part]
         write_json(self.folder / "meta.json", self._meta)
-
-
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON atomically; numbers that are not finite become null."""
-
-    def finite(node: Any) -> Any:
-        if isinstance(node, Mapping):
-            return {k: finite(v) for k, v in node.items()}
-        if isinstance(node, list):
-            return [finite(v) for v in node]
-        return None if isinstance(node, float) and not math.isfinite(node) else node
-
-    with atomic_write(path) as part:
-        part.write_text(json.dumps(finite(document), indent=1) + "\n")
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
@@ -276,6 +283,19 @@ def read_meta(folder: Path) -> dict[str, Any]:
     if not {"status", "inputs"} <= meta.keys():
         raise UserError(f"{folder / 'meta.json'} is damaged: it has no status or no inputs")
     return meta
+
+
+def parts_of(meta: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the parts of a run, one unless it was resumed: when, how long, by which code, on which machine.
+
+    Raises:
+        UserError: meta.json is damaged.
+    """
+    parts = meta.get("parts") or [{k: meta.get(k) for k in PART}]
+    try:
+        return [{k: part[k] for k in PART} | {"wall_clock_s": float(part["wall_clock_s"] or 0)} for part in parts]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"meta.json is damaged: parts of the run: {error!r}") from None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
+from hydra import compose, initialize_config_dir
 from packaging.requirements import Requirement
 
-from r2s.cli import typed_overrides
+from r2s.cli import differing, typed_overrides
 from r2s.errors import UserError
 from r2s.learning.checkpoint import load_tensors, save_tensors
 from r2s.override_checks import check_option
+from r2s.provenance import sha256
 from r2s.runs import Job, Run, is_done, is_locked, load_arrays, read_summary
+from r2s.stages.build import CONF, open_run
 
 SOURCES = [*sorted((ROOT / "r2s").rglob("*.py")), *sorted((ROOT / "hydra_plugins").glob("*.py")), ROOT / "run.py"]
 NEVER = {
@@ -151,6 +154,67 @@ def test_a_name_that_no_folder_can_have(name, tmp_path):
     with pytest.raises(UserError):
         opened(tmp_path, name=name)
     assert not list(tmp_path.rglob("*.yaml"))
+
+
+def test_a_resumed_run_lists_its_parts(tmp_path, monkeypatch):
+    """Killed, stopped, done: each part has its clock and code; start is the first, the clock their sum."""
+    monkeypatch.setattr("r2s.runs.NOTE_S", 0.0)
+    run = opened(tmp_path)
+    run.log("metrics", {"env_steps": 1})
+    os.close(run._lock)  # as the system does when a process is killed
+    config = (run.folder / "config.yaml").read_bytes()
+    first = json.loads((run.folder / "meta.json").read_text())
+    with pytest.raises(KeyboardInterrupt), opened(tmp_path, resume=run.folder, config="other: 1\n"):
+        raise KeyboardInterrupt
+    with opened(tmp_path, resume=run.folder, threads=2):
+        pass
+    meta = json.loads((run.folder / "meta.json").read_text())
+    assert [p["status"] for p in meta["parts"]] == ["killed", "stopped", "done"]
+    assert [p["threads"] for p in meta["parts"]] == [1, 1, 2]
+    assert all(p[key] == meta[key] for p in meta["parts"] for key in ("git", "machine", "packages"))
+    assert meta["start"] == first["start"] == meta["parts"][0]["start"]
+    assert meta["parts"][0]["wall_clock_s"] == first["wall_clock_s"] > 0
+    assert meta["wall_clock_s"] == pytest.approx(sum(p["wall_clock_s"] for p in meta["parts"]), abs=2e-3)
+    assert (run.folder / "config.yaml").read_bytes() == config
+
+
+def test_every_file_that_a_training_reads_has_its_digest(tmp_path):
+    """Robot, tool, calibration; of a resumed training its own copy counts, so the calibration may be gone."""
+    identified, robot, tool = tmp_path / "arm", tmp_path / "arm.xml", tmp_path / "tool.json"
+    identified.mkdir()
+    for path in (identified / "parameters.yaml", identified / "posterior.npz", robot, tool):
+        path.write_text(path.name)
+    words = [f"root={tmp_path}", "name=a", f"calibration={identified}", f"robot.mjcf={robot}", f"robot.tool={tool}"]
+    cfg = composed(*words)
+    with open_run(cfg, words) as run:
+        (run.folder / "parameters.yaml").write_text("a copy")
+    meta = json.loads((run.folder / "meta.json").read_text())
+    expected = {str(p): sha256(p) for p in (robot, tool, *identified.iterdir())}
+    assert meta["inputs"] == expected
+    assert meta["parents"] == [str(identified)]
+    shutil.rmtree(identified)
+    cfg.resume = str(run.folder)
+    with open_run(cfg, words) as run:
+        pass
+    again = json.loads((run.folder / "meta.json").read_text())
+    assert (again["inputs"], again["parents"]) == (expected, [str(identified)])
+    robot.write_text("another arm")
+    with pytest.raises(UserError, match=r"resume: .*arm.xml has changed since"):
+        open_run(cfg, words)
+
+
+def composed(*words):
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return compose("config", list(words))
+
+
+def test_a_changed_default_is_a_changed_setting(tmp_path):
+    """Nothing was typed, and yet the saved config differs; where a run is and on how many cores does not count."""
+    saved, now = composed("algo.lr=1e-3"), composed("algo.lr=2e-3", "name=b", "root=other", "threads=3")
+    assert differing(saved, now) == ["algo.lr was 0.001, is 0.002"]
+    del saved["safety"]
+    assert differing(saved, now)[1].startswith("safety.force_max was not there, is None")
+    assert differing(now, now) == []
 
 
 def test_rewinding_keeps_what_was_whole_as_it_was_written(tmp_path):

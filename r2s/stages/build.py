@@ -250,14 +250,21 @@ def make_controller(cfg, robot, task, dynamics):
 
 
 def open_run(cfg, overrides, inputs=(), parents=()):
-    """Return the open run folder of this job, with its trackers started; a resumed run keeps its group."""
+    """Return the open run folder of this job, with its trackers started; a resumed run keeps its group.
+
+    inputs: files that it reads. parents: run folders that it starts from; both beside those that the config names.
+    """
     from omegaconf import OmegaConf
 
     from r2s.runs import Job, Run
+    from r2s.stages.inputs import files_of, parents_of
 
     trackers = {k: part(node, f"tracker.{k}") for k, node in (cfg.get("tracker") or {}).items() if node}
     config = OmegaConf.to_yaml(cfg)
-    job = Job(cfg.stage, cfg.name, config, list(overrides), cfg.seed, cfg.threads, inputs, parents)
+    parents = list(dict.fromkeys([*map(str, parents), *parents_of(cfg)]))
+    inputs = [*inputs, *files_of(cfg, parents)]
+    how = {"inputs": inputs, "parents": parents, "device": cfg.get("device", "cpu")}
+    job = Job(cfg.stage, cfg.name, config, list(overrides), cfg.seed, cfg.threads, **how)
     run = Run(Path(cfg.root), job, resume=cfg.resume, exact_name=cfg.skip_completed)
     if not trackers:
         return run

@@ -49,8 +49,7 @@ def estimate(cfg, overrides):
         dynamics = with_declared_payload(cfg, robot, dynamics)
     surface = identified_surface(cfg, robot)
     inputs = [str(located(cfg.data.path))] if recording is not None else []
-    parents = [str(cfg.calibration)] if cfg.calibration else []
-    with open_run(cfg, overrides, inputs, parents=parents) as run:
+    with open_run(cfg, overrides, inputs) as run:
         if recording is None:
             recording = record_arm(cfg, robot)
             recording.save(run.folder / "recording.npz")

@@ -90,7 +90,7 @@ def identify_only_contact(cfg, overrides):
     robot = make_robot(cfg)
     data = contact_data(cfg, robot, file_data(cfg, cfg.data.contact))
     arm = calibrated_arm(cfg, robot)
-    with open_run(cfg, overrides, data.files, parents=[str(cfg.calibration)]) as run:
+    with open_run(cfg, overrides, data.files) as run:
         entry = identify_surface(cfg, run, arm, data)
         keep_calibration(cfg, run)
         run.summary({"contact": entry})

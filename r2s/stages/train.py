@@ -126,7 +126,7 @@ def train(cfg, overrides):
     if parts.env is None:
         return evaluate_reference(cfg, overrides, parts)
     algo, measures, selection = parts.algo, parts.task.measure_table, Selection(parts.task)
-    with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
+    with open_run(cfg, overrides) as run:
         keep_calibration(cfg, run.folder)
         write_measures(run.folder, measures)
         progress = Progress(f"train {cfg.algo.name}")
@@ -224,7 +224,7 @@ def evaluate_reference(cfg, overrides, parts):
 
     robot, task, name = parts.robot, parts.task, cfg.algo.name
     evaluate = make_evaluation(robot, task, parts.draw, episodes=parts.episodes, nthread=cfg.threads)
-    with open_run(cfg, overrides, parents=[cfg.calibration] if cfg.calibration else []) as run:
+    with open_run(cfg, overrides) as run:
         keep_calibration(cfg, run.folder)
         write_measures(run.folder, task.measure_table)
         done = evaluate(parts.algo)

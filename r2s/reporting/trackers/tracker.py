@@ -9,8 +9,8 @@ from threading import Lock
 from typing import Any, Protocol
 
 from r2s.errors import UserError
+from r2s.files import write_json
 from r2s.reporting.measures import measures_of
-from r2s.runs import write_json
 from r2s.tasks.measures import MeasureTable
 
 FILE = "trackers.json"  # in the run folder: ids that a resumed run continues

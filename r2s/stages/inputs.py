@@ -1,0 +1,36 @@
+"""Files that a job reads, whose SHA-256 its meta.json keeps, and the run folders that it starts from."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from r2s.files import OWN
+
+PARENTS = ("calibration", "policy", "adapt.calibration", "estimate.surface")  # config keys that name a run folder
+FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; those of the package belong to its commit
+# of a run folder, what another job may read
+READ = (
+    *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
+    *("parameters.yaml", "posterior.npz", "contact.yaml", "contact_posterior.npz", "policy.pt", "timing.csv"),
+    *("train.npz", "validation.npz", "ramps.npz", "episodes_*"),
+)
+
+
+def parents_of(cfg) -> list[str]:
+    """Return the run folders (or parameter files) that a config names."""
+    from omegaconf import OmegaConf
+
+    copied = cfg.resume and (Path(cfg.resume) / "parameters.yaml").is_file()  # a resumed training reads its own copy
+    keys = [key for key in PARENTS if not (copied and key == "calibration")]
+    return [str(value) for key in keys if (value := OmegaConf.select(cfg, key))]
+
+
+def files_of(cfg, parents: Iterable[str]) -> list[Path]:
+    """Return the files of a config's robot and of `parents`, run folders or parameter files."""
+    from omegaconf import OmegaConf
+
+    named = [str(value) for key in FILES if (value := OmegaConf.select(cfg, key))]
+    found = [Path(name) for name in named if not name.startswith(OWN)]
+    for parent in map(Path, parents):
+        file = [parent, parent.with_name("posterior.npz")]
+        found += [path for name in READ for path in sorted(parent.glob(name))] if parent.is_dir() else file
+    return [path for path in found if path.is_file()]
