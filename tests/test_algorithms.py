@@ -4,12 +4,14 @@ tests/test_tqc.py holds what is TQC's own, and the helpers for batches and Torch
 """
 
 import copy
+import re
 from dataclasses import fields
 from functools import partial
 
 import pytest
 import torch
-from conftest import conf
+import yaml
+from conftest import ROOT, conf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_tqc import HIDDEN, B, D, N, as_tensordict, critic_parts, in_si, make_batch, unbatch
@@ -30,6 +32,7 @@ from r2s.learning.train import Loop
 from r2s.stages.parts import arguments
 from r2s.tasks.reach import ReachTask
 
+PAGE = ROOT / "docs" / "reference" / "algorithms.md"
 ALL = (DDPG, TD3, SAC, TQC)
 NEAR = {"rtol": 1e-5, "atol": 1e-5}
 
@@ -492,3 +495,32 @@ def test_the_committed_settings_are_the_constructors(kind):
     positional = {"self", "scale", "action_scale", "critics"}
     assert set(own) == arguments(kind).keys() - positional
     kind((torch.zeros(D), torch.ones(D)), torch.ones(N), **own)
+
+
+def test_what_algorithms_share_lives_in_one_file():
+    """No learner's yaml has a value of conf/algo/base.yaml, and the loop has the same defaults."""
+    base = yaml.safe_load((ROOT / "conf" / "algo" / "base.yaml").read_text())
+    for path in (ROOT / "conf" / "algo").glob("*.yaml"):
+        own = yaml.safe_load(path.read_text())
+        if "base" in own.get("defaults", []):
+            assert not own.keys() & base.keys(), path.name
+    defaults = {f.name: f.default for f in fields(Loop)}
+    assert {k: defaults[k] for k in base if k in defaults} == {k: base[k] for k in base if k in defaults}
+
+
+def test_the_page_of_algorithms_has_the_settings_of_their_files():
+    """docs/reference/algorithms.md: a cell begins with the value of conf/algo, for each key of the row."""
+    rows = [line.strip("|").split("|") for line in PAGE.read_text().splitlines() if line.startswith("|`")]
+    _, *names = (cell.strip().lower() for cell in rows[0])
+    seen = set()
+    for first, *cells in rows[1:]:
+        keys = re.findall(r"`(\w+)`", first)
+        for algo, cell in zip(names, cells, strict=True):
+            settings = conf(f"algo/{algo}")
+            if keys[0] not in settings or not cell:
+                assert not cell or (algo, cell) == ("ddpg", "1 (1)")
+                continue
+            expected = [v for k in keys for v in (settings[k] if isinstance(settings[k], list) else [settings[k]])]
+            assert [float(v) for v in cell.split(" (")[0].split(", ")] == expected, f"{algo}: {first}"
+            seen |= {(algo, k) for k in keys}
+    assert {(a, k) for a in names for k in ("gamma", "tau", "lr", "hidden", "batch_size", "n_envs")} <= seen

@@ -20,7 +20,9 @@ from r2s.errors import UserError
 from r2s.reporting.comparison.grouping import LONGEST, group
 from r2s.reporting.comparison.page import comparison_page
 from r2s.reporting.comparison.scores import (
+    at_edges,
     band,
+    held_out,
     improvement_matrix,
     improvement_table,
     sensitivity_table,
@@ -44,14 +46,14 @@ def composed(*overrides):
         return compose("config", list(overrides))
 
 
-def write_run(folder, *overrides, score=-90.0, status="done", env_steps=600_000, stage="train"):
+def write_run(folder, *overrides, score=-90.0, status="done", env_steps=600_000, stage="train", **meta):
     """Write a run folder of the real config with three evaluations that end at a return of `score`."""
     folder.mkdir(parents=True)
     cfg = composed(*(o for o in overrides if not o.startswith("seed=")))
     cfg.seed = next((int(o.removeprefix("seed=")) for o in overrides if o.startswith("seed=")), 0)
     (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     (folder / "overrides.yaml").write_text("".join(f"- {json.dumps(o)}\n" for o in overrides) or "[]\n")
-    (folder / "meta.json").write_text(json.dumps({"status": status, "stage": stage}))
+    (folder / "meta.json").write_text(json.dumps({"status": status, "stage": stage} | meta))
     rows = [1, 2, 3] if env_steps else [1]
     at = np.array([env_steps // 3 * k for k in rows])
     table = {"env_steps": at, "updates": at // 32, "wall_clock_s": [5.0 * k + cfg.seed * (k == 3) for k in rows]}
@@ -173,6 +175,34 @@ def test_runs_that_are_not_comparable_are_listed_with_a_reason(user_folder):
     assert comparable([r for r in trained if r.toy])[1] == {}
 
 
+def test_one_commit_and_one_machine_or_set_apart(tmp_path):
+    """The reason names both values; a run that other code resumed is of neither; a repeated seed counts once."""
+    git, other = {"commit": "a" * 40, "dirty": False}, {"commit": "b" * 40, "dirty": False}
+    here = {"git": git, "machine": {"cpu": "Xeon", "cores": 2}, "threads": 1, "device": "cpu"}
+    part = here | {"start": "", "wall_clock_s": 1.0, "status": "killed", "process": {}, "packages": {}}
+    for seed in range(3):
+        write_run(tmp_path / f"a{seed}", f"seed={seed}", **here)
+    write_run(tmp_path / "again", "seed=2", **here)
+    write_run(tmp_path / "changed", "seed=3", **here | {"git": git | {"dirty": True}})
+    write_run(tmp_path / "newer", "seed=4", **here | {"git": other})
+    write_run(tmp_path / "both", "seed=5", **here, parts=[part, part | {"git": other}])
+    write_run(tmp_path / "faster", "seed=6", **here | {"machine": {"cpu": "Epyc", "cores": 2}})
+    write_run(tmp_path / "wider", "seed=7", **here | {"threads": 2})
+    write_run(tmp_path / "gpu", "seed=8", **here | {"device": "cuda"})
+    write_run(tmp_path / "oracle", "algo=oracle", env_steps=0, **here | {"threads": 2})
+    runs, apart = comparable(read_trainings(sorted(tmp_path.iterdir()))[0])
+    assert [r.folder.name for r in runs] == ["a0", "a1", "a2", "oracle"]
+    assert apart == {
+        "again": "seed 2 again, as a2",
+        "changed": "another commit: aaaaaaaa with changes, not aaaaaaaa",
+        "newer": "another commit: bbbbbbbb, not aaaaaaaa",
+        "both": "another commit: aaaaaaaa and bbbbbbbb, not aaaaaaaa",
+        "faster": "another machine: Epyc, not Xeon",
+        "wider": "other threads: 2, not 1",
+        "gpu": "another device: cuda, not cpu",
+    }
+
+
 def test_a_training_whose_arms_were_stopped_is_compared(tmp_path):
     """Its distance is infinite, null in a summary, in some evaluations or in all; other measures are as they are."""
     for name, at in {"early": 0, "always": slice(None), "never": []}.items():
@@ -268,11 +298,48 @@ def test_nothing_finished_is_one_line(tmp_path):
 
 
 def test_the_interquartile_mean_leaves_a_quarter_out_on_each_side():
-    """By hand: whole values, and the values at the edge in part; constants stay, order does not matter."""
+    """As rliable: a quarter is rounded down; constants stay, order does not matter."""
     assert interquartile_mean(np.array([9.0, 1.0, 2.0, 100.0])) == pytest.approx(5.5)
-    assert interquartile_mean(np.array([0.0, 1.0, 2.0, 3.0, 50.0])) == pytest.approx((0.75 * 1 + 2 + 0.75 * 3) / 2.5)
+    assert interquartile_mean(np.array([0.0, 1.0, 2.0, 3.0, 50.0])) == pytest.approx(2.0)
+    assert interquartile_mean(np.array([0.0, 1.0, 5.0])) == pytest.approx(2.0)
+    assert interquartile_mean(np.array([0.0, 1.0, 2.0, np.inf])) == pytest.approx(1.5)
     assert interquartile_mean(np.full((2, 3), 7.0)) == pytest.approx([7.0, 7.0])
     assert interquartile_mean(np.array([4.0])) == 4.0
+
+
+def test_one_seed_has_no_interval(runs):
+    """Neither a score nor a difference, nor the loss from best to median setting."""
+    one = group([r for r in runs if r.seed == 0]).members
+    assert summary_table(one)[["low", "high"]].isna().all(axis=None)
+    assert improvement_table(one)[["low", "high"]].isna().all(axis=None)
+    row = sensitivity_table(one).iloc[0]
+    assert row["best"] == -80.0
+    assert row[["held_out", "spread", "low", "high"]].isna().all()
+
+
+def test_a_winner_by_chance_is_no_better_on_a_held_out_seed():
+    """Of 12 equal settings of 3 seeds the best beats the median by more than a standard error; held out it does not.
+
+    The mean over 200 repetitions of the held-out spread is 0 within 4 standard errors, of unit normal scores.
+    """
+    rng, chosen, unseen = np.random.default_rng(0), [], []
+    for _ in range(200):
+        x = rng.normal(size=(12, 3))
+        means = x.mean(1)
+        chosen.append(means.max() - np.median(means))
+        winner, median = held_out([dict(enumerate(row)) for row in x])
+        unseen.append((winner - median).mean())
+    assert np.mean(chosen) > 3**-0.5
+    assert abs(np.mean(unseen)) < 4 * np.std(unseen) / 200**0.5
+
+
+def test_winners_at_the_edge_of_what_was_tried_are_named(tmp_path):
+    """The best of three learning rates is the largest: a line; one between two others, or of two: none."""
+    for k, (lr, batch) in enumerate([("5e-4", 256), ("1e-3", 256), ("2e-3", 128)]):
+        write_run(tmp_path / f"up{k}", f"algo.lr={lr}", f"algo.batch_size={batch}", score=-90.0 + k)
+        write_run(tmp_path / f"mid{k}", "algo=td3", f"algo.lr={lr}", score=-90.0 - abs(k - 1))
+    lines = at_edges(group(read_trainings(sorted(tmp_path.iterdir()))[0]).members)
+    assert lines == ["best setting of tqc: algo.lr=0.002 is the largest tried; a better one may lie beyond"]
 
 
 def test_the_interval_holds_the_mean_as_often_as_it_says():

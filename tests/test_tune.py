@@ -12,11 +12,13 @@ import pandas as pd
 import pytest
 import yaml
 from conftest import ROOT
+from hydra import compose, initialize_config_dir
 
 from r2s.errors import UserError
 from r2s.reporting.tuning import against_table, best_so_far
 from r2s.runs import Job, Run
-from r2s.stages.tune import TrialRun, Tune, corners, follow, parse_range, suggest
+from r2s.stages.build import CONF
+from r2s.stages.tune import TrialRun, Tune, at_edges, corners, follow, parse_range, suggest
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
 TOY = ["+experiment=[tune,toy]", "budget.env_steps=4000", "evaluation.env_steps=800", "algo.learning_starts=320"]
@@ -118,6 +120,35 @@ def test_corners_hold_every_value_and_both_ends():
     assert corners(space) == [first, first | {"algo": "sac"}, first | {"algo.lr": 1e-2}]
 
 
+def test_the_best_at_an_edge_is_named():
+    """Ends of ranges, by their scale, and of lists of numbers; algorithms have no order."""
+    space = {"algo": ["a", "b", "c"], "algo.lr": "log(1e-4, 1e-2)", "x": [1, 2, 3], "y": "interval(0, 1)"}
+    best = {"algo": "a", "algo.lr": 9e-3, "x": 1, "y": 0.06}
+    ends = at_edges(best, space)
+    assert [line.split(": ")[1].split(";")[0] for line in ends] == [
+        "algo.lr=0.009 is the largest tried",
+        "x=1 is the smallest tried",
+    ]
+    assert at_edges(best | {"algo.lr": 5e-3, "x": 2}, space) == []
+
+
+def test_defaults_lie_inside_the_grid_and_the_space():
+    """Of every algorithm and every number that they search, so that a winner may lie on either side of it."""
+    grid = yaml.safe_load((ROOT / "conf" / "experiment" / "paper_grid.yaml").read_text())["grid"]
+    for algo in grid.pop("algo").split(","):
+        with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+            default = compose("config", [f"algo={algo}"]).algo
+        axes = [(key, [float(v) for v in str(values).split(",")]) for key, values in grid.items() if key != "seed"]
+        for key, axis in TUNE["space"].items():
+            if key != "algo":
+                axes.append(
+                    (key.removeprefix("algo."), axis if isinstance(axis, list) else parse_range(key, axis)[:2])
+                )
+        for key, values in axes:
+            inside = min(values) < default[key] < max(values)
+            assert inside or set(values) == {default[key]}, f"{algo}: {key}={default[key]}, searched {values}"
+
+
 def test_suggestions_lie_in_the_space():
     """An unfinished trial gets the same settings again."""
     optuna = pytest.importorskip("optuna")
@@ -127,8 +158,8 @@ def test_suggestions_lie_in_the_space():
         trial = study.ask()
         drawn = suggest(trial, TUNE["space"])
         assert drawn["algo"] in ("ddpg", "sac", "td3", "tqc")
-        assert 2e-4 <= drawn["algo.lr"] <= 1e-3
-        assert 0.95 <= drawn["algo.gamma"] <= 0.98
+        assert 5e-4 <= drawn["algo.lr"] <= 4e-3
+        assert 0.95 <= drawn["algo.gamma"] <= 0.99
         assert suggest(optuna.trial.Trial(study, trial._trial_id), TUNE["space"]) == drawn
 
 

@@ -63,6 +63,12 @@ def _result(folder: Path, meta: Mapping[str, Any]) -> str:
 
 
 def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
+    if stage == "tune":
+        number = sum(summary["trials"].values())
+        return f"best of {number} trials: {summary['best']['value']:.4g}"
+    if stage == "identify" and "validation" not in summary:
+        found = summary["contact"]
+        return f"surface {found['slope_N_per_m']:.3g} N/m, friction {found['friction']:.2g}"
     if stage == "identify":
         side = summary["validation"]
         after, before = (float(np.mean(side[k])) for k in ("torque_rmse_Nm", "nominal_torque_rmse_Nm"))

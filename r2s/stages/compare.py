@@ -41,6 +41,7 @@ def compare_trainings(cfg, overrides, trained, others):
     """Write tables with intervals over seeds, and learning curves."""
     from r2s.reporting.comparison.grouping import group
     from r2s.reporting.comparison.page import comparison_page
+    from r2s.reporting.comparison.scores import at_edges
     from r2s.reporting.comparison.trainings import by_reason, comparable
     from r2s.reporting.tables import print_table, scores_rows
 
@@ -53,6 +54,7 @@ def compare_trainings(cfg, overrides, trained, others):
         out = console()
         print_table(out, scores_rows(runs[0].measures, tables["scores"]), title)
         print_lines(out, [f"{label} = {name}" for label, name in grouped.key.items()])
+        print_lines(out, at_edges(grouped.members))
         print_lines(out, [f"not comparable with these: {words}" for words in by_reason(apart)])
         print_lines(out, [f"no finished trainings: {'; '.join(by_reason(others))}"] if others else [])
         print_lines(out, [HINT] if "stage=transfer" in others.values() else [])

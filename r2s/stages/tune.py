@@ -1,6 +1,7 @@
 """stage=tune: search the settings of a training with Optuna; each trial is a run folder of stage=train."""
 
 import csv
+import math
 import os
 import re
 import signal
@@ -21,6 +22,7 @@ from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
 MOST_STARTS = 3  # of a training that the system ends, for example because memory is short
 POLL_S = 0.2
+EDGE = 0.05  # share of a range at each end that counts as its edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
 
@@ -103,6 +105,22 @@ def corners(space: Mapping[str, Any]) -> list[dict[str, Any]]:
     values = {key: axis if isinstance(axis, list) else [*parse_range(key, axis)[:2]] for key, axis in space.items()}
     first = {key: own[0] for key, own in values.items()}
     return [first, *({**first, key: value} for key, own in values.items() for value in own[1:])]
+
+
+def at_edges(best: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
+    """Return a line per number of the best trial at an edge: the last `EDGE` of a range, or an end of a list."""
+    from r2s.reporting.comparison.scores import edge, is_number
+
+    lines = []
+    for key, axis in space.items():
+        if isinstance(axis, list) and (len(axis) < 3 or not all(map(is_number, axis))):
+            continue
+        low, high, log = (min(axis), max(axis), False) if isinstance(axis, list) else parse_range(key, axis)
+        scale = math.log if log else float
+        share = (scale(best[key]) - scale(low)) / (scale(high) - scale(low))
+        if not EDGE <= share <= 1 - EDGE:
+            lines.append(edge("best trial", key, best[key], share > 0.5))
+    return lines
 
 
 def training_words(cfg, overrides, settings):
@@ -256,6 +274,7 @@ def tune(cfg, overrides):
     except ImportError:
         raise UserError("stage=tune needs optuna, which is not installed: pip install 'r2s[tune]'") from None
     from r2s.reporting.tuning import against_table, trials_table, tuning_page
+    from r2s.runs import read_summary
 
     given = {k: v for k, v in plain(cfg.tune).items() if k in {f.name for f in fields(Tune)}}
     how = called(Tune, "tune", given)
@@ -277,11 +296,22 @@ def tune(cfg, overrides):
         if done.empty:
             raise UserError(f"tune: no trial of {len(trials)} is complete")
         best = done.sort_values("value", key=lambda values: measure.sign * values).iloc[-1]
-        run.summary({"best": best.to_dict(), "trials": trials["state"].value_counts().to_dict()})
+        # the value is the best of many on goals that chose it; these goals chose nothing
+        last = read_summary(Path(cfg.root) / "train" / f"{run.folder.name}_{int(best['trial'])}", "tune")["last"]
+        counts = trials["state"].value_counts().to_dict()
+        run.summary({"best": best.to_dict() | {"unseen": last[how.measure]}, "trials": counts})
         tuning_page(run, trials, against, how.measure)
     settings = " ".join(f"{k}={best[k]}" for k in how.space if k in best.index)
-    line = f"best of {len(trials)} trials: {how.measure} {best['value']:.4g} with {settings}"
-    console().print(line, highlight=False)
+    unseen = f"{last[how.measure]:.4g} on goals that chose nothing"
+    line = f"best of {len(trials)} trials: {how.measure} {best['value']:.4g}, {unseen}, with {settings}"
+    seeds = ",".join(str(cfg.seed + k) for k in range(1, 4))
+    lines = [
+        line,
+        *at_edges(best, how.space),
+        f"its seed chose it: confirm with python run.py -m {settings} seed={seeds}",
+    ]
+    for line in lines:
+        console().print(line, highlight=False, markup=False, soft_wrap=True)
     print(f"written: {run.folder} (report: {run.folder / 'report.md'})")
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 from r2s.physics.robot import Robot
 from r2s.reporting.comparison.grouping import Groups
 from r2s.reporting.comparison.scores import (
+    at_edges,
     band,
     improvement_matrix,
     improvement_table,
@@ -69,8 +70,8 @@ def _sections(
     count, measures = sum(map(len, grouped.members.values())), measures_in(grouped.members)
     sections: dict[str, Sequence[Item]] = {
         f"{count} runs in {len(grouped.members)} groups, last evaluation": [
-            "Interquartile mean over seeds with a 95 % bootstrap interval. A group is named by the overrides that "
-            "differ; all other settings are default.",
+            "Interquartile mean over seeds (the mean of fewer than four) with a 95 % bootstrap interval, none for a "
+            "single seed. A group is named by the overrides that differ; all other settings are default.",
             scores_rows(measures, tables["scores"]),
             *([[f"{label}: {name}" for label, name in grouped.key.items()]] if grouped.key else []),
         ]
@@ -83,8 +84,12 @@ def _sections(
             sections[f"{heading}: {measures[key].title}, last evaluation"] = [matrix]
     if len(tables["sensitivity"]):
         what = measures[measures.selection[-1]].title
-        table = tables["sensitivity"].round(2).astype(str).set_index("algo")
-        sections[f"Sensitivity of the last {what} to the settings (small spread: little tuning)"] = [table]
+        table = tables["sensitivity"].round(2).astype(str).replace("nan", "-").set_index("algo")
+        note = (
+            "held_out scores the best setting at seeds that did not choose it; without two seeds there is no spread."
+        )
+        section = [table, note, *([edges] if (edges := at_edges(grouped.members)) else [])]
+        sections[f"Sensitivity of the last {what} to the settings (small spread: little tuning)"] = section
     return sections
 
 

@@ -51,8 +51,10 @@ def improvement_table(grouped: Grouped) -> pd.DataFrame:
 def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFrame:
     """Return per algorithm how much a measure depends on its settings; empty if no algorithm has two settings.
 
-    best, median and worst are over settings, each the interquartile mean of its seeds. spread is best minus median,
-    with a 95 % interval that draws seeds within each setting: a small spread means little need for tuning.
+    best, median and worst are over settings, each the interquartile mean of its seeds. The seeds that choose the best
+    setting flatter it. held_out scores it without them: for each seed, the setting that is best by the other seeds,
+    at this seed; mean over seeds. spread is held_out minus the median setting at the same seed, with a 95 % interval
+    over seeds; nan with fewer than two seeds that all settings have. A small spread means little need for tuning.
 
     Args:
         grouped: trainings. measure: key; None: the last of `MeasureTable.selection`.
@@ -60,21 +62,58 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
     table = measures_in(grouped)
     rows, measure = [], measure or table.selection[-1]
     sign = table[measure].sign
-
-    def spread(drawn: list[np.ndarray]) -> np.ndarray:
-        means = sign * np.stack([interquartile_mean(x) for x in drawn])
-        return means.max(0) - np.median(means, axis=0)
-
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
-        strata = [scores(g, measure) for g in grouped.values() if g[0].algo == algo]
-        if len(strata) < 2:
+        settings = [g for g in grouped.values() if g[0].algo == algo]
+        if len(settings) < 2:
             continue
-        each = sign * np.array([interquartile_mean(x) for x in strata])
-        low, high = interval(strata, spread)
-        row = {"algo": algo, "settings": len(strata), "best": sign * each.max(), "median": sign * np.median(each)}
-        row |= {"worst": sign * each.min(), "spread": each.max() - np.median(each), "low": low, "high": high}
+        each = sign * np.array([interquartile_mean(scores(g, measure)) for g in settings])
+        row = {"algo": algo, "settings": len(settings), "best": sign * each.max(), "median": sign * np.median(each)}
+        row |= {"worst": sign * each.min()} | dict.fromkeys(("held_out", "spread", "low", "high"), np.nan)
+        seeds = held_out([{r.seed: sign * r.last[measure] for r in g} for g in settings])
+        if seeds is not None:
+            row |= {"held_out": sign * seeds[0].mean(), "spread": (seeds[0] - seeds[1]).mean()}
+            row["low"], row["high"] = interval([seeds[0] - seeds[1]], lambda d: d[0].mean(-1))
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return per held-out seed (S,) the score of the setting that the other seeds choose, and of the median setting.
+
+    Args:
+        settings: {seed: score} of each, larger is better; the seeds that all of them have count. None if these are
+            fewer than two.
+    """
+    seeds = sorted(set.intersection(*(set(s) for s in settings)))
+    if len(seeds) < 2:
+        return None
+    x = np.array([[s[seed] for seed in seeds] for s in settings])
+    chosen = [interquartile_mean(np.delete(x, k, axis=1)).argmax() for k in range(len(seeds))]
+    return x[chosen, range(len(seeds))], np.median(x, axis=0)
+
+
+def at_edges(grouped: Grouped) -> list[str]:
+    """Return a line per setting whose best value is the smallest or largest of three or more that were tried."""
+    table, lines = measures_in(grouped), []
+    by = table[table.selection[-1]]
+    for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
+        settings = [g for g in grouped.values() if g[0].algo == algo]
+        best = max(settings, key=lambda g: by.sign * float(interquartile_mean(scores(g, by.key))))[0].settings
+        for key, value in best.items():
+            tried = {g[0].settings.get(key) for g in settings if is_number(g[0].settings.get(key))}
+            if len(tried) > 2 and value in (min(tried), max(tried)):
+                lines.append(edge(f"best setting of {algo}", key, value, value == max(tried)))
+    return lines
+
+
+def edge(what: str, key: str, value: float, largest: bool) -> str:
+    """Return the line of a winner at the edge of what was tried."""
+    return f"{what}: {key}={value:g} is the {'largest' if largest else 'smallest'} tried; a better one may lie beyond"
+
+
+def is_number(value: object) -> bool:
+    """Return whether a setting is a number and no switch."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:

@@ -6,6 +6,7 @@ Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistic
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.stats import trim_mean
 
 DRAWS = 2000  # of a bootstrap, as in Agarwal et al.
 
@@ -13,22 +14,22 @@ DRAWS = 2000  # of a bootstrap, as in Agarwal et al.
 def interquartile_mean(x: np.ndarray) -> np.ndarray:
     """Return the mean over the last axis of x (..., S) without the lowest and the highest quarter.
 
-    If a quarter is no whole number of values, the value at its edge counts in part.
+    A quarter is S / 4 rounded down, as in rliable: with fewer than four values this is the mean.
     """
-    x, s = np.sort(x, axis=-1), x.shape[-1]
-    weight = np.clip(np.minimum(np.arange(1, s + 1) - s / 4, s - s / 4 - np.arange(s)), 0.0, 1.0)
-    return np.where(weight > 0, x, 0.0) @ (weight / weight.sum())  # 0 x inf would be nan
+    return np.asarray(trim_mean(x, 0.25, axis=-1))
 
 
 def interval(
     strata: Sequence[np.ndarray], statistic: Callable[[list[np.ndarray]], np.ndarray], seed: int = 0
 ) -> tuple[float, float]:
-    """Return the 95 % interval of a statistic by a stratified bootstrap.
+    """Return the 95 % interval of a statistic by a stratified bootstrap; nan if a stratum has one score only.
 
     Args:
         strata: arrays (S,), a score per seed. seed: of the bootstrap.
         statistic: maps the draws (D, S) of each stratum to (D,).
     """
+    if min(map(len, strata)) < 2:
+        return np.nan, np.nan
     rng = np.random.default_rng(seed)
     drawn = [x[rng.integers(len(x), size=(DRAWS, len(x)))] for x in strata]
     found, levels = statistic(drawn), [0.025, 0.975]

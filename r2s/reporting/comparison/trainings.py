@@ -13,11 +13,15 @@ import yaml
 from r2s.errors import UserError
 from r2s.reporting.measures import measures_of
 from r2s.reporting.trackers.tracker import flat
+from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
 # config groups that a training reads, beside its seed; runs with equal values are seeds of one group
 READ = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward", "costs")
 ALIKE = ("robot", "task")  # config groups that comparable runs share
+# where a run came from, which comparable runs share: code changes what is learned, a machine how much in a minute
+ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
+ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
 MOST_BUDGETS = 2.0  # largest ratio of two comparable budgets: beyond it the longer training wins by its length
 CONTROLLERS = ("oracle", "computed_torque")  # model-based, not trained
@@ -32,6 +36,7 @@ class Trained:
         folder, seed, algo: of the run.
         settings: values that it used: {"algo.lr": 5e-4, "dr.phi_relative": 0.1, ...}.
         alike: values that comparable runs share: {"task.ctrl_hz": 50, ..., "evaluation.episodes": 200}.
+        origin: commit, machine, threads and device, None where meta.json has none; of a controller the commit only.
         typed: overrides of its settings: {"dr": "paper", "algo.lr": "5e-4"}.
         toy: whether it ran with +experiment=toy, which is too short to learn.
         minutes: its budget, None if the budget is in env_steps.
@@ -44,6 +49,7 @@ class Trained:
     algo: str
     settings: dict[str, Any]
     alike: dict[str, Any]
+    origin: dict[str, Any]
     typed: dict[str, str]
     toy: bool
     minutes: float | None
@@ -79,7 +85,7 @@ def trainings_among(folders: Sequence[str | Path]) -> tuple[list[Trained], dict[
             continue
         try:
             trained.append(_read(folder))
-        except (KeyError, TypeError, ValueError, yaml.YAMLError):  # a file edited by hand
+        except (KeyError, TypeError, ValueError, AttributeError, UserError, yaml.YAMLError):  # a file edited by hand
             others[folder.name] = "unreadable"
     return trained, others
 
@@ -119,12 +125,14 @@ def _read(folder: Path) -> Trained:
     measures = measures_of(folder)
     curve, last = _evaluations(folder, measures)
     alike = settings_in(config, ALIKE)
+    origin = _origin(folder)
     return Trained(
         folder,
         int(config["seed"]),
         name,
         settings_in(config, read),
         alike | {"evaluation.episodes": config.get("evaluation", {}).get("episodes")},
+        {"commit": origin["commit"]} if name in CONTROLLERS else origin,
         typed,
         typed.get("experiment") == "toy",
         None if budget.get("env_steps") else budget.get("minutes"),
@@ -132,6 +140,18 @@ def _read(folder: Path) -> Trained:
         curve,
         last,
     )
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    """Return commit, machine, threads and device of a run; of a resumed one the values of all its parts."""
+    found: dict[str, set[str]] = {key: set() for key in ORIGIN}
+    for part in parts_of(json.loads((folder / "meta.json").read_text())):
+        git, machine = part["git"] or {}, part["machine"] or {}
+        commit = f"{git['commit'][:8]}{' with changes' * bool(git.get('dirty'))}" if git.get("commit") else None
+        seen = {"commit": commit, **{k: machine.get(k) for k in ("cpu", "cores", "gpus")}}
+        for key, value in (seen | {k: part[k] for k in ("threads", "device")}).items():
+            found[key] |= {str(value)} if value else set()
+    return {key: " and ".join(sorted(values)) or None for key, values in found.items()}
 
 
 def settings_in(config: Mapping[str, Any], groups: Container[str]) -> dict[str, Any]:
@@ -166,8 +186,9 @@ def _evaluations(folder: Path, measures: MeasureTable) -> tuple[pd.DataFrame, di
 def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str]]:
     """Return the largest set of comparable runs, and {name: reason} of the others.
 
-    Runs are comparable if robot, task and evaluation agree and budgets differ by at most the factor `MOST_BUDGETS`.
-    Of two sets of equal size the one without toys wins, then the one with more env steps.
+    Runs are comparable if robot, task, evaluation, commit and machine agree and budgets differ by at most the factor
+    `MOST_BUDGETS`. Of two sets of equal size the one without toys wins, then the one with more env steps. Of two runs
+    with equal settings and seed the first counts: the second adds no evidence.
     """
     learned = [r for r in trained if r.learned] or list(trained)
 
@@ -177,6 +198,11 @@ def comparable(trained: Sequence[Trained]) -> tuple[list[Trained], dict[str, str
 
     first = max(learned, key=size)
     apart = {r.folder.name: why for r in trained if (why := _difference(r, first))}
+    seeds: dict[str, str] = {}
+    for run in (r for r in trained if r.folder.name not in apart):
+        key = repr((run.algo, run.seed, sorted(run.settings.items(), key=lambda item: item[0])))
+        if seeds.setdefault(key, run.folder.name) != run.folder.name:
+            apart[run.folder.name] = f"seed {run.seed} again, as {seeds[key]}"
     return [r for r in trained if r.folder.name not in apart], apart
 
 
@@ -189,6 +215,9 @@ def _difference(run: Trained, first: Trained) -> str:
         part = {"robot": "another robot", "task": "another task"}.get(keys[0].split(".")[0], "another evaluation")
         values = f"{run.alike.get(keys[0])}, not {first.alike.get(keys[0])}"
         return f"{part}: {keys[0]}" + (f" is {values}" if len(values) <= 40 else " differs")
+    for key in run.origin.keys() & first.origin.keys():
+        if run.origin[key] != first.origin[key]:
+            return f"{ORIGIN[key]}: {run.origin[key] or 'unknown'}, not {first.origin[key] or 'unknown'}"
     if not run.learned:
         return ""
     if run.minutes and first.minutes:
