@@ -1,5 +1,7 @@
 """Check the overrides of a command line before Hydra runs: a mistake is one line, with the nearest match."""
 
+import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,9 @@ RENAMED = {
     "task.residual": "control.residual, with control=computed_torque",
     "watch": "estimate",
 }
+# options of Hydra that place files, which r2s does not follow: a run folder is <root>/<stage>/<name>
+PLACES = ("hydra.sweep", "hydra.run", "hydra.output_subdir", "hydra.job.chdir")
+PLAIN = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: ]")  # what Hydra's grammar takes in a value without quotes
 EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm"}  # launcher -> extra that installs it
 
 
@@ -64,12 +69,14 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
             return [o for o in loader.get_group_options(group) if o != NO_OPTION]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
-        _check_hydra(of_hydra, own, {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")})
+        experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # one may choose a launcher
+        of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
+        _check_hydra(of_hydra, [*own, *experiments], of_groups)
         try:
-            names, jobs = _jobs(words, own, groups)
+            names, jobs = _jobs(words, own, groups, multirun)
             configs = [compose("config", job, return_hydra_config=True) for job in jobs]
         except (HydraException, OmegaConfBaseException, UnknownOption):
-            raise _first_mistake(words, own, groups) from None
+            raise _first_mistake(words, own, groups, multirun) from None
         if not multirun and configs[0].hydra.sweeper.get("params"):
             raise UserError(f"this is a grid of jobs, and only -m runs it: python run.py -m {' '.join(words)}")
         _check_configs(configs, jobs, names, groups)
@@ -102,12 +109,24 @@ def _check_configs(
 
 
 def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> None:
-    """Raise UserError if Hydra refuses one of its own options."""
+    """Raise UserError if Hydra refuses one of its own options, or r2s does not follow it.
+
+    own: words before them, which Hydra accepts, or the check of the other words finds the mistake.
+    """
     from hydra import compose
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    try:
+        compose("config", own, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException):
+        return
     for k, word in enumerate(words):
+        key, _, value = word.lstrip("+~").partition("=")
+        if any(key == place or key.startswith(f"{place}.") for place in PLACES):
+            raise UserError(f"{key}: a run folder is ROOT/STAGE/NAME; give root= and name= instead")
+        if key == "hydra/sweeper" and value in ("optuna", "ax", "nevergrad"):
+            raise UserError(f"{word}: r2s searches by +experiment=tune, with Optuna; leave hydra/sweeper= out")
         try:
             compose("config", [*own, *words[: k + 1]], return_hydra_config=True)
         except (HydraException, OmegaConfBaseException) as error:
@@ -123,8 +142,15 @@ class UnknownOption(Exception):  # noqa: N818 (its message is made where the opt
     """An override adds a key that nothing reads."""
 
 
-def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Return the typed keys and groups, and jobs that contain every value of each sweep at least once."""
+def _jobs(
+    words: Sequence[str], own: list[str], groups: Mapping[str, Any], multirun: bool
+) -> tuple[list[str], list[list[str]]]:
+    """Return the typed keys and groups, and jobs that contain every value of each sweep at least once.
+
+    Raises:
+        UserError: a sweep without -m, or a wrong value of a group.
+        UnknownOption, HydraException: another mistake, which `_first_mistake` names.
+    """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     names, jobs = [], [own]
@@ -135,6 +161,8 @@ def _jobs(words: Sequence[str], own: list[str], groups: Mapping[str, Any]) -> tu
             raise UnknownOption
         if not parsed.is_sweep_override() and not parsed.is_delete() and parsed.key_or_group in groups:
             check_option(parsed.key_or_group, parsed.value(), groups[parsed.key_or_group])
+        if parsed.is_sweep_override() and not multirun:
+            raise UserError(f"{word}: several values make a sweep, which only -m runs; {quoted(word)} is one value")
         values = list(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else [None]
         trials = [word if v is None else f"{word.split('=', 1)[0]}={v}" for v in values]
         first = jobs[0]
@@ -163,7 +191,7 @@ def check_option(group: str, value: Any, options: Sequence[str]) -> None:
         raise UserError(f"{group}: expected one of {choices(options)}, got {value}")
 
 
-def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]]) -> UserError:
+def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[str]], multirun: bool) -> UserError:
     """Return the error of the first override that Hydra refuses after those before it."""
     from hydra import compose
     from hydra.errors import HydraException
@@ -173,7 +201,7 @@ def _first_mistake(words: Sequence[str], own: list[str], groups: dict[str, list[
     for k, word in enumerate(words):
         job = [word]
         try:
-            names, jobs = _jobs(words[: k + 1], own, groups)
+            names, jobs = _jobs(words[: k + 1], own, groups, multirun)
             for job in jobs:
                 cfg = compose("config", job)
         except UnknownOption:
@@ -209,6 +237,8 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
     """Return the error of an override that Hydra refuses with `error`."""
+    from hydra.errors import OverrideParseException
+
     if "=" not in word:
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)
@@ -222,4 +252,14 @@ def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: S
             )
     if bare not in known:
         return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
+    special = PLAIN.sub("", value)
+    if isinstance(error, OverrideParseException) and special and value[0] not in "[{\"'":
+        return UserError(f"{bare}: a value with {special[0]} needs quotes: {quoted(word)}")
     return UserError(f"{word}: {' '.join(str(error).split())}")
+
+
+def quoted(word: str) -> str:
+    """Return an override as a shell needs it for its value to be one string: 'data.path="a=b.csv"'."""
+    key, _, value = word.partition("=")
+    inner = value.replace("\\", "\\\\").replace('"', '\\"')
+    return shlex.quote(f'{key}="{inner}"')

@@ -28,6 +28,7 @@ from conftest import REAL, ROOT, conf, in_blocks
 
 from r2s.arm.clients import fr3_limits
 from r2s.engines.gazebo import RELEASES
+from r2s.override_checks import check_overrides, quoted
 from r2s.physics.robot import load_robot
 from r2s.stages import pipeline
 from r2s.stages.transfer import rest_warning
@@ -442,6 +443,15 @@ MISTAKES = {
     "-m seed=0,1 hydra/launcher=jobib": r"hydra/launcher: no option 'jobib'.*did you mean 'joblib'",
     "-m seed=0,1 hydra/launher=joblib": r"unknown option 'hydra/launher'; did you mean 'hydra/launcher'",
     "-m seed=0,1 hydra/launcher=joblib hydra.launcher.n_job=2": r"launcher.n_job'.*mean 'hydra.launcher.n_jobs'",
+    "-m seed=0,1 hydra.sweep.dir=elsewhere": r"hydra.sweep.dir: a run folder is ROOT/STAGE/NAME; give root= and",
+    "hydra.run.dir=elsewhere": r"hydra.run.dir: a run folder is ROOT/STAGE/NAME",
+    "-m seed=0,1 hydra/sweeper=optuna": r"hydra/sweeper=optuna: r2s searches by \+experiment=tune",
+    "-m +experiment=paper_grid hydra.launcher.n_job=2": r"launcher.n_job'.*mean 'hydra.launcher.n_jobs'",
+    "seed=0,1": r"seed=0,1: several values make a sweep, which only -m runs; 'seed=\"0,1\"' is one value$",
+    "data.path=a=b.csv": r"""data.path: a value with = needs quotes: 'data.path="a=b.csv"'$""",
+    "data.path=a#b.csv": r"""data.path: a value with # needs quotes: 'data.path="a#b.csv"'$""",
+    "data.path=a(b.csv": r"""data.path: a value with \( needs quotes: 'data.path="a\(b.csv"'$""",
+    "data.path=a[b.csv": r"""data.path: a value with \[ needs quotes: 'data.path="a\[b.csv"'$""",
     "stage=watch": r"stage=watch is now stage=estimate$",
     "stage=estimate watch.every_s=2": r"watch.every_s is now estimate.every_s$",
     "arm.make=2 stage=identify": r"arm.make=2 is now arm.variant=elastic$",
@@ -460,6 +470,13 @@ MISTAKES = {
     "task=track task.residual=0.2": r"task.residual is now control.residual, with control=computed_torque$",
     "task.bandwidth=3": r"task.bandwidth is now control.bandwidth, with control=computed_torque$",
 }
+
+
+def test_options_of_the_launcher_that_an_experiment_chose():
+    """They are known, and what the lines above say to type is taken."""
+    check_overrides(["+experiment=paper_grid", "hydra.launcher.n_jobs=2"], None, multirun=True)
+    for character in ",=#([":
+        check_overrides([shlex.split(quoted(f"name=a{character}b"))[0]], None)
 
 
 def one_line(done, pattern):
@@ -598,9 +615,11 @@ def test_names_that_are_taken_get_one_line(tmp_path):
     """A run folder with other settings, or of another process, is neither used nor overwritten."""
     words = [*SHORT, f"root={tmp_path}", "name=a", "compile=false"]
     succeed(*words)
+    config = (tmp_path / "train" / "a" / "config.yaml").read_text()
     done = r2s(*words, "skip_completed=true", "algo.gamma=0.9")
     assert done.returncode == 2
-    assert re.search(r"train/a has other settings \(algo.gamma=0.9\); give another name=", done.stderr)
+    assert re.search(r"train/a has other settings: algo.gamma was 0.97, is 0.9; give another name=", done.stderr)
+    assert (tmp_path / "train" / "a" / "config.yaml").read_text() == config
     (tmp_path / "identify" / "a").mkdir(parents=True)
     done = r2s("stage=pipeline", f"root={tmp_path}", "name=a")
     assert done.returncode == 2

@@ -32,7 +32,7 @@ from r2s.reporting.figures.colours import KNOWN
 from r2s.reporting.run_list import ago, run_rows
 from r2s.reporting.viewer import look
 from r2s.reporting.viewer.data import Content, Overlay
-from r2s.runs import status_of
+from r2s.runs import Job, Run, status_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WRAPPER = """
@@ -94,6 +94,20 @@ def test_the_status_of_a_killed_run():
     assert status_of(meta) == "killed"
     assert status_of(meta | {"process": {"host": "elsewhere", "pid": child.pid}}) == "running"
     assert status_of(meta | {"status": "done"}) == "done"
+
+
+def test_the_list_has_figures_of_searches_and_surfaces(tmp_path):
+    """stage=tune has its best trial; an identification of presses alone has the surface."""
+    summaries = {
+        "tune": {"best": {"value": -91.234}, "trials": {"complete": 3, "pruned": 1}},
+        "identify": {"contact": {"slope_N_per_m": 12345.6, "friction": 0.3}},
+    }
+    for stage, summary in summaries.items():
+        with Run(tmp_path, Job(stage, "a", "", [], 0, 1)) as run:
+            run.summary(summary)
+    shown = run_rows(tmp_path)["result"]
+    assert shown["tune/a"] == "best of 4 trials: -91.23"
+    assert shown["identify/a"] == "surface 1.23e+04 N/m, friction 0.3"
 
 
 def test_the_list_has_status_figures_and_age(root):
