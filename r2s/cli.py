@@ -145,7 +145,10 @@ def is_completed(cfg):
     if not (folder / "meta.json").is_file():
         return False
 
-    if other := differing(loaded(folder / "config.yaml"), cfg):
+    saved = loaded(folder / "config.yaml")
+    if not isinstance(saved, Mapping):
+        raise UserError(f"skip_completed: {folder / 'config.yaml'} is damaged: expected settings by name")
+    if other := differing(saved, cfg):
         raise UserError(f"skip_completed: {folder} has other settings: {'; '.join(other)}; give another name=")
     if is_done(folder):
         print(f"already finished: {folder}")

@@ -237,8 +237,6 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: Sequence[str]) -> UserError:
     """Return the error of an override that Hydra refuses with `error`."""
-    from hydra.errors import OverrideParseException
-
     if "=" not in word:
         return UserError(f"'{word}' is not KEY=VALUE{nearest(word, [*groups, *COMMANDS])}")
     key, value = word.split("=", 1)
@@ -250,12 +248,24 @@ def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: S
             return UserError(
                 f"{bare}: no option '{option}'; allowed: {choices(groups[bare])}{nearest(option, groups[bare])}"
             )
+    special = PLAIN.sub("", value)
+    if special and value[0] not in "[{\"'" and not _parses(word):
+        return UserError(f"{bare}: a value with {special[0]} needs quotes: {quoted(word)}")
     if bare not in known:
         return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
-    special = PLAIN.sub("", value)
-    if isinstance(error, OverrideParseException) and special and value[0] not in "[{\"'":
-        return UserError(f"{bare}: a value with {special[0]} needs quotes: {quoted(word)}")
     return UserError(f"{word}: {' '.join(str(error).split())}")
+
+
+def _parses(word: str) -> bool:
+    """Return whether an override obeys Hydra's grammar."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        OverridesParser.create().parse_override(word)
+    except HydraException:
+        return False
+    return True
 
 
 def quoted(word: str) -> str:

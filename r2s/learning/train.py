@@ -298,7 +298,7 @@ def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Pol
     if "algo" in cause:
         algo.load_state_dict(cause["algo"])
         if "batch" not in cause:
-            evaluate(algo.policy)
+            evaluate(copy.deepcopy(algo.policy).cpu())
             return
         device = algo.action_scale.device
         set_generators(cause, device)

@@ -21,7 +21,7 @@ def parents_of(cfg) -> list[str]:
 
     copied = cfg.resume and (Path(cfg.resume) / "parameters.yaml").is_file()  # a resumed training reads its own copy
     keys = [key for key in PARENTS if not (copied and key == "calibration")]
-    return [str(value) for key in keys if (value := OmegaConf.select(cfg, key))]
+    return [str(Path(str(value))) for key in keys if (value := OmegaConf.select(cfg, key))]
 
 
 def files_of(cfg, parents: Iterable[str]) -> list[Path]:

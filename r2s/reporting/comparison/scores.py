@@ -93,13 +93,13 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per setting whose best value is the smallest or largest of three or more that were tried."""
+    """Return a line per number of algo= or reward= whose best value is the least or largest of three or more."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):
         settings = [g for g in grouped.values() if g[0].algo == algo]
         best = max(settings, key=lambda g: by.sign * float(interquartile_mean(scores(g, by.key))))[0].settings
-        for key, value in best.items():
+        for key, value in ((k, v) for k, v in best.items() if k.startswith(("algo.", "reward."))):
             tried = {g[0].settings.get(key) for g in settings if is_number(g[0].settings.get(key))}
             if len(tried) > 2 and value in (min(tried), max(tried)):
                 lines.append(edge(f"best setting of {algo}", key, value, value == max(tried)))
