@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test test-slow test-portable lint format bench docs setup clean
+.PHONY: run test test-slow test-portable lint format bench docs setup uv.lock clean
 
 run: $(READY)
 	$(BIN)/python run.py stage=pipeline
@@ -37,6 +37,11 @@ docs: $(READY)
 	@echo "open site/index.html"
 
 setup: $(READY)
+
+# The versions of constraints.txt for uv. Afterwards `uv sync` installs what `make setup` does.
+uv.lock: $(READY)
+	$(BIN)/python tests/pins.py
+	uv lock
 
 # The pins of constraints.txt are what the tests were seen to pass with. `torch==2.13.0` is whatever build the user's
 # package index gives for that pin: CUDA by default on Linux, the CPU build from a CPU index.

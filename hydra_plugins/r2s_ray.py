@@ -41,16 +41,13 @@ class RayLauncher(Launcher):
         Raises:
             UserError: Ray is not installed, or there is no cluster at the address.
         """
-        from r2s.errors import UserError
+        from r2s.errors import UserError, optional_import
 
         if self.address is None and "ray" not in sys.modules:
             # Ray accepts connections on all addresses of the machine; this token protects it
             os.environ.setdefault("RAY_AUTH_MODE", "token")
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-        try:
-            import ray
-        except ImportError:
-            raise UserError("hydra/launcher=ray: ray is not installed: pip install 'r2s[ray]'") from None
+        ray = optional_import("ray", "hydra/launcher=ray", "sweeps")
         from hydra.core.singleton import Singleton
 
         own = not ray.is_initialized()

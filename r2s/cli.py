@@ -9,12 +9,13 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.override_checks import COMMANDS, check_overrides
 from r2s.stages.build import GROUP, STAGES
-from r2s.stages.run_config import CONF, TRUST, loaded, modules, replayed, run_config
+from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replayed, run_config
 
 STOPPED = 3  # exit status of a run that a stopped arm ended
 INTERRUPTED = 130
@@ -29,6 +30,9 @@ FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of 
 
 def main():
     """Run what the user typed."""
+    if find_spec("hydra") is None:
+        lacks = f"{sys.executable} lacks the packages of r2s"
+        sys.exit(fail(f"{lacks}; type `make setup` once, then `source .venv/bin/activate`"))
     from hydra._internal.utils import get_args_parser
 
     try:
@@ -38,7 +42,7 @@ def main():
             return run_command(sys.argv[1:])
         sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
         parser = get_args_parser()
-        parser.error = lambda message: sys.exit(fail(f"{message}; see python run.py --help"))  # type: ignore[method-assign]
+        parser.error = lambda message: sys.exit(fail(f"{message}; see {PROGRAM} --help"))  # type: ignore[method-assign]
         run_hydra(parser.parse_args())
     except UserError as error:
         sys.exit(fail(error))

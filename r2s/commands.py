@@ -70,8 +70,7 @@ def run_command(words: Sequence[str]) -> None:
 
 def list_runs(typed: Namespace) -> None:
     """Print a table of run folders."""
-    from r2s.reporting.run_list import run_rows
-    from r2s.reporting.tables import print_table
+    from r2s.reporting.run_list import print_runs, run_rows
     from r2s.stages.build import STAGES, console
 
     if typed.stage not in (None, *STAGES):
@@ -83,7 +82,7 @@ def list_runs(typed: Namespace) -> None:
         kind = " that failed or was killed" * typed.failed
         print(f"no run{f' of stage={typed.stage}' if typed.stage else ''}{kind} in {typed.root}/")
         return
-    print_table(console(), table, f"{len(table)} runs in {typed.root}/")
+    print_runs(console(), table, f"{len(table)} run{'s' * (len(table) > 1)} in {typed.root}/")
 
 
 def look(typed: Namespace) -> None:

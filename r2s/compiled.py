@@ -8,15 +8,21 @@ any other room.
 """
 
 import hashlib
+import os
 import re
+import sys
 from functools import cache
 from pathlib import Path
+from threading import Timer
 
 from numba import cfunc, config, njit
+from numba.core import event
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 
 __all__ = ["cfunc", "njit"]
 PACKAGE = Path(__file__).parent
+RELAYED = "R2S_RELAYED"  # environment variable of a process whose output another one shows
+LONG_S = 2.0  # of one compilation, after which a user wonders what happens
 
 
 @cache
@@ -63,3 +69,28 @@ class UserWide(_Sources, UserWideCacheLocator):
 
 _own = ",".join(f"{__name__}.{kind.__name__}" for kind in (Provided, Beside, UserWide))
 config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # type: ignore[attr-defined]
+
+
+class _Announce(event.Listener):
+    """Says on a terminal, once in a process, that a compilation takes long: it is minutes after an installation."""
+
+    def __init__(self):
+        self._said, self._timers = False, []
+
+    def on_start(self, event: event.Event) -> None:
+        timer = Timer(LONG_S, self._say)
+        timer.daemon = True
+        timer.start()
+        self._timers.append(timer)
+
+    def on_end(self, event: event.Event) -> None:
+        self._timers.pop().cancel()
+
+    def _say(self) -> None:
+        if not self._said:
+            self._said = True
+            print("compiling numeric code: once after an installation, for one to three minutes", file=sys.stderr)
+
+
+if sys.stderr.isatty() or RELAYED in os.environ:
+    event.register("numba:compile", _Announce())

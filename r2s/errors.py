@@ -1,8 +1,10 @@
 """Exceptions that end a run with one line of text: exit status 2 for a user's mistake, 3 for a stopped arm."""
 
+import importlib
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
+from types import ModuleType
 
 
 class UserError(ValueError):
@@ -22,6 +24,23 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 def choices(allowed: Iterable[str]) -> str:
     """Return the allowed names as "a, b, c"."""
     return ", ".join(str(a) for a in allowed)
+
+
+def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
+    """Import a module of one of r2s's extras (docs/how_to/install.md).
+
+    Args:
+        module: such as "panda_py". needed_by: option or file, begins the message. extra: that installs it.
+
+    Raises:
+        UserError: it, or what it imports, is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.split(".")[0]
+        why = "which is not installed" if error.name in (module, package) else f"which does not import ({error})"
+        raise UserError(f"{needed_by} needs {package}, {why}: pip install 'r2s[{extra}]'") from None
 
 
 def check_number(name: str, value: object, interval: str, whole: bool = False) -> None:

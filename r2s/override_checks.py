@@ -8,6 +8,7 @@ from typing import Any
 
 from r2s.errors import UserError, choices, nearest
 from r2s.stages.build import CONF, STAGES, unread
+from r2s.stages.run_config import PROGRAM
 
 COMMANDS = ("look", "list", "export", "check", "convert")
 OPTIONAL = ("tracker", "experiment")  # groups that may have no option
@@ -39,7 +40,7 @@ RENAMED = {
 # options of Hydra that place files, which r2s does not follow: a run folder is <root>/<stage>/<name>
 PLACES = ("hydra.sweep", "hydra.run", "hydra.output_subdir", "hydra.job.chdir")
 PLAIN = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: ]")  # what Hydra's grammar takes in a value without quotes
-EXTRAS = {"submitit_slurm": "slurm", "submitit_local": "slurm"}  # launcher -> extra that installs it
+SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweeps`
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool = False) -> None:
@@ -78,7 +79,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         except (HydraException, OmegaConfBaseException, UnknownOption):
             raise _first_mistake(words, own, groups, multirun) from None
         if not multirun and configs[0].hydra.sweeper.get("params"):
-            raise UserError(f"this is a grid of jobs, and only -m runs it: python run.py -m {' '.join(words)}")
+            raise UserError(f"this is a grid of jobs, and only -m runs it: {PROGRAM} -m {' '.join(words)}")
         _check_configs(configs, jobs, names, groups)
     GlobalHydra.instance().clear()
 
@@ -130,9 +131,8 @@ def _check_hydra(words: Sequence[str], own: list[str], groups: dict[str, list[st
         try:
             compose("config", [*own, *words[: k + 1]], return_hydra_config=True)
         except (HydraException, OmegaConfBaseException) as error:
-            if word.partition("=")[2] in EXTRAS:
-                package = EXTRAS[word.partition("=")[2]]
-                raise UserError(f"{word}: not installed here; pip install 'r2s[{package}]'") from None
+            if word.partition("=")[2] in SUBMITIT:
+                raise UserError(f"{word} needs submitit, which is not installed: pip install 'r2s[sweeps]'") from None
             before = compose("config", [*own, *words[:k]], return_hydra_config=True)
             known = [*(f"hydra.{key}" for key in _keys(before.hydra)), *groups]
             raise _mistake(word, error, groups, known) from None
@@ -252,7 +252,7 @@ def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: S
     if special and value[0] not in "[{\"'" and not _parses(word):
         return UserError(f"{bare}: a value with {special[0]} needs quotes: {quoted(word)}")
     if bare not in known:
-        return UserError(f"unknown option '{bare}'{nearest(bare, known) or '; see python run.py --help'}")
+        return UserError(f"unknown option '{bare}'{nearest(bare, known) or f'; see {PROGRAM} --help'}")
     return UserError(f"{word}: {' '.join(str(error).split())}")
 
 

@@ -19,6 +19,7 @@ class Progress:
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
+        self._part, self._share = self._began, 0.0  # begin of the part whose share grows, and its last share
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
         if self._console.is_terminal:
@@ -56,15 +57,17 @@ class Progress:
 
     def _show(self, share: float, text: str) -> None:
         now = time.perf_counter()
+        if share < 0.5 * self._share:  # the next part, such as another search of an identification
+            self._part = now
+        self._share = share
         if now - self._shown < (0.2 if self._bar else self._every):
             return
         self._shown = now
         if self._bar:
             self._bar.update(self._task, completed=share, text=text, refresh=True)
         else:
-            elapsed = now - self._began
-            left = f"{clock(elapsed * (1 - share) / share)} left" if share > 0.01 else ""
-            self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(elapsed)}  {left}  {text}")
+            left = f"{clock((now - self._part) * (1 - share) / share)} left" if share > 0.01 else ""
+            self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(now - self._began)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:
         """Print the elapsed time and the result in `text`."""

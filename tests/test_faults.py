@@ -95,7 +95,7 @@ def test_every_pin_is_there():
                 extras.setdefault(name, {""}).update(requirement.extras)
                 waiting.append(name)
     assert len(seen) > 50
-    builds = {"r2s", "setuptools"}  # of which the environment has its own
+    builds = {"r2s"}
     missing = {n for n in seen - pins - builds if not n.startswith(("nvidia", "cuda", "triton"))}
     assert missing == set()
 

@@ -25,11 +25,12 @@ import yaml
 from conftest import ROOT, conf
 from matplotlib.colors import to_rgb
 from PIL import Image
+from rich.console import Console
 
 from r2s import cli
 from r2s.errors import UserError
 from r2s.reporting.figures.colours import KNOWN
-from r2s.reporting.run_list import ago, run_rows
+from r2s.reporting.run_list import ago, print_runs, run_rows
 from r2s.reporting.viewer import look
 from r2s.reporting.viewer.data import Content, Overlay
 from r2s.runs import Job, Run, status_of
@@ -132,6 +133,23 @@ def test_the_list_has_status_figures_and_age(root):
     assert set(run_rows(root, stage="identify").index) == {"identify/found"}
     assert run_rows(root / "nowhere").empty
     assert [ago(s) for s in (3, 90, 7200, 3e5)] == ["3 s", "2 min", "2 h", "3 d"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_list_has_one_line_per_run(root, terminal):
+    """A terminal cuts long ones; a file or a pipe holds them whole."""
+    rows = run_rows(root)
+    long = "train/2026-11-25_21-43-17_" + 9 * "algo=tqc_", "why " * 40
+    rows.loc[long[0]] = ["failed", "2 h", long[1]]
+    console = Console(file=io.StringIO(), width=100, force_terminal=terminal, color_system=None)
+    print_runs(console, rows, "runs")
+    head, *lines = [line for line in console.file.getvalue().splitlines() if "/" in line or "result" in line]
+    assert len(lines) == len(rows)
+    assert ("…" in lines[-1]) == terminal
+    assert (long[0] in lines[-1]) != terminal
+    assert (max(map(len, lines)) <= 100) == terminal
+    assert lines[-1].strip().startswith(long[0][:40])
+    assert all(line.index(status) == head.index("status") for line, status in zip(lines, rows["status"], strict=True))
 
 
 def typed(*words: str, monkeypatch, capsys) -> tuple[int, str, str]:

@@ -79,4 +79,7 @@ def test_ray_is_one_line_where_it_is_not(tmp_path):
     words = ["-m", "+experiment=toy", "hydra/launcher=ray", "seed=0,1", f"root={tmp_path}"]
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr.strip() == "error: hydra/launcher=ray: ray is not installed: pip install 'r2s[ray]'"
+    assert (
+        done.stderr.strip()
+        == "error: hydra/launcher=ray needs ray, which is not installed: pip install 'r2s[sweeps]'"
+    )

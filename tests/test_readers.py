@@ -393,10 +393,10 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
         h5["t"] = np.arange(20.0)
     without(monkeypatch, "rosbags", "h5py")
     assert message(read, bag, torque="measured") == (
-        f"{bag}: reading this file needs rosbags, which is not installed: pip install 'r2s[bags]'"
+        f"{bag}: reading this file needs rosbags, which is not installed: pip install 'r2s[recordings]'"
     )
     assert message(read, file, torque="measured") == (
-        f"{file}: reading this file needs h5py, which is not installed: pip install 'r2s[hdf5]'"
+        f"{file}: reading this file needs h5py, which is not installed: pip install 'r2s[recordings]'"
     )
 
 

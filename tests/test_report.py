@@ -154,7 +154,7 @@ def recording(panda) -> Recording:
 
 @pytest.fixture
 def console() -> Console:
-    return Console(file=StringIO(), width=110)
+    return Console(file=StringIO(), width=100)
 
 
 def printed(console: Console) -> str:
@@ -292,23 +292,37 @@ SUMMARY = {
 }
 
 
-def test_the_identification_table_holds_the_numbers_in_110_columns(console, panda, identified):
+def test_the_identification_table_holds_the_numbers_in_100_columns(console, panda, identified):
     identification_table(console, panda, identified, {"train": SUMMARY, "validation": SUMMARY})
     text = printed(console)
-    assert max(map(len, text.splitlines())) <= 110
+    assert max(map(len, text.splitlines())) <= 100
     f = identified.found
-    parameters = (f"0.5 → {f.x[1]:.3g}", f"[{f.low[1]:.3g}, {f.high[1]:.3g}]", f"0 → {1e3 * f.x[21]:.3g}")
+    parameters = (f"{f.x[1]:.3g}", f"±{0.5 * (f.high[1] - f.low[1]):.2g}", "nominal 0.5", f"{1e3 * f.x[21]:.3g}")
     for expected in (*parameters, "0.111", "0.444", "0.25", "6.25", "0.81", "451", "mean", "delay, ms"):
         assert expected in text
-    assert text.count(KEPT) == 1 + text.count("?: the interval is")
-    assert text.count(" ? ") == np.sum(~f.identifiable)
+    assert text.count("kept") == 1 + text.count("?: the interval is")
+    assert text.count("? ") == np.sum(~f.identifiable)
+
+
+def test_widest_parameters_stay_in_one_table_of_100_columns(console, panda):
+    """All parameters of a presliding family, of both signs and every size, with other nominal values per joint."""
+    signed = ("asymmetry", "rise_asymmetry", "offset", "drag_sin", "drag_cos", "gain")
+    names = {name: [-1e-3, 1e-3] for name in signed}
+    names |= {"coulomb": [0.05, 5], "viscous": [0, 5], "stribeck_velocity": [0.01, 0.5], "presliding": [1e-4, 1e-2]}
+    found = make_identified(panda, names, "bristle")
+    start = replace(found.space.nominal, offset=-1.23e-4 * np.arange(panda.n))
+    identification_table(console, panda, replace(found, space=replace(found.space, nominal=start)), {})
+    text = printed(console)
+    assert max(map(len, text.splitlines())) <= 100
+    assert text.count("identified parameters") == 1
+    assert "…" not in text
 
 
 def test_ten_numbers_per_link_take_one_line_in_the_terminal(console, panda):
     found = make_identified(panda, LINKS)
     identification_table(console, panda, found, {})
     text = printed(console)
-    assert max(map(len, text.splitlines())) <= 110
+    assert max(map(len, text.splitlines())) <= 100
     assert "link_" not in text
     assert f"{panda.mass[3]:.3g} → {found.dynamics.mass[3]:.3g}" in text
     assert len(text.splitlines()) < 60
@@ -382,7 +396,7 @@ def test_the_breakaway_table_shows_how_it_was_measured(panda, identified, record
     assert ramped.loc["7", "positive\nnew"] == "0.4 ?"
     assert ramped.loc["7", "positive\n95 % interval"] == "[0.4, 12]"  # contains the value; up to tau_max
     terminal = identification_tables(panda, ramps, {})["breakaway, Nm of command and offset"]
-    assert terminal.loc["positive", "joint 7"] == "0.4\nnot reached\nheld against 0.7 Nm"
+    assert terminal.loc["7", "positive"] == "0.4, not reached: held against 0.7 Nm"
     measured = replace(recording, torque="measured")
     assert not tables_of(everything(panda, scanned, measured, nominal=old), "Table II:")
 

@@ -11,14 +11,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, nearest, optional_import
 from r2s.files import DAMAGED
 from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed, specs_of
 from r2s.recordings.csv_table import read_csv, without_units
 from r2s.recordings.lerobot import dataset_files, is_dataset, lerobot_table
 from r2s.recordings.recording import MIN_ROWS, SIGNALS, Recording, declared_torque
 from r2s.recordings.repairs import held, repair_rows, unwrap
-from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, missing_extra, rostopic_table
+from r2s.recordings.robot_logs import BAGS, Table, bag_table, is_bag, libfranka_table, rostopic_table
 
 HDF5 = (".h5", ".hdf5")
 SUFFIXES = (".csv", ".npz", ".parquet", *HDF5, *BAGS)
@@ -300,10 +300,7 @@ def _load_npz(path: Path) -> Table:
 
 def _load_hdf5(path: Path) -> Table:
     """Return the datasets of up to two dimensions by their paths."""
-    try:
-        import h5py
-    except ImportError:
-        raise missing_extra("h5py", "hdf5") from None
+    h5py = optional_import("h5py", "reading this file", "recordings")
     table: Table = {}
 
     def keep(name, item):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, nearest, optional_import
 
 Table = dict[str, np.ndarray]  # column name -> (T,) or (T, n)
 Layouts = dict[tuple[str, ...], list[int] | None]  # names in a message -> indices of the robot's joints; None: all
@@ -21,11 +21,6 @@ MAX_LATENESS_NS = 10**9  # ns, a message of a network arrives at most so late; a
 def is_bag(path: Path) -> bool:
     """Return whether `path` is a bag: by its suffix, or a folder with metadata.yaml (ROS 2)."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in BAGS
-
-
-def missing_extra(library: str, extra: str) -> UserError:
-    """Return the error for a missing optional dependency."""
-    return UserError(f"reading this file needs {library}, which is not installed: pip install 'r2s[{extra}]'")
 
 
 def libfranka_table(table: Table) -> Table:
@@ -191,15 +186,11 @@ def choose_joints(
 
 def _read(path: Path, topic: str | None) -> tuple[str, list[Sample]]:
     """Return a topic and its messages."""
-    try:
-        import rosbags.rosbag1
-        import rosbags.rosbag2
-    except ImportError:
-        raise missing_extra("rosbags", "bags") from None
+    rosbag1, rosbag2 = (optional_import(f"rosbags.rosbag{k}", "reading this file", "recordings") for k in (1, 2))
     try:
         # only this topic is decoded: others may have unknown message types
         ros1 = path.is_file() and path.suffix.lower() == ".bag"
-        with (rosbags.rosbag1 if ros1 else rosbags.rosbag2).Reader(path) as reader:
+        with (rosbag1 if ros1 else rosbag2).Reader(path) as reader:
             topic, connections = _pick_topic(reader.connections, topic)
             samples = list(_samples(reader, connections, ros1))
     except UserError:

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from r2s.errors import UserError
+from r2s.errors import UserError, optional_import
 from r2s.physics.description import Link, chain, write_urdf
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
-from r2s.recordings.robot_logs import missing_extra
 
 START_NS = 10**9  # ns, stamp of the first row: readers take a stamp of 0 for a missing one
 PAUSE_NS = 10**9  # ns, between trajectories: longer than any data.max_gap_s in use
@@ -61,12 +60,11 @@ def write_mcap(
     Raises:
         UserError: rosbags is not installed, or the recording is of another number of joints.
     """
-    try:
-        from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise missing_extra("rosbags", "bags") from None
+    optional_import("rosbags", str(path), "recordings")
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
     if recording.n_joints != robot.n:
         raise UserError(f"expected {robot.n} joints, as robot={robot.name} has, got {recording.n_joints}")
     store, endless = get_typestore(Stores.ROS2_HUMBLE), QosTime(0, 0)

@@ -14,7 +14,7 @@ Item = str | list[str] | pd.DataFrame | Path  # paragraph, bullets, table, pictu
 
 def doubtful(cell: str) -> bool:
     """Return whether a cell shows a poorly identifiable value."""
-    return cell.split("\n")[0].endswith("?") or cell.endswith(KEPT)
+    return any(line.endswith(("?", "kept", KEPT)) for line in cell.split("\n"))
 
 
 def report_markdown(path: Path, sections: Mapping[str, Sequence[Item]]) -> Path:

@@ -9,12 +9,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from r2s.reporting.measures import measures_of
 from r2s.runs import status_of
 
 LOST = ("failed", "killed")
-COLUMNS = ["status", "result", "age"]
+COLUMNS = ["status", "age", "result"]
+LONGEST = 46  # letters of a run's name in a terminal; the time at its beginning tells runs apart
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
@@ -34,9 +39,22 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
             found.append((start, path.parent, status, meta))
     rows = {}
     for start, folder, status, meta in sorted(found, key=lambda f: f[0]):
-        cells = status, _result(folder, meta), ago((datetime.now().astimezone() - start).total_seconds())
+        cells = status, ago((datetime.now().astimezone() - start).total_seconds()), _result(folder, meta)
         rows[f"{folder.parent.name}/{folder.name}"] = dict(zip(COLUMNS, cells, strict=True))
     return pd.DataFrame.from_dict(rows, orient="index", columns=COLUMNS).rename_axis("run")
+
+
+def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
+    """Print `run_rows`, one line each: cut at the width of a terminal, whole in a file or pipe."""
+    cut = console.is_terminal
+    table = Table(title=title, title_style="bold", title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("run", no_wrap=True, max_width=LONGEST if cut else None)
+    table.add_column("status", no_wrap=True)
+    table.add_column("age", no_wrap=True, justify="right")
+    table.add_column("result", no_wrap=True)
+    for name, row in runs.iterrows():
+        table.add_row(*(escape(str(cell)) for cell in (name, *row)))
+    console.print(table, width=None if cut else 10_000, no_wrap=True, crop=cut)
 
 
 def ago(seconds: float) -> str:

@@ -284,7 +284,7 @@ def console():
     """Return the console that prints tables."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 110)
+    return Console(width=None if sys.stdout.isatty() else 100)
 
 
 def set_threads(cfg):

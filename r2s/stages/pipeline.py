@@ -8,10 +8,11 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+from r2s.compiled import RELAYED
 from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
 from r2s.stages.build import GROUP, console, make_robot, open_run, unread
-from r2s.stages.run_config import CONF, PACKAGE, replayed
+from r2s.stages.run_config import CONF, PACKAGE, PROGRAM, replayed
 
 STEPS = (
     "1/3 record the arm and identify it",
@@ -45,7 +46,7 @@ def overrides_for(overrides: Sequence[str], step: Any) -> list[str]:
 
 
 def run_step(words: dict[str, list[str]]) -> None:
-    """Run the commands {label: words} in parallel and print their output, each line with its label.
+    """Run the commands {label: words} in parallel: print their progress line by line, their tables when they end.
 
     Raises:
         UserError: a command failed; the others are terminated.
@@ -55,25 +56,30 @@ def run_step(words: dict[str, list[str]]) -> None:
     last: dict[str, str] = {}
 
     def relay(label: str, process: subprocess.Popen) -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.strip():
                 last[label] = line.strip()
             print(f"  {label:<10} | {line.rstrip()}", file=sys.stderr, flush=True)
 
-    threads = []
+    def show(label: str, process: subprocess.Popen) -> None:
+        assert process.stdout is not None
+        if tables := process.stdout.read().strip("\n"):
+            print(f"  {label}:\n{tables}\n", file=sys.stderr, flush=True)
+
+    threads: dict[str, list[Thread]] = {}
     try:
         for label, typed in words.items():
-            print(f"  {label:<10} $ python run.py {' '.join(typed)}", file=sys.stderr, flush=True)
-            command = [*command_prefix(), *typed]
-            piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-            process = subprocess.Popen(command, **piped, env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "110"})  # type: ignore[call-overload]
+            print(f"  {label:<10} $ {PROGRAM} {' '.join(typed)}", file=sys.stderr, flush=True)
+            env, piped = os.environ | {"PYTHONUNBUFFERED": "1", RELAYED: "1"}, subprocess.PIPE
+            process = subprocess.Popen([*command_prefix(), *typed], stdout=piped, stderr=piped, text=True, env=env)
             running[label] = process
-            threads.append(Thread(target=relay, args=(label, process), daemon=True))
-            threads[-1].start()
+            threads[label] = [Thread(target=do, args=(label, process), daemon=True) for do in (relay, show)]
+            for thread in threads[label]:
+                thread.start()
         for label, process in running.items():
             if process.wait() != 0:
-                threads[list(running).index(label)].join()
+                threads[label][0].join()
                 if process.returncode == STOPPED:
                     raise Stopped(f"{label}: {last.get(label, 'no output').removeprefix('stopped: ')}")
                 raise UserError(
@@ -83,7 +89,7 @@ def run_step(words: dict[str, list[str]]) -> None:
         for process in running.values():
             if process.poll() is None:
                 process.terminate()
-        for thread in threads:
+        for thread in (t for both in threads.values() for t in both):
             thread.join(timeout=5)
 
 

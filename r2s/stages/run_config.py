@@ -11,6 +11,7 @@ from r2s.stages.parts import target
 
 PACKAGE = Path(__file__).parent.parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"  # in a wheel, in a checkout
+PROGRAM = "python run.py" if CONF.parent != PACKAGE else "r2s"  # what the user types
 TRUST = (
     "R2S_TRUST"  # environment variable: `trust=` of a resumed search, whose trainings replay overrides of its folder
 )

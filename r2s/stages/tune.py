@@ -14,7 +14,7 @@ from glob import glob
 from pathlib import Path
 from typing import Any, Literal
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, choices, nearest, optional_import
 from r2s.stages import train
 from r2s.stages.build import console, make_dynamics, make_robot, make_task, open_run, unread
 from r2s.stages.parts import called, plain
@@ -269,10 +269,7 @@ def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize",
 
 def tune(cfg, overrides):
     """Search settings: ask for a trial, train, report its evaluations, prune; write trials.csv and the page."""
-    try:
-        import optuna  # noqa: F401
-    except ImportError:
-        raise UserError("stage=tune needs optuna, which is not installed: pip install 'r2s[tune]'") from None
+    optional_import("optuna", "stage=tune", "sweeps")
     from r2s.reporting.tuning import against_table, trials_table, tuning_page
     from r2s.runs import read_summary
 

@@ -31,9 +31,12 @@ def operator_agrees(reason: str) -> bool:
     if not sys.stdin.isatty():
         return False
     termios.tcflush(sys.stdin, termios.TCIFLUSH)  # input typed before the question does not count
-    print(f"\nthe arm was stopped: {reason}", file=sys.stderr)
+    question = f"check the arm; type '{CONSENT}' to let it move again, anything else ends the run:"
+    print(
+        f"\nthe arm was stopped: {reason}\n{question}", file=sys.stderr
+    )  # a whole line, which a pipeline shows at once
     try:
-        answer = input(f"check the arm; type '{CONSENT}' to let it move again, anything else ends the run: ")
+        answer = input()
     except EOFError:
         return False
     return answer.strip() == CONSENT

@@ -1,11 +1,9 @@
 """libfranka through its two Python packages: import, connection, error messages, and what both clients share."""
 
-import importlib
 import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ import numpy as np
 from r2s.arm.clients import fci
 from r2s.arm.interface import ArmStopped
 from r2s.arm.realtime import kept_scheduler
-from r2s.errors import UserError, check_number
+from r2s.errors import UserError, check_number, optional_import
 
 DESK_PORT = 443  # https, Franka's web interface "Desk"
 CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in ms; libfranka waits about 60 s
@@ -62,7 +60,7 @@ class Client:
     version: int
 
     def __init__(self, name: str, package: str, address: str, realtime: bool):
-        self._package = import_package(package, name)
+        self._package = optional_import(package, f"arm={name}", name)
         config = self._package.RealtimeConfig
         config = config.kEnforce if realtime else config.kIgnore
         with kept_scheduler():
@@ -110,22 +108,6 @@ class Client:
             return function()
         except Exception as error:
             raise ArmStopped(one_line(error)) from error
-
-
-def import_package(name: str, extra: str) -> ModuleType:
-    """Import a client package.
-
-    Raises:
-        UserError: the package or one of its dependencies is not installed.
-
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        cause = "" if error.name in (name, name.split(".")[0]) else f" ({error})"
-        raise UserError(
-            f"arm={extra} needs the package {name.split('.')[0]}{cause}: pip install 'r2s[{extra}]'"
-        ) from None
 
 
 def connect(make: Callable[[], Any], extra: str, address: str) -> Any:

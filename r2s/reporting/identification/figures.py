@@ -17,6 +17,7 @@ from r2s.reporting.figures.panels import joint_panels, log_axis, panels
 LONGEST = 30.0  # s of torque in a figure: more is a solid band
 SCANS = {  # steps of the history without a cost that compares, and their shade
     "family": ("comparison of friction families", "#9aa0a6"),
+    "terms": ("choice of terms", "#57ab5a"),
     "breakaway": ("search for breakaway", "#c9a227"),
 }
 BARS: dict[str, Any] = {"marker": "_", "markersize": 14, "markeredgewidth": 2, "linewidth": 1, "linestyle": ":"}

@@ -8,26 +8,29 @@ from rich.console import Console
 
 from r2s.identification.friction.breakaway import SIDES
 from r2s.identification.link_inertia import LINK, inertia_scale
-from r2s.identification.parameters import WHOLE_ARM
+from r2s.identification.parameters import WHOLE_ARM, units
 from r2s.identification.result import IdentificationResult
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
-from r2s.reporting.identification.values import LEGEND, named, of_whole_arm, per_joint, values
+from r2s.reporting.identification.values import SHORT, Value, of_whole_arm, per_joint, values
 from r2s.reporting.tables import number, print_table
 
-WIDE = 5  # parameter columns of a table in a terminal of 110 columns
+MOST = 7  # joints side by side in a terminal of 100 columns
 
 
 def identification_tables(robot: Robot, found: IdentificationResult, summary: Mapping) -> dict[str, pd.DataFrame]:
     """Return {title: table}: parameters, breakaway, and the prediction errors in `summary` (summary.json)."""
     space, estimate, tables = found.space, found.found, {}
     own = [b for b in space.blocks if b not in WHOLE_ARM and b not in LINK]
-    blocks = per_joint(robot, {named(b): [v.cell for v in values(space, estimate, b, found.unseen)] for b in own})
-    for i in range(0, blocks.shape[1], WIDE):
-        tables[f"parameters, nominal → identified{' (continued)' * (i > 0)}"] = blocks.iloc[:, i : i + WIDE]
+    rows = dict(_parameter(b, values(space, estimate, b, found.unseen)) for b in own)
+    parameters = pd.DataFrame.from_dict(rows, orient="index", columns=[str(j + 1) for j in range(robot.n)])
+    for i in range(0, robot.n if rows else 0, MOST):
+        some = f" of joints {i + 1} to {min(i + MOST, robot.n)}" if robot.n > MOST else ""
+        tables[f"identified parameters{some}"] = parameters.iloc[:, i : i + MOST].rename_axis("joint")
     if arm := of_whole_arm(space, estimate, found.unseen):
-        cells = {"nominal → identified": [v.cell for v in arm.values()]}
-        tables["whole arm"] = pd.DataFrame(cells, index=pd.Index(list(arm), name="whole arm"))
+        cells = {name: [number(v.old), v.found, v.interval] for name, v in arm.items()}
+        whole = pd.DataFrame.from_dict(cells, orient="index", columns=["nominal", "identified", "95 %"])
+        tables["parameters of the whole arm"] = whole.rename_axis("parameter")
     if set(LINK) & set(space.blocks):
         tables["links, nominal → identified"] = _links(robot, found)
     dynamics = found.dynamics
@@ -37,17 +40,29 @@ def identification_tables(robot: Robot, found: IdentificationResult, summary: Ma
     return tables | error_tables(robot, summary)
 
 
+def _parameter(block: str, found: Sequence[Value]) -> tuple[str, list[str]]:
+    """Return the heading of a parameter's row and a cell per joint: value, ± half of its interval, nominal value.
+
+    The heading has the nominal value if all joints share it.
+    """
+    unit = units()[block]
+    if unit == "rad":
+        unit, found = "mrad", [v.times(1e3) for v in found]
+    nominal = list(dict.fromkeys(number(v.old) for v in found))
+    shared = len(nominal) == 1
+    words = [unit] * (unit != "1") + [f"nominal {nominal[0]}"] * shared
+    cells = [v.short + f"\n{number(v.old)}" * (not shared) for v in found]
+    return "\n".join([block, ", ".join(words), *["nominal"] * (not shared)]), cells
+
+
 def _breakaway(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
     """Return the breakaway torque per joint and side, with the reason if the ramps did not measure it."""
     reasons = identified.edges.unknown if identified.edges is not None else {}
-    cells = {
-        f"joint {j + 1}": [
-            "\n".join([number(edge), *reasons.get(f"joint {j + 1}, {side}", "").split(": ")]).strip()
-            for side, edge in zip(SIDES, identified.dynamics.breakaway[j], strict=True)
-        ]
-        for j in range(robot.n)
-    }
-    return pd.DataFrame(cells, index=pd.Index(SIDES, name="side"))
+    columns = {}
+    for side, edges in zip(SIDES, identified.dynamics.breakaway.T, strict=True):
+        why = [reasons.get(f"joint {j + 1}, {side}", "") for j in range(robot.n)]
+        columns[side] = [f"{number(x)}{f', {w}' if w else ''}" for x, w in zip(edges, why, strict=True)]
+    return per_joint(robot, columns)
 
 
 def _links(robot: Robot, identified: IdentificationResult) -> pd.DataFrame:
@@ -113,6 +128,6 @@ def _before_after(columns: Mapping[str, Sequence[Sequence[float]]], index: pd.In
 def identification_table(console: Console, robot: Robot, identified: IdentificationResult, summary: Mapping) -> None:
     """Print `identification_tables`."""
     for title, table in identification_tables(robot, identified, summary).items():
-        print_table(console, table, title, LEGEND if title.startswith("parameters") else None)
+        print_table(console, table, title, SHORT if title.startswith("identified") else None)
     if identified.refused:
         console.print("replays rejected: they contradict the torque of moving joints; the fit is of torque alone")

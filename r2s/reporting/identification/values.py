@@ -12,10 +12,9 @@ from r2s.physics.robot import Robot
 from r2s.reporting.document import KEPT
 from r2s.reporting.tables import number
 
-LEGEND = (
-    f"[ ]: 95 % interval; ?: the interval is wider than {2 / SHARPER:g} standard deviations of the prior; "
-    f"{KEPT}: the data hardly constrain the value"
-)
+WIDE = f"?: the interval is wider than {2 / SHARPER:g} standard deviations of the prior"
+LEGEND = f"[ ]: 95 % interval; {WIDE}; {KEPT}: the data hardly constrain the value"
+SHORT = f"±: half of the 95 % interval; {WIDE}; kept: nominal, as the data hardly constrain it"
 
 
 class Value(NamedTuple):
@@ -44,6 +43,14 @@ class Value(NamedTuple):
     def found(self) -> str:
         """The new value, with "?" if it is not identifiable."""
         return number(self.new) + ("" if self.identifiable else " ?")
+
+    @property
+    def short(self) -> str:
+        """Cell "new" over "± half of the interval"."""
+        half = 0.5 * (self.high - self.low)
+        if self.kept:
+            return f"{number(self.old)}\nkept"
+        return f"{self.found.replace(' ', '')}\n±{number(half, '{:.0f}' if half >= 100 else '{:.2g}')}"
 
     @property
     def interval(self) -> str:

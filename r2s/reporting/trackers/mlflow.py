@@ -1,7 +1,7 @@
 """tracker=mlflow: an SQLite store beside the run folders, or a server.
 
 `mlflow ui --backend-store-uri sqlite:///runs/mlflow.db` shows it, in an environment with all of MLflow: the extra
-r2s[mlflow] installs the writing part only.
+r2s[trackers] installs the writing part only.
 """
 
 import logging
@@ -14,7 +14,8 @@ from typing import Any
 from filelock import FileLock
 from torchrl.record.loggers.mlflow import MLFlowLogger
 
-from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
+from r2s.errors import optional_import
+from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 SQLITE = "sqlite:///"
 STATUS = {"done": "FINISHED", "stopped": "KILLED"}
@@ -45,8 +46,8 @@ class Mlflow(LoggerTracker):
 
     def __init__(self, uri: str, experiment: str = "r2s"):
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        needs("mlflow", "mlflow")
-        needs("sqlalchemy", "mlflow")
+        optional_import("mlflow", "tracker=mlflow", "trackers")
+        optional_import("sqlalchemy", "tracker=mlflow", "trackers")
         logging.getLogger("mlflow").setLevel(logging.WARNING)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         self._uri, self._experiment = uri, experiment

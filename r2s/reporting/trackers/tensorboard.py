@@ -5,14 +5,15 @@ from pathlib import Path
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
+from r2s.errors import optional_import
+from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Tensorboard(LoggerTracker):
     """Scalars, settings and figures; other files are listed as text, because event files hold none."""
 
     def __init__(self) -> None:
-        needs("tensorboard", "tensorboard")
+        optional_import("tensorboard", "tracker=tensorboard", "trackers")
 
     def start(self, run: Tracked) -> None:
         """Write into <run folder>/tensorboard."""

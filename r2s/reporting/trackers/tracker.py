@@ -1,6 +1,5 @@
 """The tracker interface and the run that it shows. Your own tracker is such a class and a file of conf/tracker."""
 
-import importlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +7,6 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol
 
-from r2s.errors import UserError
 from r2s.files import write_json
 from r2s.reporting.measures import measures_of
 from r2s.tasks.measures import MeasureTable
@@ -94,20 +92,6 @@ class LoggerTracker:
     def summary(self, numbers: Mapping[str, float]) -> None:
         """Show the numbers of summary.json."""
         self._logger.log_metrics({f"summary/{k}": v for k, v in numbers.items()}, 0)
-
-
-def needs(package: str, tracker: str) -> None:
-    """Import a package of a tracker before the run folder exists.
-
-    Raises:
-        UserError: it is not installed.
-    """
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        raise UserError(
-            f"tracker={tracker}: cannot import {package} ({error}); install it with pip install 'r2s[{tracker}]'"
-        ) from None
 
 
 def flat(node: Any, prefix: str = "", between: str = ".") -> Iterator[tuple[str, Any]]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from torchrl.record.loggers.trackio import TrackioLogger
 
-from r2s.reporting.trackers.tracker import Tracked, needs
+from r2s.errors import optional_import
+from r2s.reporting.trackers.tracker import Tracked
 
 
 class Trackio:
@@ -20,7 +21,7 @@ class Trackio:
     def __init__(self, folder: str, project: str = "r2s"):
         os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
         os.environ.setdefault("TRACKIO_DIR", str(Path(folder).absolute()))  # read at import
-        needs("trackio", "trackio")
+        optional_import("trackio", "tracker=trackio", "trackers")
         self._project = project
 
     def start(self, run: Tracked) -> None:

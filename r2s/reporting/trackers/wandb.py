@@ -7,7 +7,8 @@ from uuid import uuid4
 
 from torchrl.record.loggers.wandb import WandbLogger
 
-from r2s.reporting.trackers.tracker import LoggerTracker, Tracked, needs
+from r2s.errors import optional_import
+from r2s.reporting.trackers.tracker import LoggerTracker, Tracked
 
 
 class Wandb(LoggerTracker):
@@ -20,7 +21,7 @@ class Wandb(LoggerTracker):
     def __init__(self, project: str = "r2s", entity: str | None = None, offline: bool = True):
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         os.environ.setdefault("WANDB_SILENT", "true")
-        needs("wandb", "wandb")
+        optional_import("wandb", "tracker=wandb", "trackers")
         self._where, self._offline = {"project": project, "entity": entity}, offline
 
     def start(self, run: Tracked) -> None:
