@@ -31,8 +31,8 @@ FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of 
 def main():
     """Run what the user typed."""
     if find_spec("hydra") is None:
-        lacks = f"{sys.executable} lacks the packages of r2s"
-        sys.exit(fail(f"{lacks}; type `make setup` once, then `source .venv/bin/activate`"))
+        problem = f"{sys.executable} lacks the packages of r2s"
+        sys.exit(fail(f"{problem}; type `make setup` once, then `source .venv/bin/activate`"))
     from hydra._internal.utils import get_args_parser
 
     try:

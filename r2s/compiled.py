@@ -72,13 +72,14 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Says on a terminal, once in a process, that a compilation takes long: it is minutes after an installation."""
+    """Prints on a terminal, once in a process, that a compilation takes long: it is minutes after an installation."""
 
     def __init__(self):
-        self._said, self._timers = False, []
+        self._printed = False
+        self._timers: list[Timer] = []
 
     def on_start(self, event: event.Event) -> None:
-        timer = Timer(LONG_S, self._say)
+        timer = Timer(LONG_S, self._print)
         timer.daemon = True
         timer.start()
         self._timers.append(timer)
@@ -86,9 +87,9 @@ class _Announce(event.Listener):
     def on_end(self, event: event.Event) -> None:
         self._timers.pop().cancel()
 
-    def _say(self) -> None:
-        if not self._said:
-            self._said = True
+    def _print(self) -> None:
+        if not self._printed:
+            self._printed = True
             print("compiling numeric code: once after an installation, for one to three minutes", file=sys.stderr)
 
 

@@ -65,7 +65,7 @@ def test_every_extra_is_on_one_page():
         (p.name, extra)
         for p in OWN
         if p.suffix in (".py", ".md", ".yaml")
-        for extra in re.findall(r"pip install 'r2s\[(\w+)\]'", p.read_text())
+        for extra in re.findall(r"pip install 'r2s\[([a-z]\w+)\]'", p.read_text())
     }
     assert len(named) > 10
     assert not [(name, extra) for name, extra in named if extra not in EXTRAS]
@@ -116,9 +116,17 @@ def test_no_import_is_left_to_chance():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
             imported |= {name.split(".")[0]: path for name in names}
-    brought = {Requirement(line).name for line in PROJECT["project"]["dependencies"]}
-    provided = {module for module, names in packages_distributions().items() if brought & set(names)}
+    brought = {Requirement(line).name.lower() for line in PROJECT["project"]["dependencies"]}
+    provided = {module for module, names in packages_distributions().items() if brought & {n.lower() for n in names}}
     optional = {m.split(".")[0] for p in files for m in re.findall(r'optional_import\(\s*f?"([\w.]+)', p.read_text())}
-    elsewhere = {"r2s", "numba", "yaml", "PIL", "filelock", "llvmlite"}  # of what a dependency needs itself
+    elsewhere = {
+        "r2s",
+        "dartpy",
+        "joblib",
+        "yaml",
+        "PIL",
+        "filelock",
+        "llvmlite",
+    }  # of what a dependency needs itself
     elsewhere |= {"onnxruntime", "IPython"}  # in a bundle, in a notebook
     assert not imported.keys() - provided - optional - elsewhere - set(sys.stdlib_module_names)

@@ -9,10 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from r2s.reporting.measures import measures_of
 from r2s.runs import status_of
@@ -20,6 +17,7 @@ from r2s.runs import status_of
 LOST = ("failed", "killed")
 COLUMNS = ["status", "age", "result"]
 LONGEST = 46  # letters of a run's name in a terminal; the time at its beginning tells runs apart
+LEAST = 20  # letters of a result
 
 
 def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False) -> pd.DataFrame:
@@ -46,15 +44,18 @@ def run_rows(root: str | Path, *, stage: str | None = None, failed: bool = False
 
 def print_runs(console: Console, runs: pd.DataFrame, title: str) -> None:
     """Print `run_rows`, one line each: cut at the width of a terminal, whole in a file or pipe."""
-    cut = console.is_terminal
-    table = Table(title=title, title_style="bold", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("run", no_wrap=True, max_width=LONGEST if cut else None)
-    table.add_column("status", no_wrap=True)
-    table.add_column("age", no_wrap=True, justify="right")
-    table.add_column("result", no_wrap=True)
-    for name, row in runs.iterrows():
-        table.add_row(*(escape(str(cell)) for cell in (name, *row)))
-    console.print(table, width=None if cut else 10_000, no_wrap=True, crop=cut)
+    rows = [("run", *runs.columns), *((str(name), *map(str, row)) for name, row in runs.iterrows())]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    if console.is_terminal:
+        widths[0] = min(widths[0], LONGEST)
+        widths[-1] = max(LEAST, console.width - sum(widths[:-1]) - 2 * (len(widths) - 1))
+
+    def cell(text: str, width: int) -> str:
+        return text if len(text) <= width else f"{text[: width - 1]}…"
+
+    lines = ["  ".join(cell(*c).ljust(c[1]) for c in zip(row, widths, strict=True)).rstrip() for row in rows]
+    for line in (title, "", lines[0], "─" * min(console.width, max(map(len, lines))), *lines[1:]):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def ago(seconds: float) -> str:
@@ -72,7 +73,7 @@ def _result(folder: Path, meta: Mapping[str, Any]) -> str:
         if summary.is_file():
             return _key_figures(folder, meta.get("stage", ""), json.loads(summary.read_text()))
         if "error" in meta:
-            return str(meta["error"]).splitlines()[0]
+            return str(meta["error"]).splitlines()[0].removeprefix("Stopped: ")
         with open(folder / "evaluations.csv", newline="") as file:
             *_, row = csv.DictReader(file)
         return f"{_in_words(folder, row)} after {float(row['env_steps']) / 1e3:.0f}k env steps"

@@ -62,12 +62,12 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
 
 def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str | None = None) -> None:
     """Print a table of strings; uncertain values are dimmed."""
-    left = {"title_justify": "left", "caption_justify": "left"}
-    table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **left)  # type: ignore[arg-type]
+    how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
+    table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))
     for column in frame.columns:
         table.add_column(str(column), justify="right")
     for label, row in frame.iterrows():
         cells = [escape(str(cell)) for cell in row]
         table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if doubtful(c) else c for c in cells))
-    console.print(table)
+    console.print(table, *[""] * bool(caption), sep="\n")

@@ -50,7 +50,8 @@ class Value(NamedTuple):
         half = 0.5 * (self.high - self.low)
         if self.kept:
             return f"{number(self.old)}\nkept"
-        return f"{self.found.replace(' ', '')}\n±{number(half, '{:.0f}' if half >= 100 else '{:.2g}')}"
+        new = number(self.new, "{:.3g}" if abs(self.new) >= 1e-3 else "{:.2g}")
+        return f"{new}{'' if self.identifiable else '?'}\n±{number(half, '{:.0f}' if half >= 100 else '{:.2g}')}"
 
     @property
     def interval(self) -> str:
