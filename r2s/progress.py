@@ -57,8 +57,12 @@ class Progress:
 
     def _show(self, share: float, text: str) -> None:
         now = time.perf_counter()
-        if share < 0.5 * self._share:  # the next part, such as another search of an identification
+        if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part, such as another search
             self._part = now
+            if self._bar:  # a bar that was full stays finished: it would show no time any more
+                began = self._bar.tasks[0].start_time
+                self._bar.reset(self._task)
+                self._bar.tasks[0].start_time = began
         self._share = share
         if now - self._shown < (0.2 if self._bar else self._every):
             return

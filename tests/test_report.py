@@ -33,6 +33,7 @@ from r2s.identification.result import IdentificationResult
 from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import Robot, load_robot
+from r2s.progress import Progress
 from r2s.recordings.recording import Recording
 from r2s.reporting import pages
 from r2s.reporting.document import KEPT, report_html, report_markdown
@@ -280,6 +281,20 @@ def test_colours_are_fixed_by_meaning_and_differ():
     found = colours(labels)
     assert len(set(found.values())) == len(labels)
     assert found["twin, nominal"] == colours(["nominal"])["nominal"]
+
+
+def test_a_bar_goes_on_after_it_was_full(monkeypatch):
+    """An identification has several searches: each begins at zero, and the time goes on."""
+    monkeypatch.setenv("FORCE_COLOR", "1")  # makes rich see a terminal
+    progress = Progress("identify")
+    (task,) = progress._bar.tasks
+    progress(1.0)
+    assert task.finished
+    before = task.elapsed
+    progress(0.3)
+    assert not task.finished
+    assert task.elapsed > before
+    progress.close()
 
 
 SUMMARY = {

@@ -101,6 +101,8 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         count = len({row[name] for row in summary[what]})
         return f"{count} {'groups of runs' if what == 'scores' else 'adapters'} compared"
     rows = summary["reach"] if stage == "pipeline" else summary
+    if stage == "pipeline":  # the arm, for which it was done
+        rows = {where: row for where, row in rows.items() if not where.endswith((", mujoco", ", predicted"))}
     table = measures_of(folder)
     measure = table[table.transfer[0]]
     cells = [f"{where} {measure.cell(row.get(measure.key))}" for where, row in rows.items()]
