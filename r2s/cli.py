@@ -211,8 +211,10 @@ def errors_in_one_line():
     except Stopped as reason:
         print(f"stopped: {in_one_line(reason)}", file=sys.stderr)
         sys.exit(STOPPED)
-    except KeyboardInterrupt:
-        print("\ninterrupted; the run folder keeps what was written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        folder = str(stop)  # see r2s/runs.py; empty before there is one
+        again = f"; resume={folder} goes on" if Path(folder).parent.name in RESUMABLE else ""
+        print(f"\ninterrupted{f'; {folder} keeps what was written{again}' if folder else ''}", file=sys.stderr)
         sys.exit(INTERRUPTED)
 
 

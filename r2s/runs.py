@@ -142,6 +142,9 @@ class Run:
         self._meta["status"] = "done" if kind is None else "stopped" if interrupted else "failed"
         if error is not None:
             self._meta["error"] = f"{kind.__name__ if kind else ''}: {error}".strip(": ")
+        if isinstance(error, KeyboardInterrupt):
+            self._meta["error"] = "interrupted"
+            error.args = (str(self.folder),)  # which r2s/cli.py prints
         try:
             for _, file in self._tables.values():
                 file.close()

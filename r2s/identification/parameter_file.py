@@ -84,6 +84,8 @@ def load_parameters(folder: str | Path, robot: Robot, trust: Sequence[str] = ())
     """
     path = Path(folder)
     path = path / "parameters.yaml" if path.is_dir() else path
+    if Path(folder).is_dir() and not path.is_file():
+        raise UserError(f"calibration: {folder} has no parameters.yaml; is it a finished identification?")
     if not path.is_file():
         siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
         raise UserError(f"calibration: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")

@@ -48,10 +48,12 @@ def trained_config(cfg, option="policy"):
     Raises:
         UserError: it is no finished training.
     """
-    source = Path(cfg.policy) if cfg.policy else None
-    if source is None or not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
-        names = [p.name for p in source.parent.glob("*")] if source and source.parent.is_dir() else []
-        near = nearest(source.name, names) if source else ""
+    if not cfg.policy:
+        raise UserError(f"{option} must be given: {option}=RUN_FOLDER, of a finished stage=train")
+    source = Path(cfg.policy)
+    if not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
+        names = [p.name for p in source.parent.glob("*")] if source.parent.is_dir() else []
+        near = nearest(source.name, names)
         raise UserError(f"{option}: '{cfg.policy}' is no finished run folder of stage=train{near}")
     trained = run_config(source, getattr(cfg, "trust", None))
     if trained.stage != "train":

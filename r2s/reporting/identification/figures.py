@@ -164,7 +164,7 @@ def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
                 title = f"{label}: {count:.0f} evaluations"
                 axis.plot([], [], color=colour[label], marker="o", markersize=3.5, label=title)
         log_axis(axis)
-        axis.set_ylim(lowest / 1.3, 1.3)
+        axis.set_ylim(min(lowest / 1.3, 0.45), 1.3)  # at least two ticks
         axis.set_xlim(left=0)
         axis.set(xlabel="seconds", ylabel="cost relative to the start of the search")
     return path
