@@ -1,7 +1,7 @@
 """Commands without a run folder of their own.
 
-`r2s list`, `look` and `export` read run folders, `convert` writes a recording for ROS 2 or LeRobot, `check` connects
-to an arm.
+`r2s list`, `look` and `export` read run folders, `convert` writes a recording for ROS 2 or LeRobot, `check` judges a
+recording, or connects to an arm.
 """
 
 import os
@@ -9,11 +9,13 @@ import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from r2s.errors import UserError, choices, nearest
 
 PORT = 9090
+CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # groups that a command reads
+JUDGED = (*CONVERTED, "identify")
 TRUSTED = "modules that a run may execute beside r2s, with commas between, also trust=MODULES"
 
 
@@ -46,9 +48,11 @@ def run_command(words: Sequence[str]) -> None:
     exporting.add_argument("run", type=Path, metavar="RUN", help="run folder of a finished training")
     exporting.add_argument("--to", type=Path, help="new folder, also to=FOLDER; default RUN/bundle")
     exporting.add_argument("--trust", help=TRUSTED)
-    checking = commands.add_parser("check", help="connect to an arm without moving it, and compare it with the model")
-    checking.add_argument("override", nargs="+", metavar="KEY=VALUE", help="arm=panda arm.address=..., robot=...")
+    checking = commands.add_parser("check", help="verdict on a recording before a fit, or on an arm before a motion")
+    words_of_check = "data=recording data.path=FILE ..., or arm=panda arm.address=...; robot=..."
+    checking.add_argument("override", nargs="+", metavar="KEY=VALUE", help=words_of_check)
     checking.add_argument("--seconds", type=float, default=10.0, help="of reading states, default 10; 0: none")
+    checking.add_argument("--to", type=Path, help="of a recording: also to=FILE.json; default runs/check/NAME.json")
     converting = commands.add_parser("convert", help="write a recording as MCAP (ROS 2) or as a LeRobotDataset")
     converting.add_argument("file", type=Path, metavar="FILE", help="a recording, or episodes_*.npz of a transfer")
     converting.add_argument("override", nargs="*", metavar="KEY=VALUE", help="robot=, data.torque=, data.columns.q=")
@@ -131,23 +135,46 @@ def export(typed: Namespace) -> None:
 
 
 def check(typed: Namespace) -> None:
-    """Connect to an arm, print what was compared, and raise UserError if anything is refused; nothing moves."""
+    """Judge a recording, or an arm: print what was compared, and raise UserError if anything is refused."""
+    from r2s.stages.check_data import check_data
+
+    if not any(word.split("=")[0].split(".")[0] == "data" for word in typed.override):
+        check_arm(typed)
+        return
+    sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
+    check_data(composed("check", typed.override, JUDGED), typed.to)
+
+
+def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
+    """Return the config of stage=identify with the overrides `words`, all of these groups.
+
+    Raises:
+        UserError: another group, or an option that does not exist.
+    """
     from hydra import compose, initialize_config_dir
+
+    from r2s.override_checks import check_overrides
+    from r2s.stages.build import CONF
+
+    if other := [w for w in words if w.split("=")[0].split(".")[0] not in groups]:
+        raise UserError(f"{command}: expected {choices(f'{g}=' for g in groups)} and their keys, got '{other[0]}'")
+    check_overrides(words := ["stage=identify", *words], None)
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return compose("config", words)
+
+
+def check_arm(typed: Namespace) -> None:
+    """Connect to an arm, print what was compared, and raise UserError if anything is refused; nothing moves."""
     from omegaconf import OmegaConf
     from pandas import DataFrame
 
     from r2s.arm.clients.computer_check import computer_findings, network_findings
     from r2s.arm.clients.connection_check import Finding, refuse
     from r2s.arm.interface import ArmStopped
-    from r2s.override_checks import check_overrides
     from r2s.reporting.tables import print_table
-    from r2s.stages.build import CONF, console, make_robot, opened_arm
+    from r2s.stages.build import console, make_robot, opened_arm
 
-    if other := [w for w in typed.override if w.split("=")[0].split(".")[0] not in ("arm", "robot")]:
-        raise UserError(f"check: expected arm=, robot= and their keys, got '{other[0]}'")
-    check_overrides(words := ["stage=identify", *typed.override], None)
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        cfg = compose("config", words)
+    cfg = composed("check", typed.override, ("arm", "robot"))
     if "collision_torque" not in cfg.arm:
         raise UserError(
             f"check: arm={cfg.arm.name} has no connection; allowed: panda, fr3, panda_emulated, fr3_emulated"
@@ -168,27 +195,19 @@ def check(typed: Namespace) -> None:
 
 def convert(typed: Namespace) -> None:
     """Write a recording, or the episodes of a transfer, as MCAP or as a LeRobotDataset."""
-    from hydra import compose, initialize_config_dir
-
-    from r2s.override_checks import check_overrides
     from r2s.physics.description import chain
     from r2s.recordings.lerobot import write_dataset
     from r2s.recordings.ros_bag import write_mcap
-    from r2s.stages.build import CONF, make_dynamics, make_robot
+    from r2s.stages.build import make_dynamics, make_robot
     from r2s.stages.data import file_data, read_episodes, read_file, read_reference
     from r2s.stages.run_config import run_config
 
-    groups = ("robot", "data", "calibration", "friction", "inertia")
-    if other := [w for w in typed.override if w.split("=")[0].split(".")[0] not in groups]:
-        raise UserError(f"convert: expected {choices(f'{g}=' for g in groups)} and their keys, got '{other[0]}'")
     if typed.to.suffix not in ("", ".mcap"):
         raise UserError(f"to: expected FILE.mcap, or a folder for a LeRobotDataset, got {typed.to}")
     if typed.to.exists():
         raise UserError(f"to: {typed.to} exists")
     sys.path.append(os.getcwd())  # a user's robot is a module of the working folder
-    check_overrides(words := ["stage=identify", "data=recording", *typed.override], None)
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        cfg = compose("config", words)
+    cfg = composed("convert", ["data=recording", *typed.override], CONVERTED)
     if (typed.file.parent / "config.yaml").is_file() and not any(w.startswith("robot") for w in typed.override):
         cfg.robot = run_config(typed.file.parent, typed.trust).robot
     robot = make_robot(cfg)

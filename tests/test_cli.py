@@ -243,6 +243,8 @@ def test_command(command, root, recording, trained, identified):
     toy = TOY if re.search("stage=|oracle", command) else SHORT
     if "pipeline" in command:
         toy = [*SHORT, "pipeline.train_minutes=null"]
+    if "stage=excite" in command:
+        toy = [*TOY, "excite.seconds=3", "excite.effort=5"]
     if "search=ga" in command:
         toy = ["data.seconds=2", "data.ramp_poses=1", "search.0.population=4", "search.0.generations=2"]
         toy += [
@@ -275,6 +277,7 @@ def test_run_folders_hold_what_the_contract_says(trained, identified):
         for key in ("torque_rmse_Nm", "nominal_torque_rmse_Nm", "position_rmse_mrad", "nominal_position_rmse_mrad"):
             assert len(errors[side][key]) == 7
         assert "0.1" in errors[side]["ee_error_mm"]
+    assert json.loads((identified / "verdict.json").read_text())["verdict"] in ("pass", "warn")
     first = []
     for side in ("train", "validation"):
         with np.load(identified / f"{side}.npz") as file:
@@ -352,6 +355,11 @@ MISTAKES = {
     "stage=estimate arm.friction_scale=nan": r"arm.friction_scale: expected a number in \[0.1, 3\], got nan",
     "stage=estimate arm.extra_delay_s=5": r"arm.extra_delay_s: expected a number in \[0, 0.02\], got 5",
     "stage=estimate arm.payload=2": r"arm.payload: expected a number in \[0, 1.5\], got 2",
+    "stage=excite excite.seconds=700": r"excite.seconds: expected a number in \[2, 600\], got 700",
+    "stage=excite excite.torque=mesured": r"excite.torque: expected measured, .* 'mesured'; did you mean 'measured'",
+    "stage=excite excite.parameters=[ofset]": r"excite.parameters: 'ofset' is not estimated.*did you mean 'offset'",
+    "stage=excite excite.obstacles=[{center:[0.4,0,0.3],size:[0.2,0.2,0.6]}]": r"obstacle 1 is .* at robot.q_home",
+    "stage=excite arm.seed=3": r"arm.seed: stage=excite does not read it: nothing moves",
     "algo=tqq": r"algo: no option 'tqq'.*tqc",
     "algo.gama=0.9": r"unknown option 'algo.gama'; did you mean 'algo.gamma'",
     "+typo=1": r"unknown option 'typo'",

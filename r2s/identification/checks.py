@@ -4,7 +4,7 @@ import numpy as np
 
 from r2s.errors import UserError
 from r2s.identification.residuals.windows import MOVED
-from r2s.identification.unit_checks import OVER_LIMIT, check_units
+from r2s.identification.unit_checks import OVER_LIMIT, Judged, check_units
 from r2s.physics.robot import Robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
@@ -16,12 +16,26 @@ MARGIN = 0.05  # rad beyond the position limits: logs of arms at their limits do
 LEAST_S = 1.0  # s of motion
 
 
-def check_recording(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if a user's recording does not fit the arm (`check_motion`), is damaged or has wrong units."""
+def check_recording(robot: Robot, recording: Recording) -> Judged | None:
+    """Return what `check_units` measured.
+
+    Raises:
+        UserError: a user's recording does not fit the arm (`check_motion`), is damaged or has wrong units.
+    """
     check_motion(robot, recording)
     _check_spikes(robot, recording, NONSENSE)
-    check_units(robot, recording)
+    judged = check_units(robot, recording)
     _check_spikes(robot, recording, SPIKE)
+    return judged
+
+
+def check_rate(cutoff_hz: float, recording: Recording) -> None:
+    """Raise UserError unless a cutoff is below the recording's Nyquist rate."""
+    if cutoff_hz >= 0.499 * recording.rate_hz:  # the clock of a log jitters
+        raise UserError(
+            f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
+            f"{recording.name or 'the recording'} ({recording.rate_hz:.4g} Hz), got {cutoff_hz:g}"
+        )
 
 
 def check_motion(robot: Robot, recording: Recording) -> None:

@@ -7,6 +7,7 @@ mounting do not. r2s refuses a recording only if a correction leaves at most a q
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -31,47 +32,87 @@ CURRENT = 0.005  # Nm/A: no arm's joint has less, so a smaller factor is no curr
 OVER_LIMIT = 3.0  # times tau_max, at most
 RATIO = 4.0  # factor between dq and the slope of q that is refused, like its inverse
 UNITS = {"tau": {1e3: "mNm", 1e-3: "kNm"}, "dq": {np.degrees(1): "deg/s", 1e3: "mrad/s", np.radians(1): "", 1e-3: ""}}
+ORDER, UNITS_OF, GRAVITY, CLOCK, MASSES = "order of joints", "units and signs", "gravity", "clock", "masses"
 
 
-def check_units(robot: Robot, recording: Recording) -> None:
-    """Raise UserError if dq or tau have other units, signs or joint order; too few rows are not judged."""
+class DataError(UserError):
+    """A recording is refused; `check` names the check, one of those above."""
+
+    def __init__(self, check: str, message: str):
+        super().__init__(message)
+        self.check = check
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the checks of a recording measured; nan or None: the motion does not show it.
+
+    Attributes:
+        clock: (n,) change of q over the integral of dq. scale: (n,) dq over the slope of q. late: (n,) s, of dq.
+        misfit: share of the torque's square that the nominal arm leaves. shares: (S,) of nominal gravity in tau.
+    """
+
+    clock: np.ndarray
+    scale: np.ndarray
+    late: np.ndarray
+    misfit: float | None = None
+    shares: np.ndarray | None = None
+
+
+def check_units(robot: Robot, recording: Recording) -> Judged | None:
+    """Return what was measured of clock, dq and tau, or None: too few rows are not judged.
+
+    Raises:
+        DataError: dq or tau have other units, signs or joint order, or the clock is wrong.
+    """
     moved = np.ptp(recording.q, axis=0) > STILL
     dead = np.flatnonzero(moved & (np.ptp(recording.tau, axis=0) == 0))
     if recording.torque != "commanded" and len(dead):
-        raise UserError(
+        raise DataError(
+            UNITS_OF,
             f"the recording: tau of joint {dead[0] + 1} is {recording.tau[0, dead[0]]:g} Nm in every row, though the "
-            "joint moves: is its sensor dead?"
+            "joint moves: is its sensor dead?",
         )
     if any(s.stop - s.start < 2 for s in recording.stretches):
-        return
+        return None
     if recording.rate_hz < SLOWEST_HZ:
-        check_clock(recording)
-        return
+        _check_clock(recording)
+        return None
     smooth, step = recording.resample(SIM_DT).smooth(CUTOFF_HZ), round(1 / (RATE_HZ * SIM_DT))
     dq = smooth.derivative(smooth.q)
     rows = np.concatenate([np.arange(s.start + EDGE, s.stop - EDGE, step) for s in smooth.stretches])
     if len(rows) < MIN_ROWS:
-        check_clock(recording)
-        return
+        _check_clock(recording)
+        return None
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MAX_ROWS)).astype(int)]
     dead = np.flatnonzero(moved & (np.ptp(recording.dq, axis=0) == 0))
     if len(dead):
-        raise UserError(
+        raise DataError(
+            UNITS_OF,
             f"the recording: dq of joint{_listed(dead)} is {recording.dq[0, dead[0]]:g} rad/s in every row, though q "
-            "moves; leave dq out of the file to derive it from q"
+            "moves; leave dq out of the file to derive it from q",
         )
-    _check_velocity(dq[rows], smooth.dq[rows])
-    check_clock(recording)
+    scale = _check_velocity(dq[rows], smooth.dq[rows])
+    clock = _check_clock(recording)
     m = Moments(smooth.q[rows], dq[rows], smooth.derivative(dq)[rows], smooth.tau[rows])
-    _check_torque(robot, m, recording, moved)
+    lead = smooth.dq[rows] - m.dq
+    late = np.where(np.isnan(scale), np.nan, -(lead * m.ddq).sum(0) / np.maximum((m.ddq**2).sum(0), 1e-12))
+    return Judged(clock, scale, late, *_check_torque(robot, m, recording, moved))
 
 
-def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
-    """Compare the slope of q (T, n) with dq (T, n), both rad/s."""
+def _check_clock(recording: Recording) -> np.ndarray:
+    try:
+        return check_clock(recording)
+    except UserError as error:
+        raise DataError(CLOCK, str(error)) from None
+
+
+def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    """Compare the slope of q (T, n) with dq (T, n), both rad/s; return their ratio (n,), nan for joints at rest."""
     size = np.sqrt((slope**2).mean(0))
-    seen = np.flatnonzero(size > MOVING)
+    seen, ratios = np.flatnonzero(size > MOVING), np.full(len(size), np.nan)
     if not len(seen):
-        return
+        return ratios
     s, v = slope[:, seen], dq[:, seen]
     cross = s.T @ v / len(s)  # of joint j's slope and column k
     square = np.maximum((v**2).mean(0), 1e-12)
@@ -79,8 +120,8 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
     own = np.diag(left)
     if (swap := _swapped(left, own)) is not None:
         fits = _fits(seen, swap, "dq", "the slope of q of ")
-        raise UserError(f"the recording: dq and q have their joints in another order: {fits}")
-    factor = np.diag(cross) / size[seen] ** 2
+        raise DataError(ORDER, f"the recording: dq and q have their joints in another order: {fits}")
+    factor = ratios[seen] = np.diag(cross) / size[seen] ** 2
     scaled = (factor > RATIO) | (abs(factor) < 1 / RATIO)
     for wrong, what in ((factor < -REFUSED, "of the other sign than"), (scaled, "")):
         bad = np.flatnonzero(wrong & (own < REFUSED))
@@ -92,13 +133,16 @@ def _check_velocity(slope: np.ndarray, dq: np.ndarray) -> None:
         unit = f": {UNITS['dq'][near]}, not rad/s?" if known and UNITS["dq"][near] else ""
         unit = unit or (": q is not in rad, or t not in s?" if known else "")
         what = what or f"{ratio:.{3 if abs(ratio) < 999.5 else 4}g} times"
-        raise UserError(f"the recording: dq of joint{_listed(seen[bad])} is {what} the slope of its q{unit}")
+        words = f"dq of joint{_listed(seen[bad])} is {what} the slope of its q{unit}"
+        raise DataError(UNITS_OF, f"the recording: {words}")
     strange = np.flatnonzero((own > REFUSED) & (size[seen] > 3 * MOVING))
     if len(strange):
-        raise UserError(
+        raise DataError(
+            UNITS_OF,
             f"the recording: dq of joint{_listed(seen[strange])} does not follow the slope of its q "
-            f"({100 * own[strange[0]]:.0f} % of its square is unexplained)"
+            f"({100 * own[strange[0]]:.0f} % of its square is unexplained)",
         )
+    return ratios
 
 
 def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -110,78 +154,86 @@ def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return None
 
 
-def _check_torque(robot: Robot, m: Moments, recording: Recording, moved: np.ndarray) -> None:
-    """Compare the torque with that of the nominal arm for the same motion."""
+def _check_torque(
+    robot: Robot, m: Moments, recording: Recording, moved: np.ndarray
+) -> tuple[float | None, np.ndarray | None]:
+    """Compare the torque with that of the nominal arm for the same motion; return misfit and shares of `Judged`."""
     gravity = recording.torque != "commanded"
     most = np.quantile(np.abs(recording.tau), 0.99, axis=0) / robot.tau_max
     left = Unexplained(robot, m, gravity)
     held = np.sqrt((left.need**2).mean(0)) > HELD * robot.tau_max
     left.seen = np.flatnonzero(moved | held)
     if not len(left.seen):
-        return
+        return None, None
     own = left.each(m.tau)
     tau = f"the recording: {recording.torque} tau"
-    corrections = []  # (what it leaves of the misfit, description)
+    corrections = []  # (what it leaves of the misfit, check, description)
     if own.mean() > REFUSED or most.max() > OVER_LIMIT:
         for factor, unit in UNITS["tau"].items():
             words = f"is {factor:g} times what {robot.name} needs for this motion: {unit}, not Nm?"
-            corrections.append((left.each(m.tau / factor).mean() / own.mean(), words))
+            corrections.append((left.each(m.tau / factor).mean() / own.mean(), UNITS_OF, words))
     if own.mean() > REFUSED:
         words = f"has the other sign in all joints: negated, it fits what {robot.name} needs"
-        corrections.append((left.each(-m.tau).mean() / own.mean(), words))
+        corrections.append((left.each(-m.tau).mean() / own.mean(), UNITS_OF, words))
     misfit = left.misfit()
     if misfit > SUSPECT:
         kind = left.with_need(left.inverse_dynamics(not gravity)).misfit()  # of the other kind of torque
         limit = min(SUSPECT, kind)
-        corrections += [(after / misfit, words) for after, words in other_orders(left, gravity) if after < limit]
+        orders = [(after / misfit, ORDER, words) for after, words in other_orders(left, gravity) if after < limit]
+        corrections += orders
     if misfit > TURNED and gravity:
-        corrections += [(after / misfit, words) for after, words in mounting(left) if after < MASS_LEFT * misfit]
+        turned = [(after / misfit, GRAVITY, words) for after, words in mounting(left) if after < MASS_LEFT * misfit]
+        corrections += turned
     corrections = [x for x in corrections if x[0] < CORRECTED]
     if own.max() > REFUSED:
-        corrections += [(after / own.mean(), words) for after, words in _corrected_joints(left, own)]
+        corrections += [(after / own.mean(), *rest) for after, *rest in _corrected_joints(left, own)]
     if misfit > SUSPECT and not corrections:
-        masses = [(after / misfit, words) for after, words in other_masses(left, gravity)]
+        masses = [(after / misfit, MASSES, words) for after, words in other_masses(left, gravity)]
         corrections = [x for x in masses if x[0] < MASS_LEFT]
     if corrections:
-        raise UserError(f"{tau} {min(corrections)[1]}")
+        _, check, words = min(corrections, key=lambda x: (x[0], x[2]))
+        raise DataError(check, f"{tau} {words}")
     if most.max() > OVER_LIMIT:
         j = int(most.argmax())
-        raise UserError(
+        raise DataError(
+            UNITS_OF,
             f"{tau} reaches {most[j] * robot.tau_max[j]:.4g} Nm in joint {j + 1}, {robot.name} has at most "
-            f"{robot.tau_max[j]:g}; is it in Nm, and the right arm?"
+            f"{robot.tau_max[j]:g}; is it in Nm, and the right arm?",
         )
     shares = left.gravity_shares()
     if shares is None:
-        return
+        return misfit, None
     mean = f"({100 * shares.mean():.0f} % of {robot.name}'s)"
     if gravity and shares.max() < -HAS_GRAVITY[0]:
-        raise UserError(f"{tau} contains gravity with the other sign {mean}")
+        raise DataError(GRAVITY, f"{tau} contains gravity with the other sign {mean}")
     if gravity and np.abs(shares).max() < NO_GRAVITY:
         (factors, rest), other = left.scaled(), left.with_need(left.inverse_dynamics(False)).scaled()[1]
         if rest < min(SUSPECT, other) and np.median(factors) > CURRENT:
-            raise UserError(
+            raise DataError(
+                UNITS_OF,
                 f"{tau} is {np.median(factors):.2g} times what {robot.name} needs: is it a current in A? Then set "
-                "data.torque=motor and data.torque_constant=[Nm/A of each joint, gear included]"
+                "data.torque=motor and data.torque_constant=[Nm/A of each joint, gear included]",
             )
-        raise UserError(f"{tau} hardly contains gravity {mean}: is it data.torque=commanded?")
+        raise DataError(GRAVITY, f"{tau} hardly contains gravity {mean}: is it data.torque=commanded?")
     # an undeclared payload adds another share to each joint
     if not gravity and shares.min() > HAS_GRAVITY[0] and shares.max() < HAS_GRAVITY[1]:
-        raise UserError(f"{tau} contains gravity {mean}: is it data.torque=measured?")
+        raise DataError(GRAVITY, f"{tau} contains gravity {mean}: is it data.torque=measured?")
+    return misfit, shares
 
 
-def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str]]:
+def _corrected_joints(left: Unexplained, own: np.ndarray) -> list[tuple[float, str, str]]:
     """Return corrections of single joints: swapped columns, and flipped signs."""
     seen, out, pairs = left.seen, [], left.pairs()
     if (swap := _swapped(pairs, own)) is not None:
         order = np.arange(len(seen))
         order[swap[0]] = swap[1]
         words = f"has its joints in another order than q: {_fits(seen, swap, 'tau', '')}"
-        out.append((pairs[np.arange(len(seen)), order].mean(), words))
+        out.append((pairs[np.arange(len(seen)), order].mean(), ORDER, words))
     signs = left.each(-left.m.tau)
     flipped = (own > REFUSED) & (signs < CORRECTED * own)
     if flipped.any() and not flipped.all():
         words = f"has the other sign in joint{_listed(seen[flipped])}: negated, it fits what {left.robot.name} needs"
-        out.append((np.where(flipped, signs, own).mean(), words))
+        out.append((np.where(flipped, signs, own).mean(), UNITS_OF, words))
     return out
 
 

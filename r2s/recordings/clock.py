@@ -33,13 +33,17 @@ def speed_factors(recording: Recording) -> np.ndarray:
     return np.where((own > least) & (left < UNEXPLAINED), factor, np.nan)
 
 
-def check_clock(recording: Recording) -> None:
-    """Raise UserError if t runs too fast or too slow for the speeds, or dq of a joint has another scale than q."""
+def check_clock(recording: Recording) -> np.ndarray:
+    """Return `speed_factors` (n,).
+
+    Raises:
+        UserError: t runs too fast or too slow for the speeds, or dq of a joint has another scale than q.
+    """
     factor = speed_factors(recording)
     seen = np.flatnonzero(np.isfinite(factor))
     off = seen[np.abs(np.log(np.abs(factor[seen]))) > np.log1p(WRONG)]
     if not len(off):
-        return
+        return factor
     middle = float(np.median(factor[seen]))
     if len(off) == len(seen) and np.ptp(factor[seen]) < ALIKE * abs(middle) and middle > 0:
         raise UserError(

@@ -60,14 +60,17 @@ def print_measures(console: Console, measures: MeasureTable, rows: Mapping[str, 
     print_table(console, measure_rows(measures, rows), title)
 
 
-def print_table(console: Console, frame: pd.DataFrame, title: str, caption: str | None = None) -> None:
-    """Print a table of strings; uncertain values are dimmed."""
+def print_table(
+    console: Console, frame: pd.DataFrame, title: str, caption: str | None = None, sentences: bool = False
+) -> None:
+    """Print a table of strings: of numbers, of which uncertain ones are dimmed, or of sentences."""
     how = {"title_justify": "left", "caption_justify": "left", "padding": (0, 1, 0, 0)}
     table = Table(title=title, caption=caption, title_style="bold", box=SIMPLE_HEAD, **how)  # type: ignore[arg-type]
     table.add_column(str(frame.index.name or ""))
     for column in frame.columns:
-        table.add_column(str(column), justify="right")
+        table.add_column(str(column), justify="left" if sentences else "right")
     for label, row in frame.iterrows():
         cells = [escape(str(cell)) for cell in row]
-        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if doubtful(c) else c for c in cells))
+        dim = [doubtful(c) and not sentences for c in cells]
+        table.add_row(escape(str(label)), *(f"[dim]{c}[/dim]" if d else c for c, d in zip(cells, dim, strict=True)))
     console.print(table, *[""] * bool(caption), sep="\n")

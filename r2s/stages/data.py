@@ -198,8 +198,6 @@ def read_motion(robot, file, share):
     Args:
         share: part of the recording that is held out if there is no validation file.
     """
-    import numpy as np
-
     from r2s.identification.checks import check_recording
 
     recording = read_file(robot, file, file.path)
@@ -214,6 +212,14 @@ def read_motion(robot, file, share):
         raise UserError("data.validation is the training file itself: it must hold other motion")
     validation = read_file(robot, file, file.validation)
     check_recording(robot, validation)
+    check_other_motion(recording, validation)
+    return recording, validation
+
+
+def check_other_motion(recording, validation):
+    """Raise UserError if a validation recording repeats training motion."""
+    import numpy as np
+
     rows = {row.tobytes() for row in np.column_stack([recording.q, recording.dq])}
     same = sum(row.tobytes() in rows for row in np.column_stack([validation.q, validation.dq]))
     if same > 0.01 * len(validation.t):
@@ -226,18 +232,15 @@ def read_motion(robot, file, share):
             f"data.validation: {100 * overlap:.0f} % of its motion repeats the training file; it must hold other "
             "motion (to hold out a part of a periodic motion, leave data.validation=null)"
         )
-    return recording, validation
 
 
 def check_cutoff(cutoff_hz, recordings):
     """Raise UserError unless identify.cutoff_hz is below the Nyquist rate of each recording."""
+    from r2s.identification.checks import check_rate
+
     check_number("identify.cutoff_hz", cutoff_hz, "(0, 500)")  # r2s works at 1 kHz
     for recording in recordings:
-        if cutoff_hz >= 0.499 * recording.rate_hz:  # the clock of a log jitters
-            raise UserError(
-                f"identify.cutoff_hz: expected less than {0.5 * recording.rate_hz:.4g} Hz, half the rate of "
-                f"{recording.name or 'the recording'} ({recording.rate_hz:.4g} Hz), got {cutoff_hz:g}"
-            )
+        check_rate(cutoff_hz, recording)
 
 
 def read_user_ramps(robot, file):

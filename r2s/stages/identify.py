@@ -106,11 +106,13 @@ def identify(cfg, overrides):
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
     from r2s.identification.prediction import prediction_errors
+    from r2s.identification.verdict import judge
     from r2s.physics.description import write_description
     from r2s.progress import Progress
     from r2s.recordings.speed_noise import speed_noise
     from r2s.reporting.identification.page import identification_page
     from r2s.reporting.identification.tables import identification_table
+    from r2s.runs import write_json
 
     made = make_parts(cfg)
     robot, nominal = made.robot, made.nominal
@@ -118,8 +120,13 @@ def identify(cfg, overrides):
     with open_run(cfg, overrides, made.inputs) as run:
         if cfg.data.kind != "recording":
             train, validation, ramps = record_arm(cfg, robot, run, made.motion)
-        nominal = replace(nominal, speed_noise=speed_noise([train, validation]))
         settings = make_settings(cfg, train.torque)
+        verdict = judge(robot, nominal, train, settings)
+        write_json(run.folder / "verdict.json", verdict.document())
+        verdict.refuse()
+        for warning in verdict.warnings:
+            print(f"warning: {warning}")
+        nominal = replace(nominal, speed_noise=speed_noise([train, validation]))
         progress = Progress("identify")
 
         def report(row):

@@ -1,0 +1,104 @@
+"""The 95 % widths that an identification of a recording will have, before it runs.
+
+A few steps of least squares on torque with all terms give the noise and the point at which the model is linearized.
+The widths are those of the identification's own posterior there. What takes an identification its time is left out:
+families, selection of terms, convergence, replays, breakaway.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from r2s.identification.identify import History, State, formulate
+from r2s.identification.parameters import TIMING, ParameterSpace
+from r2s.identification.posterior import posterior
+from r2s.identification.problem import Problem
+from r2s.identification.result import SHARPER, conclude
+from r2s.identification.search.least_squares import LeastSquares
+from r2s.identification.settings import Settings
+from r2s.identification.terms import scaled_prior
+from r2s.physics.dynamics import Dynamics, with_family
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import Recording
+
+STEPS, FTOL = 6, 1e-2  # Jacobians between two reweightings of the fit, and its relative gain at the end
+Z = 1.96  # standard deviations of half a 95 % interval
+USED_S, PIECE_S = 120.0, 10.0  # s of a longer recording that are used, in evenly spread pieces of this length
+
+
+@dataclass(frozen=True)
+class ExpectedWidths:
+    """Widths to expect.
+
+    Attributes:
+        space: the parameters. width: (P,) SI units, of the 95 % interval. share: (P,) of the prior's that is left.
+        identifiable: (P,) whether the data determine the value, by the rule of the identification's result.
+        late: s, by which measured tau is late against the motion, or the motion against commands, and its standard
+            deviation.
+    """
+
+    space: ParameterSpace
+    width: np.ndarray
+    share: np.ndarray
+    identifiable: np.ndarray
+    late: tuple[float, float]
+
+
+def torque_problem(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> Problem:
+    """Return the torque problem of an identification of these settings, with all of their terms.
+
+    family=auto stands for the family of the nominal arm.
+    """
+    if settings.family != "auto":
+        nominal = with_family(nominal, settings.family)
+    prior = scaled_prior(settings.prior, robot, recording, nominal)
+    history = History(lambda row: None, lambda name, make: make())
+    return formulate(State(robot, nominal, recording, (), settings, None, prior, history, settings.terms)).problem
+
+
+def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, settings: Settings) -> ExpectedWidths:
+    """Return the widths to expect of a recording.
+
+    Raises:
+        UserError: no trajectory is long enough, or a setting does not fit the arm.
+    """
+    used = _some(recording)
+    problem = torque_problem(robot, nominal, used, settings)
+    space = problem.space
+    u = LeastSquares(STEPS, FTOL, level="torque")(problem, problem.start, lambda row: None)
+    problem = problem.torque_reweighted(u)
+    sure = posterior(problem, u, settings.seed)
+    found = conclude(problem, space, sure._asdict(), history=pd.DataFrame(), families={}).found
+    share = np.minimum(sure.steps.std(0) / problem.prior_width, 1.0)
+    # the rows that are left out have as much information as those that are used
+    more = recording.duration / used.duration
+    less = 1.0 / np.sqrt(share**2 + more * (1.0 - share**2))
+    seen = found.identifiable | ((more > 1.0) & (Z * less * share < 1.0 / SHARPER))
+    if timing := [k for name in TIMING if name in space.blocks for k in space.where(name).tolist()]:
+        draws = space.from_unit(u + sure.steps)[:, timing].sum(1)
+        late = float(space.from_unit(u)[timing].sum()), float(draws.std())
+    else:
+        late = _lateness(problem, u)
+    return ExpectedWidths(space, less * (found.high - found.low), less * share, seen, late)
+
+
+def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
+    """Return by how much tau is late, s, beyond what the parameters explain, and its standard deviation."""
+    data = problem.torque_data
+    r, j = data(problem.space.from_unit(u[None]))[0], data.jacobian(u)
+    change = (data.motion.command(0.0, 0.0) - data.motion.command(SIM_DT, 0.0)) / SIM_DT
+    column = (change * data.seen / data.scale).reshape(-1)
+    own = column - j @ np.linalg.lstsq(j.T @ j + problem.prior_information(u), j.T @ column, rcond=None)[0]
+    square = max(float(own @ own), 1e-12)
+    late = float(own @ r) / square
+    return (-late if data.commanded else late), square**-0.5
+
+
+def _some(recording: Recording) -> Recording:
+    """Return evenly spread pieces of a long recording, USED_S in total."""
+    if recording.duration <= USED_S:
+        return recording
+    t = np.arange(len(recording.t)) / len(recording.t) * recording.duration  # trajectories may share a clock
+    pieces = round(USED_S / PIECE_S)
+    return recording.select((t % (recording.duration / pieces)) < PIECE_S)
