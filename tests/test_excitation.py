@@ -12,7 +12,8 @@ from conftest import conf
 from r2s.arm.recorder import record
 from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError
-from r2s.excitation.fourier import fourier, information
+from r2s.excitation.fourier import fourier
+from r2s.excitation.information import information
 from r2s.excitation.motion import Excitation, load
 from r2s.excitation.motion_checks import (
     CLEARANCE_M,

@@ -12,19 +12,17 @@ from functools import partial
 import numpy as np
 
 from r2s.errors import UserError
+from r2s.excitation.information import COARSE_HZ, motion_information
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import (
     GEOMETRY_HZ,
     TABLE_M,
     TOOL_M,
     TORQUE_SHARE,
-    Motion,
     Space,
     check_motion,
-    gravity_torque,
     torque_share,
 )
-from r2s.physics.rigid_body import LinkInertia, regressor, tensor_elements
 from r2s.physics.robot import SIM_DT, Robot
 
 # Speed ladder: paces relative to full speed.
@@ -54,19 +52,10 @@ MIN_AMPLITUDE = 0.3  # share of a joint's amplitude; a series that needs less to
 MARGIN = 0.3  # share of each clearance, and 0.03 of tau_max: reserve for motion between two samples
 APPROACH_STEPS = 40  # postures checked on the straight path from q_home to the first posture
 FINE = 10  # samples for limits per sample for information and safety
-COARSE_HZ = 10  # samples for information and safety
 BLOCK = 5000  # rows of the basis computed at once; the basis of two minutes would take 1 GB
-# Information: standard deviations of noise and priors, rough values of torque-controlled arms.
-NOISE = 0.002  # share of tau_max, per sample
-FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
-DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, such as a cable's
-MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, of its centre of mass
-SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
-DELAY_PRIOR = 3e-3  # s
-SLOPE = 0.05  # share of dq_max, width of the sign change of friction
-RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carries no information
-
 Samples = tuple[np.ndarray, ...]  # offset from the centre, velocity, acceleration
+# of B motions (B, T, n) rad, rad/s, rad/s^2 at times (T,) s: (t, q, dq, ddq) -> (B,)
+Score = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def fourier(
@@ -103,77 +92,38 @@ def fourier(
         raise UserError(f"excitation.duration: expected {LEAST_S:g} to {LONGEST_S:g} s, got {duration:g}")
     if effort < 0:
         raise UserError(f"excitation.effort: expected a number of 0 or more, got {effort}")
-    center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)
-    _check_center(robot, center)
     space = Space(robot, table=table, z_min=z_min)
-    space.check(np.array([robot.q_home, center]), lambda k: ("at robot.q_home", "at excitation.q_center")[k])
-    candidates = _Candidates(robot, center, duration, gravity, space)
-    rng = np.random.default_rng(seed)
-    best = candidates.draw(rng, KEPT if effort else 1)
-    motion = candidates.finish(*candidates.search(rng, best, effort)) if best else None
-    if motion is None:
-        raise UserError(
-            f"excitation: no motion about q_center={np.round(center, 3).tolist()} keeps clear of the table at "
-            f"{table:g} m, of the arm itself and of {100 * TORQUE_SHARE:g} % of tau_max, with the end effector "
-            f"{z_min:g} m above the base plane; set another excitation.q_center"
-        )
-    check_motion(robot, motion, table=table, z_min=z_min)
+    center = checked_center(robot, space, q_center)
+    candidates = Candidates(robot, center, duration, partial(motion_information, robot, gravity=gravity), space)
+    motion = candidates.found(np.random.default_rng(seed), effort)
+    check_motion(robot, motion, space=space)
     return motion
 
 
-def information(robot: Robot, motion: Motion, *, gravity: bool = False) -> float:
-    """Return the information in nats of a recording of this motion: half the log det of posterior over prior.
+def checked_center(robot: Robot, space: Space, q_center: np.ndarray | None) -> np.ndarray:
+    """Return the centre posture (n,) rad of a motion, by default the middle of the position range.
 
-    The unknowns have independent normal priors. Per joint: offset, Coulomb friction as a tanh, its width and shift,
-    viscous friction, and angle-dependent drag. Per link: mass and centre of mass (their errors appear in gravity even
-    if the arm compensates the nominal ones). Without `gravity` (commanded torque): per link the tensor's scale, and
-    one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of tau_max at 10 samples per
-    second. Rows with a joint at rest do not count, because friction is undetermined there.
+    Raises:
+        UserError: it is outside the limits, or it or q_home is too near to an obstacle.
     """
-    every = round(1 / (COARSE_HZ * SIM_DT))
-    q, dq, ddq = (x[None, ::every] for x in (motion.q, motion.dq, motion.ddq))
-    return float(_information(robot, motion.t[::every], q, dq, ddq, gravity)[0])
+    center = 0.5 * np.add(*robot.q_range) if q_center is None else np.asarray(q_center, dtype=float)
+    _check_center(robot, center)
+    space.check(np.array([robot.q_home, center]), lambda k: ("at robot.q_home", "at excitation.q_center")[k])
+    return center
 
 
-def _information(
-    robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
-) -> np.ndarray:
-    """Return the information (B,) of B motions (B, T, n) at the times t (T,)."""
-    n, shape = robot.n, (len(q), len(t), robot.n)
-    flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)
-    y = regressor(robot, *flat, gravity=robot.gravity).reshape(*shape, n, 10)
-    speed, bend = dq / robot.dq_max, dq / (SLOPE * robot.dq_max)
-    step, bump = np.tanh(bend), 1 / np.cosh(np.minimum(np.abs(bend), 50)) ** 2
-    curves = FRICTION_PRIOR * np.stack([np.ones_like(dq), step, bend * bump, bump, speed], -1)
-    curves = np.concatenate([curves, DRAG_PRIOR * np.stack([np.sin(q), np.cos(q)], -1)], -1)
-    friction = np.zeros((*shape, n, 7))
-    friction[:, :, range(n), range(n)] = curves * robot.tau_max[:, None]
-    mass, center = MASS_PRIOR
-    points = y[..., :4] * np.outer(robot.mass, [mass, center, center, center])
-    if gravity:
-        tensors = y[..., 4:] * (SCALE_PRIOR * np.trace(robot.inertia, axis1=1, axis2=2)[:, None])
-        delay = np.zeros((*shape, 0))
-    else:
-        tensors = SCALE_PRIOR * np.einsum("btjkc,kc->btjk", y[..., 4:], tensor_elements(robot.inertia))
-        torque = np.einsum("btjkc,kc->btj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard())
-        torque -= gravity_torque(robot, flat[0]).reshape(shape)
-        coulomb = FRICTION_PRIOR * robot.tau_max * bump / (SLOPE * robot.dq_max) * ddq
-        delay = DELAY_PRIOR * (np.gradient(torque, t, axis=1) + coulomb)[..., None]
-    columns = [x.reshape(*shape, -1) for x in (friction, points, tensors, delay)]
-    rows = np.concatenate(columns, -1) / (NOISE * robot.tau_max[:, None])
-    rows *= (np.abs(speed) > RESTING)[..., None]
-    rows = rows.reshape(len(q), -1, rows.shape[-1])
-    return 0.5 * np.linalg.slogdet(np.eye(rows.shape[-1]) + rows.transpose(0, 2, 1) @ rows)[1]
-
-
-class _Candidates:
+class Candidates:
     """Candidate motions: coefficients x (2 H, n) of a series, and a share a (n,) of each joint's amplitude.
 
     The amplitude is the largest that the joint's limits allow, so x only determines the shape.
+
+    Args:
+        robot: its limits. center: (n,) rad. duration: s. space: the obstacles.
+        score: of a motion, the larger the better; see `Score`.
     """
 
-    def __init__(self, robot: Robot, center: np.ndarray, duration: float, gravity: bool, space: Space):
-        self.robot, self.center, self.gravity, self.space = robot, center, gravity, space
+    def __init__(self, robot: Robot, center: np.ndarray, duration: float, score: Score, space: Space):
+        self.robot, self.center, self.score, self.space = robot, center, score, space
         self.clock = _clock(duration)
         self.period = max(1.1 * float(np.ptp(self.clock[1])), SHORTEST_S)
         self.harmonics = max(3, round(TOP_HZ * self.period))
@@ -181,34 +131,59 @@ class _Candidates:
         self.t = self.clock[0][:: every * FINE]
         self.basis = self._basis(slice(None, None, every))
 
+    def found(
+        self, rng: np.random.Generator, effort: int, report: Callable[[float], None] = lambda share: None
+    ) -> Excitation:
+        """Return the best motion of `effort` tries; `report` gets the share of them that is done.
+
+        Raises:
+            UserError: no draw is safe.
+        """
+        best = self.draw(rng, KEPT if effort else 1)
+        motion = self.finish(*self.search(rng, best, effort, report)) if best else None
+        if motion is None:
+            raise UserError(
+                f"excitation: no motion about q_center={np.round(self.center, 3).tolist()} keeps clear of the table "
+                f"at {self.space.table:g} m, of the arm itself and of obstacles, and needs less than "
+                f"{100 * TORQUE_SHARE:g} % of tau_max, with the end effector {self.space.floor:g} m above the base "
+                "plane; set another excitation.q_center"
+            )
+        return motion
+
     def draw(self, rng: np.random.Generator, count: int) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """Return (information, x, a) of the best safe draw, or None if no draw is safe."""
+        """Return (score, x, a) of the best safe draw, or None if no draw is safe."""
         shapes = [rng.standard_normal((2 * self.harmonics, self.robot.n)) for _ in range(DRAWS)]
         full = np.ones(self.robot.n)
         if count > 1:
-            shapes = [shapes[k] for k in np.argsort(-self.information([(x, full) for x in shapes]))]
+            shapes = [shapes[k] for k in np.argsort(-self.scores([(x, full) for x in shapes]))]
         kept: list[tuple[float, np.ndarray, np.ndarray]] = []
         for x in shapes:
             if (a := self._shrink(full, partial(self._coarse, x), 0.9, MARGIN, MIN_AMPLITUDE)) is not None:
-                kept.append((float(self.information([(x, a)])[0]), x, a))
+                kept.append((float(self.scores([(x, a)])[0]), x, a))
             if len(kept) == count:
                 break
         return max(kept, key=lambda k: k[0], default=None)
 
     def search(
-        self, rng: np.random.Generator, best: tuple[float, np.ndarray, np.ndarray], effort: int
+        self,
+        rng: np.random.Generator,
+        best: tuple[float, np.ndarray, np.ndarray],
+        effort: int,
+        report: Callable[[float], None],
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, a) after a local search with random changes of one joint at a time."""
         most, x, a = best
-        for _ in range(-(-effort // TRIES)):
+        steps = -(-effort // TRIES)
+        for step in range(steps):
             tried = [self._changed(rng, x, a) for _ in range(TRIES)]
-            nats = self.information(tried)
-            for k in np.argsort(-nats):
-                if nats[k] <= most:
+            scores = self.scores(tried)
+            for k in np.argsort(-scores):
+                if scores[k] <= most:
                     break
                 if self._safe(*tried[k]):
-                    most, (x, a) = nats[k], tried[k]
+                    most, (x, a) = scores[k], tried[k]
                     break
+            report((step + 1) / steps)
         return x, a
 
     def _changed(self, rng: np.random.Generator, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,10 +205,10 @@ class _Candidates:
         offset, dq, ddq = dense(less)
         return Excitation(self.clock[0], self.center + offset, dq, ddq)
 
-    def information(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return the information (B,) of several (x, a); one call for all is faster."""
+    def scores(self, motions: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Return the scores (B,) of several (x, a); one call for all is faster."""
         offset, dq, ddq = (np.stack(m) for m in zip(*(self._coarse(x, a) for x, a in motions), strict=True))
-        return _information(self.robot, self.t, self.center + offset, dq, ddq, self.gravity)
+        return self.score(self.t, self.center + offset, dq, ddq)
 
     def _basis(self, rows: slice) -> Samples:
         """Return matrices (T, 2 H) that map x to the series, its velocity and its acceleration at these ms."""

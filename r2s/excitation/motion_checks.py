@@ -3,7 +3,7 @@
 Joint limits are checked at every sample, torque and geometry at `GEOMETRY_HZ`. The links are the MJCF's geoms.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import mujoco
@@ -12,6 +12,7 @@ import numpy as np
 from r2s.errors import UserError
 from r2s.physics.collision import TABLE_M, collision_pairs, link_name
 from r2s.physics.fence import FENCE_M
+from r2s.physics.obstacle import Box
 from r2s.physics.rigid_body import mujoco_inverse_dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
@@ -38,7 +39,9 @@ class Motion(Protocol):
     def ddq(self) -> np.ndarray: ...  # noqa: D102
 
 
-def check_motion(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
+def check_motion(
+    robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
+) -> None:
     """Raise UserError with joint or link, value and time of the first violation, in the order of the checks below.
 
     Args:
@@ -46,12 +49,13 @@ def check_motion(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min:
         motion: sampled at 1 kHz.
         table: m, height of the table in the base frame; -inf: no table.
         z_min: m, minimum height of the end effector, for a tool that the MJCF does not contain.
+        space: built from them before, also with obstacles.
     """
     check_shape(robot, motion)
     check_limits(robot, motion)
     check_derivatives(robot, motion)
     check_torque(robot, motion)
-    check_space(robot, motion, table=table, z_min=z_min)
+    check_space(robot, motion, table=table, z_min=z_min, space=space)
 
 
 def check_shape(robot: Robot, motion: Motion) -> None:
@@ -133,9 +137,11 @@ def check_torque(robot: Robot, motion: Motion) -> None:
         )
 
 
-def check_space(robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M) -> None:
-    """Raise UserError if a link comes too near to the table or to another link; paths.py checks the approach."""
-    space = Space(robot, table=table, z_min=z_min)
+def check_space(
+    robot: Robot, motion: Motion, *, table: float = TABLE_M, z_min: float = TOOL_M, space: "Space | None" = None
+) -> None:
+    """Raise UserError if a link comes too near to table, obstacles or links; paths.py checks the approach."""
+    space = space or Space(robot, table=table, z_min=z_min)
     rows = geometry_rows(motion)
     space.check(motion.q[rows], lambda k: f"at {motion.t[rows[k]]:.3f} s")
 
@@ -169,7 +175,7 @@ def friction_margin(robot: Robot) -> np.ndarray:
 
 
 class Space:
-    """Distances of an arm's links from the table and from each other; see `collision` for the geoms that count.
+    """Distances of an arm's links from table, obstacles and each other; see `collision` for the geoms that count.
 
     An arm is not exactly where it was planned to be. If joint j deviates by e_j rad, a distance shrinks by at most
     sum_j lever_j |e_j|, to first order: the lever is how far a rad of that joint moves the link, from the Jacobian at
@@ -184,11 +190,20 @@ class Space:
 
     Args:
         robot: its links. table, z_min: m, see `check_motion`. deviation: rad, the one to leave room for.
+        obstacles: boxes.
     """
 
-    def __init__(self, robot: Robot, *, table: float = TABLE_M, z_min: float = TOOL_M, deviation: float = DEVIATION):
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        table: float = TABLE_M,
+        z_min: float = TOOL_M,
+        deviation: float = DEVIATION,
+        obstacles: Sequence[Box] = (),
+    ):
         self._deviation = deviation
-        self.model = robot.model(gravity=False)
+        self.model = robot.model(gravity=False, obstacles=obstacles)
         self.data = mujoco.MjData(self.model)
         self.site = self.model.site(robot.ee_site).id
         moving = self.model.jnt_bodyid

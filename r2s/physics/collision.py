@@ -22,6 +22,7 @@ from r2s.physics import convex
 from r2s.physics.convex import BODY, BOUND, separation, support_point
 from r2s.physics.kinematics import POSE, link_frames, pose_axes, write_pose
 from r2s.physics.newton_euler import links_of, product, rotate
+from r2s.physics.obstacle import PREFIX
 from r2s.physics.robot import Robot
 
 TABLE_M = 0.0  # m, default height of the table in the base frame
@@ -34,7 +35,7 @@ class CollisionPairs:
     """The pairs of a model to check.
 
     Attributes:
-        above: geoms to keep above the table. pairs: pairs of geoms to keep apart.
+        above: geoms to keep above the table. pairs: pairs of geoms to keep apart, obstacles first.
         link: (ngeom,) number of the joint that moves each geom, from 1; 0: the base.
     """
 
@@ -51,7 +52,8 @@ def collision_pairs(
     may_touch: pairs of body names, or of a body name and "table", that are not checked.
     """
     link = np.searchsorted(model.jnt_bodyid, model.body_weldid[model.geom_bodyid], side="right")
-    solid = ~np.isin(model.geom_type, [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD])
+    box = np.array([model.geom(g).name.startswith(PREFIX) for g in range(model.ngeom)], dtype=bool)
+    solid = ~np.isin(model.geom_type, [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD]) & ~box
     colliding = solid & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
     geoms = np.flatnonzero(colliding if colliding.any() else solid).tolist()
     data = mujoco.MjData(model)
@@ -71,11 +73,14 @@ def collision_pairs(
         and {body[a], body[b]} not in free
         and mujoco.mj_geomDistance(model, data, a, b, 1.0, None) >= HOUSING_M
     ]
-    return CollisionPairs(above, pairs, link)
+    around = [(b, g) for b in np.flatnonzero(box).tolist() for g in geoms if link[g] > 0]
+    return CollisionPairs(above, around + pairs, link)
 
 
 def link_name(model: mujoco.MjModel, geom: int) -> str:
-    """Return "link 'hand'" for a geom of the body hand."""
+    """Return "link 'hand'" for a geom of the body hand, "obstacle 1" for that box."""
+    if model.geom(geom).name.startswith(PREFIX):
+        return str(model.geom(geom).name)
     body = model.geom_bodyid[geom]
     return f"link '{model.body(body).name}'" if model.body(body).name else f"the link of body {body}"
 

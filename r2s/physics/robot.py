@@ -6,7 +6,7 @@ objects, gravity compensation and contacts. The file's damping and frictionloss 
 works: `robot.mjcf=FILE`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import located
+from r2s.physics.obstacle import Box
 from r2s.physics.robot_checks import check_arm, check_limits, check_masses, gravity_of, torque_limits
 from r2s.physics.robot_file import read_spec, rotors, strip
 from r2s.physics.surface import Tool, load_tool
@@ -91,7 +92,9 @@ class Robot:
         low = np.where(more, np.maximum(self.q_min, self.q_home - np.pi), self.q_min)
         return low, np.where(more, np.minimum(self.q_max, self.q_home + np.pi), self.q_max)
 
-    def model(self, *, gravity: bool, user: int = 0, memory: int = 0, dt: float = SIM_DT) -> mujoco.MjModel:
+    def model(
+        self, *, gravity: bool, user: int = 0, memory: int = 0, dt: float = SIM_DT, obstacles: Sequence[Box] = ()
+    ) -> mujoco.MjModel:
         """Compile the MuJoCo model.
 
         Args:
@@ -99,6 +102,7 @@ class Robot:
             user: columns of `jnt_user`, the parameters of the callback (r2s/physics/mujoco_callback.py).
             memory: doubles of the callback's state.
             dt: time step, s.
+            obstacles: boxes beside the arm, for distances.
         """
         spec, _ = read_spec(self.mjcf, self.lock)
         spec.compile()  # assigns the joints' ids; the changes below invalidate them
@@ -114,6 +118,8 @@ class Robot:
             joint.range = unit * limits if joint.limited else np.zeros(2)
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
             joint.parent.simple = False  # MuJoCo simplifies such bodies, but their inertia may change
+        for number, box in enumerate(obstacles, 1):
+            box.add_to(spec, number)
         spec.nuser_jnt = user
         spec.nuserdata = memory
         spec.option.timestep = dt

@@ -185,6 +185,10 @@ def _numbered(table: Table, pattern: str, first: int | None) -> list[str]:
 
 def _missing(table: Table, field: str, name: str, torque: str = "") -> UserError:
     """Return the error for a missing column; another kind of torque is never suggested as a typo."""
+    if field == "tau" and _match(table, "q", "ddq"):
+        return UserError(
+            "no torque, but ddq: this is a planned motion; let the arm follow it, and give the arm's own log"
+        )
     inside = {key: key.rsplit("/", 1)[-1] for key in table}  # HDF5: what a group holds
     nested = [key for key, last in inside.items() if last == name]
     hint = f"; did you mean '{nested[0]}'?" if nested else nearest(name, table)

@@ -94,6 +94,9 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
         return f"torque RMSE {after:.3g} Nm, nominal {before:.3g}"
     if stage == "estimate":
         return f"payload {summary['mass_kg']:.3g} ± {summary['mass_kg_half']:.2g} kg"
+    if stage == "excite":
+        known = [x["identifiable"] for x in summary["expected_width95"].values()]
+        return f"{summary['seconds']:.1f} s of motion for {sum(known)} of {len(known)} values"
     if stage == "train":
         return _in_words(folder, summary["best"])
     if stage == "compare":

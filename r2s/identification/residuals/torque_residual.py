@@ -11,6 +11,7 @@ import numpy as np
 
 from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
 from r2s.identification.residuals.modulating_functions import SlidingMotion
+from r2s.identification.residuals.planned_motion import PlannedMotion
 from r2s.identification.residuals.zero_phase import SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
@@ -31,7 +32,7 @@ class TorqueResidual:
     cutoff and then filtered like the torque, because a filter rounds the step of friction at a reversal.
 
     Args:
-        space, recording: the parameters, and the data.
+        space, recording: the parameters, and the data, or a planned motion, which needs no filter.
         cutoff_hz, rate_hz: of the zero-phase filter, and of the rows.
         presliding_rad: distance over which bristles bend, one or (n,).
         slowest: rad/s. If positive, rows are means over windows in which a joint is faster and does not reverse
@@ -41,7 +42,7 @@ class TorqueResidual:
     def __init__(
         self,
         space: ParameterSpace,
-        recording: Recording,
+        recording: Recording | PlannedMotion,
         *,
         cutoff_hz: float = 10.0,
         rate_hz: float = 100.0,
@@ -49,8 +50,10 @@ class TorqueResidual:
         slowest: float = 0.0,
     ):
         self.space, robot = space, space.robot
-        m: SmoothMotion | SlidingMotion
-        if slowest:
+        m: SmoothMotion | SlidingMotion | PlannedMotion
+        if isinstance(recording, PlannedMotion):
+            m, self.seen, self._noise = recording, np.abs(recording.dq) >= slowest, np.zeros_like(recording.q)
+        elif slowest:
             slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
             m = sliding = SlidingMotion.of(recording, rate_hz, slowest, slid, presliding_rad)
             encoder_torque = m.rows(mass_matrix(robot, m.q) ** 2) @ sliding.encoder**2

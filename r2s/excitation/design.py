@@ -1,0 +1,127 @@
+"""A motion of up to ten minutes that determines chosen parameters best: segments that are chosen one after the other.
+
+Each segment is the series of fourier.py with the best score given those before it (sequential design: Chernoff, Ann.
+Math. Stat. 30(3), 1959). Between two segments the arm moves on a checked way at minimum jerk.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from r2s.errors import check_number
+from r2s.excitation.fourier import ACCELERATION, LEAST_S, SPEED, Candidates
+from r2s.excitation.information import COARSE_HZ
+from r2s.excitation.minimum_jerk import minimum_jerk
+from r2s.excitation.motion import Excitation
+from r2s.excitation.motion_checks import TORQUE_SHARE, Space, check_motion, torque_share
+from r2s.excitation.paths import approach
+from r2s.physics.robot import SIM_DT, Robot
+
+SEGMENT_S = 60.0  # s, longest segment: two minutes of a series need 1 GB
+LONGEST_S = 600.0
+PEAKS = 1.875, 5.7735  # of velocity and acceleration at minimum jerk, for 1 rad in 1 s
+SHORTEST_WAY_S, SLOWER, MOST_SLOWER = 0.5, 1.5, 8  # s; factor until the torque suffices, at most so often
+EVERY = round(1 / (COARSE_HZ * SIM_DT))  # rows of a motion that a design counts
+
+
+class Design(Protocol):
+    """What a motion is chosen for."""
+
+    def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return the scores (B,) of motions (B, T, n) at times t (T,) s, given the motions so far."""
+        ...
+
+    def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
+        """Count a motion (T, n) among those so far."""
+        ...
+
+
+def designed(
+    robot: Robot,
+    design: Design,
+    space: Space,
+    *,
+    seconds: float,
+    center: np.ndarray,
+    seed: int,
+    effort: int,
+    report: Callable[[float], None] = lambda share: None,
+) -> Excitation:
+    """Return a motion of `seconds`, and of the ways between its segments, that passes `check_motion`.
+
+    Args:
+        robot, space: limits, links and obstacles.
+        design: scores motions.
+        seconds: of the segments. center: (n,) rad, centre posture, see `fourier.checked_center`.
+        seed: of the random draws. effort: motions tried per segment.
+        report: gets the share of the work that is done.
+
+    Raises:
+        UserError: an argument is out of range, no draw is safe, or no way is free.
+    """
+    check_number("seconds", seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
+    check_number("effort", effort, "[0, inf)", whole=True)
+    rng = np.random.default_rng(seed)
+    count = int(np.ceil(seconds / SEGMENT_S))
+    parts: list[Excitation] = []
+    for k in range(count):
+        candidates = Candidates(robot, center, round(seconds / count, 3), design.score, space)
+        part = candidates.found(rng, effort, lambda share, k=k: report((k + share) / count))  # type: ignore[misc]
+        design.add(*(x[::EVERY] for x in (part.t, part.q, part.dq, part.ddq)))
+        parts += [way(robot, parts[-1].q[-1], part.q[0], space), part] if parts else [part]
+    motion = joined(parts)
+    check_motion(robot, motion, space=space)
+    return motion
+
+
+def way(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, space: Space) -> Excitation:
+    """Return a motion between two postures (n,) rad on a path that `approach` finds, at rest in its corners.
+
+    Raises:
+        UserError: no path is free.
+    """
+    path = approach(robot, q_from, q_to, what="excitation: the way between two segments", space=space)
+    legs = []
+    for a, b in pairwise(path):
+        far = np.abs(b - a)
+        speed = PEAKS[0] * far / (SPEED * robot.dq_max)
+        seconds = max(SHORTEST_WAY_S, speed.max(), np.sqrt(PEAKS[1] * far / (ACCELERATION * robot.ddq_max)).max())
+        for _ in range(MOST_SLOWER):
+            steps = int(np.ceil(seconds / SIM_DT))
+            t = SIM_DT * np.arange(steps + 1)
+            leg = Excitation(t, *minimum_jerk(a, b, steps * SIM_DT, t[:, None]))
+            if (torque_share(robot, *(x[::10] for x in (leg.q, leg.dq, leg.ddq))) <= TORQUE_SHARE).all():
+                break
+            seconds *= SLOWER
+        legs.append(leg)
+    return joined(legs)
+
+
+def joined(parts: list[Excitation]) -> Excitation:
+    """Return motions that begin where the one before ends, one after the other."""
+
+    def all_of(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
+
+    q = all_of("q")
+    return Excitation(SIM_DT * np.arange(len(q)), q, all_of("dq"), all_of("ddq"))
+
+
+def trajectory_yaml(motion: Excitation, joints: list[str], rate_hz: float) -> str:
+    """Return a motion as trajectory_msgs/msg/JointTrajectory (ROS 2), with every sample of `rate_hz` and the last.
+
+    Controllers interpolate between points with positions, velocities and accelerations by quintic polynomials.
+    """
+    rows = np.union1d(np.arange(0, len(motion.t), max(1, round(1 / (rate_hz * SIM_DT)))), [len(motion.t) - 1])
+    lines = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}", f"joint_names: [{', '.join(joints)}]", "points:"]
+    for k in rows.tolist():
+        # YAML reads a number without a decimal point, such as 1e-05, as a string
+        q, dq, ddq = (", ".join(f"{x:z.9f}" for x in part[k].tolist()) for part in (motion.q, motion.dq, motion.ddq))
+        sec, nanosec = divmod(round(1e9 * float(motion.t[k])), 10**9)
+        lines.append(
+            f"- {{positions: [{q}], velocities: [{dq}], accelerations: [{ddq}], "
+            f"time_from_start: {{sec: {sec}, nanosec: {nanosec}}}}}"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,63 @@
+"""The information in a recording of a planned motion, before anything is known of the arm's noise."""
+
+import numpy as np
+
+from r2s.excitation.motion_checks import Motion, gravity_torque
+from r2s.physics.rigid_body import LinkInertia, regressor, tensor_elements
+from r2s.physics.robot import SIM_DT, Robot
+
+COARSE_HZ = 10  # samples for information and safety
+# Standard deviations of noise and priors, rough values of torque-controlled arms.
+NOISE = 0.002  # share of tau_max, per sample
+FRICTION_PRIOR = 0.05  # share of tau_max, per friction coefficient
+DRAG_PRIOR = 0.01  # share of tau_max, torque proportional to the sine of the angle, such as a cable's
+MASS_PRIOR = 0.03, 0.005  # share of a link's mass; m, of its centre of mass
+SCALE_PRIOR = 0.3  # share of a link's tensor, or of its trace
+DELAY_PRIOR = 3e-3  # s
+SLOPE = 0.05  # share of dq_max, width of the sign change of friction
+RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carries no information
+
+
+def information(robot: Robot, motion: Motion, *, gravity: bool = False) -> float:
+    """Return the information in nats of a recording of this motion: half the log det of posterior over prior.
+
+    The unknowns have independent normal priors. Per joint: offset, Coulomb friction as a tanh, its width and shift,
+    viscous friction, and angle-dependent drag. Per link: mass and centre of mass (their errors appear in gravity even
+    if the arm compensates the nominal ones). Without `gravity` (commanded torque): per link the tensor's scale, and
+    one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of tau_max at 10 samples per
+    second. Rows with a joint at rest do not count, because friction is undetermined there.
+    """
+    every = round(1 / (COARSE_HZ * SIM_DT))
+    q, dq, ddq = (x[None, ::every] for x in (motion.q, motion.dq, motion.ddq))
+    return float(motion_information(robot, motion.t[::every], q, dq, ddq, gravity)[0])
+
+
+def motion_information(
+    robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
+) -> np.ndarray:
+    """Return the information (B,) of B motions (B, T, n) at the times t (T,)."""
+    n, shape = robot.n, (len(q), len(t), robot.n)
+    flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)
+    y = regressor(robot, *flat, gravity=robot.gravity).reshape(*shape, n, 10)
+    speed, bend = dq / robot.dq_max, dq / (SLOPE * robot.dq_max)
+    step, bump = np.tanh(bend), 1 / np.cosh(np.minimum(np.abs(bend), 50)) ** 2
+    curves = FRICTION_PRIOR * np.stack([np.ones_like(dq), step, bend * bump, bump, speed], -1)
+    curves = np.concatenate([curves, DRAG_PRIOR * np.stack([np.sin(q), np.cos(q)], -1)], -1)
+    friction = np.zeros((*shape, n, 7))
+    friction[:, :, range(n), range(n)] = curves * robot.tau_max[:, None]
+    mass, center = MASS_PRIOR
+    points = y[..., :4] * np.outer(robot.mass, [mass, center, center, center])
+    if gravity:
+        tensors = y[..., 4:] * (SCALE_PRIOR * np.trace(robot.inertia, axis1=1, axis2=2)[:, None])
+        delay = np.zeros((*shape, 0))
+    else:
+        tensors = SCALE_PRIOR * np.einsum("btjkc,kc->btjk", y[..., 4:], tensor_elements(robot.inertia))
+        torque = np.einsum("btjkc,kc->btj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard())
+        torque -= gravity_torque(robot, flat[0]).reshape(shape)
+        coulomb = FRICTION_PRIOR * robot.tau_max * bump / (SLOPE * robot.dq_max) * ddq
+        delay = DELAY_PRIOR * (np.gradient(torque, t, axis=1) + coulomb)[..., None]
+    columns = [x.reshape(*shape, -1) for x in (friction, points, tensors, delay)]
+    rows = np.concatenate(columns, -1) / (NOISE * robot.tau_max[:, None])
+    rows *= (np.abs(speed) > RESTING)[..., None]
+    rows = rows.reshape(len(q), -1, rows.shape[-1])
+    return 0.5 * np.linalg.slogdet(np.eye(rows.shape[-1]) + rows.transpose(0, 2, 1) @ rows)[1]

@@ -1,0 +1,123 @@
+"""The 95 % widths that a recording of a planned motion will give, for choosing the motion.
+
+The parameters, their bounds and their prior are those of an identification, linearized at the nominal arm.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from r2s.errors import UserError, nearest
+from r2s.excitation.information import COARSE_HZ, NOISE
+from r2s.identification.expected_width import Z
+from r2s.identification.identify import STANDSTILL
+from r2s.identification.problem import Problem
+from r2s.identification.residuals.planned_motion import PlannedMotion
+from r2s.identification.residuals.torque_residual import STEP, TorqueResidual
+from r2s.identification.result import SHARPER
+from r2s.identification.settings import Settings
+from r2s.identification.terms import scaled_prior, search_space
+from r2s.physics.dynamics import Dynamics, with_family
+from r2s.physics.robot import Robot
+from r2s.recordings.recording import Recording
+
+FLAT = 12.0  # information of the bounds of a flat prior (posterior.py)
+MOST_ROWS = 200  # samples of a motion in a search: with more of them, the order of two motions hardly changes
+
+
+class PlannedWidths:
+    """Expected widths of planned motions.
+
+    Attributes:
+        space: the parameters. information: (P, P) on the unit cube, of the motions so far (`add`).
+
+    Args:
+        robot, nominal: the arm, and where the identification will start.
+        settings: of the identification; family=auto stands for the family of the nominal arm.
+        torque: kind of torque that will be recorded.
+        noise: standard deviation of an independent sample, of tau_max, at COARSE_HZ.
+        chosen: parameters such as "offset" or "offset[3]", whose widths count; none: all.
+
+    Raises:
+        UserError: an unknown parameter in `chosen`.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        nominal: Dynamics,
+        settings: Settings,
+        torque: str,
+        noise: float = NOISE,
+        chosen: Sequence[str] = (),
+    ):
+        nominal = nominal if settings.family == "auto" else with_family(nominal, settings.family)
+        rest = np.zeros((10, robot.n))
+        recording = Recording(np.arange(10.0), rest + robot.q_home, rest, rest, torque)
+        self.robot, self.nominal, self.torque, self._noise = robot, nominal, torque, noise * robot.tau_max
+        self.space = search_space(robot, nominal, settings.bounds, settings.terms, recording)
+        self._slowest = STANDSTILL if torque == "commanded" else 0.0
+        still = (recording.q[None], rest[None], rest[None])
+        data = self._residual(recording.t, still)
+        self._problem = Problem.of(data, data, scaled_prior(settings.prior, robot, recording, nominal))
+        self._u = self._problem.start
+        prior = self._problem.prior_information(self._u)
+        self._prior = prior + np.diag(np.where(np.diag(prior) > 0, 0.0, FLAT))
+        self._chosen = self._places(chosen)
+        self.information = np.zeros_like(prior)
+
+    def _places(self, chosen: Sequence[str]) -> np.ndarray:
+        names, blocks = self.space.names, self.space.blocks
+        places: list[int] = []
+        for name in chosen:
+            if name in blocks:
+                places += self.space.where(name).tolist()
+            elif name in names:
+                places.append(names.index(name))
+            else:
+                near = nearest(str(name), [*blocks, *names])
+                raise UserError(f"parameters: '{name}' is not estimated; allowed: {', '.join(blocks)}{near}")
+        return np.unique(places) if places else np.arange(len(names))
+
+    def _residual(self, t: np.ndarray, motions: tuple[np.ndarray, ...]) -> TorqueResidual:
+        planned = PlannedMotion.of(self.robot, self.nominal, self.torque, t, motions)
+        return TorqueResidual(self.space, planned, slowest=self._slowest)
+
+    def of(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return the information (B, P, P) of B motions (B, T, n) rad, rad/s, rad/s^2 at times t (T,) s."""
+        data = self._residual(t, (q, dq, ddq))
+        j = data.jacobian(self._u) * np.broadcast_to(data.scale / self._noise, data.seen.shape).reshape(-1, 1)
+        j = j.reshape(len(q), -1, j.shape[-1])
+        return (j.transpose(0, 2, 1) @ j) * ((t[-1] - t[0]) * COARSE_HZ / len(t))
+
+    def add(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> None:
+        """Count a motion (T, n) at times t (T,) among those so far."""
+        self.information = self.information + self.of(t, q[None], dq[None], ddq[None])[0]
+
+    def half(self, information: np.ndarray) -> np.ndarray:
+        """Return half widths (..., P) on the unit cube, of the information (..., P, P)."""
+        covariance = np.linalg.inv(information + self._prior)
+        return Z * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+    def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+        """Return (B,) minus the mean logarithm of the chosen widths, after the motions so far and each of B more."""
+        some = slice(None, None, 1 + len(t) // MOST_ROWS)
+        information = self.of(t[some], q[:, some], dq[:, some], ddq[:, some])
+        return -np.log(self.half(self.information + information)[:, self._chosen]).mean(1)
+
+    @property
+    def width(self) -> np.ndarray:
+        """(P,) SI units, expected 95 % widths after the motions so far."""
+        h = np.where(self._u > 0.5, -STEP, STEP)
+        slope = (self.space.from_unit(self._u + h) - self.space.from_unit(self._u)) / h
+        return 2 * self.half(self.information) * slope
+
+    @property
+    def share(self) -> np.ndarray:
+        """(P,) of the prior's width that is left after the motions so far."""
+        return np.minimum(self.half(self.information) / (Z * self._problem.prior_width), 1.0)
+
+    @property
+    def identifiable(self) -> np.ndarray:
+        """(P,) whether the motions so far will determine the value, as in the identification's result."""
+        return Z * self.share < 1.0 / SHARPER

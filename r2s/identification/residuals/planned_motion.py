@@ -1,0 +1,62 @@
+"""A planned motion in place of a recording: exact, so that no filter is needed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.robot import Robot
+
+
+@dataclass(frozen=True)
+class PlannedMotion:
+    """Samples of B motions, one after the other, with the interface of `SmoothMotion`.
+
+    Attributes:
+        t: (T,) s. q, dq, ddq, tau: (T, n); tau is that of the nominal arm. change: (T, n) Nm/s, its slope over time.
+        torque: kind of tau, as in `Recording`.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    ddq: np.ndarray
+    tau: np.ndarray
+    change: np.ndarray
+    torque: str
+
+    @staticmethod
+    def of(
+        robot: Robot,
+        nominal: Dynamics,
+        torque: str,
+        t: np.ndarray,
+        motions: tuple[np.ndarray, ...],
+    ) -> "PlannedMotion":
+        """Return B motions, q, dq and ddq (B, T, n) at times t (T,), with the torque of the nominal arm."""
+        q, dq, ddq = (x.reshape(-1, robot.n) for x in motions)
+        model = robot.model(gravity=torque != "commanded")
+        tau = mujoco_inverse_dynamics(model, q, dq, ddq) + nominal.friction(dq, np.sign(dq))
+        change = np.gradient(tau.reshape(motions[0].shape), t, axis=1).reshape(tau.shape)
+        return PlannedMotion(np.tile(t, len(motions[0])), q, dq, ddq, tau, change, torque)
+
+    @property
+    def friction_dq(self) -> np.ndarray:
+        """(T, n) rad/s, velocity in the friction law."""
+        return self.dq
+
+    @property
+    def bristle(self) -> np.ndarray:
+        """(T, n), presliding state of joints that slide."""
+        return np.sign(self.dq)
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return x (T, n, ...) as it is."""
+        return x
+
+    rows = filtered
+
+    def command(self, delay: float, lag: float) -> np.ndarray:
+        """Return (T, n) Nm: the command at the joints."""
+        return self.tau - (delay + lag) * self.change

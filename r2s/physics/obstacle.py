@@ -1,0 +1,58 @@
+"""Boxes around an arm that its links keep clear of."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from r2s.errors import UserError, choices, nearest
+
+PREFIX = "obstacle "  # of the geoms' names in a model
+KEYS = ("center", "size", "yaw")
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in the base frame: center (3,) m, size (3,) m along its edges, yaw rad about the vertical."""
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float = 0.0
+
+    def add_to(self, spec: mujoco.MjSpec, number: int) -> None:
+        """Add the box to the world of a model."""
+        axes = [np.cos(0.5 * self.yaw), 0.0, 0.0, np.sin(0.5 * self.yaw)]
+        half = 0.5 * np.array(self.size)
+        kind = mujoco.mjtGeom.mjGEOM_BOX
+        spec.worldbody.add_geom(name=f"{PREFIX}{number}", type=kind, pos=list(self.center), size=half, quat=axes)
+
+
+def boxes(where: str, given: Sequence[Mapping[str, Any]]) -> list[Box]:
+    """Return the boxes of a setting, [{center: [x, y, z], size: [x, y, z], yaw: rad}, ...].
+
+    Raises:
+        UserError: an unknown or missing key, or values that are no numbers.
+    """
+    out = []
+    for k, one in enumerate(given):
+        name = f"{where}[{k}]"
+        if not isinstance(one, Mapping):
+            raise UserError(f"{name}: expected {{center: [x, y, z], size: [x, y, z]}}, got {one!r}")
+        for key in one:
+            if key not in KEYS:
+                raise UserError(f"{name}: unknown key '{key}'; allowed: {choices(KEYS)}{nearest(str(key), KEYS)}")
+        for key in ("center", "size"):
+            _check_numbers(f"{name}.{key}", one.get(key), 3)
+        _check_numbers(f"{name}.yaw", [one.get("yaw", 0.0)], 1)
+        if min(one["size"]) <= 0:
+            raise UserError(f"{name}.size: expected edges above 0 m, got {list(one['size'])}")
+        out.append(Box(tuple(one["center"]), tuple(one["size"]), one.get("yaw", 0.0)))
+    return out
+
+
+def _check_numbers(name: str, value: Any, count: int) -> None:
+    right = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
+    if not right or any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
+        raise UserError(f"{name}: expected {count} number{'s' * (count > 1)}, got {value!r}")
