@@ -173,7 +173,7 @@ def _gravity(robot: Robot, r: Recording, shares: np.ndarray | None) -> Line:
     if shares is None:
         return Line(GRAVITY, OPEN, "gravity changes too little along this motion")
     share, contains = float(shares.mean()), r.torque != "commanded"
-    found = f"{r.torque} tau contains {100 * share:.0f} % of {robot.name}'s gravity torque"
+    found = f"{r.torque} tau contains {100 * share:z.0f} % of {robot.name}'s gravity torque"
     far = not LOADED[0] < share < LOADED[1] if contains else abs(share) > 1 - LOADED[0]
     advice = "an undeclared load, or other masses than in the robot's file?" if far else ""
     return Line(GRAVITY, WARN if far else PASS, found, advice, {"share_of_gravity": shares})
