@@ -15,7 +15,9 @@ MIN_MOTION = 3.0  # standard deviation of a joint's motion, in tolerances: ten p
 OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # tracks compared with each track, and pieces searched for; bounds the computing time
-PIECE_S, PIECE_MOTION = 1.0, 0.3  # s, rad: minimum duration and range of a piece in `overlap`
+PIECE_S, PIECE_MOTION = 1.0, 2.0  # s, and deviations of the motion: least duration and range of a piece in `overlap`
+SIMILAR = 0.04  # deviations of the motion: a tracking error, 20 mrad of a swing by 0.7 rad
+STILL = 0.25  # of the largest joint's deviation: least one of a joint that hardly moves
 
 
 class Track:
@@ -72,26 +74,36 @@ def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
 
 
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
-    """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once."""
-    pieces = [piece for track in other for piece in _pieces(track.q)]
+    """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
+
+    It occurs if each joint's RMS distance is less than SIMILAR standard deviations of its motion in `other`: tracking
+    errors of a slow or soft arm reach tens of mrad, and a small motion repeats itself within less.
+    """
+    deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
+    tolerance = SIMILAR * np.maximum(deviation, STILL * deviation.max())
+    pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
     pieces = pieces[:: 1 + len(pieces) // MAX_COMPARED]
     repeated = 0
     for piece in pieces:
         for track in training:
             square, _, count = _distances(track.q, piece)
-            if ((square < TOLERANCE**2).all(1) & (count >= 0.9 * len(piece))).any():
+            if ((square < tolerance**2).all(1) & (count >= 0.9 * len(piece))).any():
                 repeated += 1
                 break
     return repeated / max(len(pieces), 1)
 
 
-def _pieces(q: np.ndarray) -> list[np.ndarray]:
-    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces of at least PIECE_S and PIECE_MOTION."""
+def _pieces(q: np.ndarray, motion: float) -> list[np.ndarray]:
+    """Cut q (S, n) rad, NaN in gaps, into gap-free pieces that last at least PIECE_S and move `motion` rad."""
     pieces, start, shortest = [], 0, round(PIECE_S / STEP)
-    for k in range(len(q)):
-        if np.isnan(q[k, 0]):
+    low = high = q[0]
+    for k, x in enumerate(q):
+        if k == start:
+            low = high = x
+        low, high = np.minimum(low, x), np.maximum(high, x)
+        if np.isnan(x[0]):
             start = k + 1
-        elif k + 1 - start >= shortest and np.ptp(q[start : k + 1], axis=0).max() > PIECE_MOTION:
+        elif k + 1 - start >= shortest and (high - low).max() > motion:
             pieces.append(q[start : k + 1])
             start = k + 1
     return pieces

@@ -278,7 +278,7 @@ class Recording:
         return best, clock
 
     def overlap(self, training: "Recording") -> float:
-        """Return the share (0 to 1) of this motion that also occurs in `training`, within 0.01 rad RMS per joint.
+        """Return the share (0 to 1) of this motion that also occurs in `training`; see `periodicity.overlap`.
 
         Phases of little motion do not count, and the time of a motion does not matter.
         """
@@ -373,6 +373,8 @@ def declared_torque(torque: str | None) -> str:
 
 
 def _floats(field: str, value) -> np.ndarray:
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and not value.flags.writeable:
+        return np.ascontiguousarray(value)  # of another recording
     try:
         return np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):

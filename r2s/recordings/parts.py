@@ -1,0 +1,48 @@
+"""Parts of a long recording: all of it piece by piece, or some of it spread over the whole."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from r2s.recordings.recording import Recording
+
+
+def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
+    """Yield pieces of about `seconds` in the order of the log; neighbours in one trajectory share `overlap_s`."""
+    if recording.duration <= 1.5 * seconds:
+        yield recording
+        return
+    group: list[np.ndarray] = []
+    held = 0.0
+    for s in recording.stretches:
+        t = recording.t[s]
+        edges = np.linspace(t[0], t[-1], max(1, round((t[-1] - t[0]) / seconds)) + 1)
+        for low, high in pairwise(edges):
+            first, last = np.searchsorted(t, low - overlap_s * (low > t[0])), np.searchsorted(t, high, "right")
+            group.append(s.start + np.arange(first, last))
+            held += high - low
+            if held >= 0.5 * seconds:  # several short trajectories make one piece
+                yield _rows(recording, group)
+                group, held = [], 0.0
+    if group:
+        yield _rows(recording, group)
+
+
+def _rows(recording: Recording, group: list[np.ndarray]) -> Recording:
+    rows = np.concatenate(group)
+    return recording.rows(rows, recording.trajectory[rows])
+
+
+def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Recording:
+    """Return stretches of `each_s`, evenly spread over the recording, that last `seconds` in total.
+
+    A recording that is not longer is returned unchanged.
+    """
+    if recording.duration <= seconds:
+        return recording
+    clock = np.concatenate(
+        [np.diff(recording.t[s], prepend=recording.t[s.start]) for s in recording.stretches]
+    ).cumsum()
+    count = max(1, round(seconds / each_s))
+    return recording.select(clock * count / recording.duration % 1.0 < seconds / recording.duration)
