@@ -42,7 +42,7 @@ from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.model_based import computed_torque
 from r2s.learning.policy import load_policy
 from r2s.learning.vector_arms import VectorArms
-from r2s.physics.payload import FARTHEST_M, Payload, sphere_inertia
+from r2s.physics.payload import USUAL, Payload, sphere_inertia
 from r2s.reporting.comparison.statistics import paired
 from r2s.stages.adapter_factory import BESIDE, calibrated
 from r2s.tasks.rollout import HOLD_S, rollout
@@ -55,7 +55,8 @@ KEY = ["twin", "under", "condition", "adapter", "episode"]
 
 def draw_payload(rng: np.random.Generator, mass: float) -> Payload:
     """Return a payload whose time and centre do not depend on its mass."""
-    way, far, on = rng.normal(size=3), FARTHEST_M * rng.uniform() ** (1 / 3), float(rng.uniform(0.5, 1.5))
+    way, far = rng.normal(size=3), USUAL * ROBOT.payload_max[1] * rng.uniform() ** (1 / 3)
+    on = float(rng.uniform(0.5, 1.5))
     return Payload(np.array(mass), far * way / np.linalg.norm(way), sphere_inertia(np.array(mass)), on)
 
 

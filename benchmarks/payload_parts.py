@@ -28,7 +28,7 @@ from r2s.compiled import njit
 from r2s.files import atomic_write
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import FARTHEST_M, MOST_KG, dynamics_with_payload, payload_of
+from r2s.physics.payload import USUAL, dynamics_with_payload, payload_of
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.readers import read
 
@@ -61,7 +61,8 @@ class IdentifiedTwin(NamedTuple):
 
     def estimator(self, declared=None) -> Estimator:
         """Return a new estimator of an arm with this declared payload."""
-        arm = make_arm_model(ROBOT, dynamics_with_payload(ROBOT, self.dynamics, None, payload_of(declared)))
+        declared = payload_of(declared, ROBOT.payload_max)
+        arm = make_arm_model(ROBOT, dynamics_with_payload(ROBOT, self.dynamics, None, declared))
         return Estimator(apply_correction(arm, self.correction), self.noise)
 
     def kept(self, name: str, make: Callable[[], list]) -> list:
@@ -109,7 +110,7 @@ def motion(k: int):
 def draw_payload(rng: np.random.Generator) -> dict:
     """Return a payload."""
     way = rng.normal(size=3)
-    centre = way / np.linalg.norm(way) * FARTHEST_M * rng.uniform() ** (1 / 3)
+    centre = way / np.linalg.norm(way) * USUAL * ROBOT.payload_max[1] * rng.uniform() ** (1 / 3)
     on, off = rng.uniform(2, 4), rng.uniform(7, 9)
     return {"mass": float(rng.uniform(0.05, 1.5)), "centre": centre.tolist(), "on_s": float(on), "off_s": float(off)}
 
@@ -141,7 +142,7 @@ def errors(estimates: list[Estimate], payload) -> dict:
 def events(of: IdentifiedTwin, k: int) -> list[dict]:
     """Return the estimates of a payload that is attached and removed in motion k."""
     given = draw_payload(of.rng(k))
-    payload, estimator = payload_of(given), of.estimator()
+    payload, estimator = payload_of(given, ROBOT.payload_max), of.estimator()
     arm = of.arm(100 + k, payload=given)
     (recording,) = of.kept(f"events_{k}", lambda: [record(arm, motion(k), loaded=True)])
     began = time.process_time()
@@ -176,12 +177,13 @@ def load(of: IdentifiedTwin, k: int) -> list[dict]:
     """Return the estimates of a constant payload for several declared payloads of the arm."""
     rng, rows = of.rng(k, 1), []
     given = draw_payload(rng) | {"on_s": 0.0, "off_s": None}
-    given["mass"] = float(rng.uniform(0.05, MOST_KG / max(DECLARED.values())))
+    given["mass"] = float(rng.uniform(0.05, USUAL * ROBOT.payload_max[0] / max(DECLARED.values())))
     for name, share in DECLARED.items():
         declared = {"mass": share * given["mass"], "centre": given["centre"]} if share else None
         estimator = of.estimator(declared)
         recording = record(of.arm(200 + k, payload=given, declared_payload=declared), motion(k), loaded=True)
-        row = {"declared": name} | errors(estimate_recording(ROBOT, estimator, recording), payload_of(given))
+        found = estimate_recording(ROBOT, estimator, recording)
+        row = {"declared": name} | errors(found, payload_of(given, ROBOT.payload_max))
         rows.append(row | {"changes": len(estimator.changes)})
     return rows
 

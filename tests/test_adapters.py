@@ -27,12 +27,12 @@ from r2s.errors import UserError
 from r2s.override_checks import check_overrides
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.inverse_dynamics import InverseDynamics
-from r2s.physics.payload import FARTHEST_M, MOST_KG, dynamics_with_payload, payload_of
+from r2s.physics.payload import dynamics_with_payload, payload_of
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.stages.adapter_factory import make_adapter
 from r2s.tasks.reach import ReachTask
 
-PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
+PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]}, (3.0, 0.15))
 PANDA = load_robot(**conf("robot/panda"))
 TORQUE = 0.3 * PANDA.tau_max
 SPRING = np.array([60, 120, 60, 60, 10, 10, 5.0])
@@ -167,18 +167,20 @@ def test_an_uncertain_torque_is_not_added():
 
 
 def test_a_compensated_payload_is_plausible():
-    """For any estimate: mass and centre within their limits, a physical body."""
+    """For any estimate: mass and centre within the arm's limits, a physical body; 3 kg at 15 cm are what they are."""
     rng, out = np.random.default_rng(0), np.zeros(BODY)
     for _ in range(100):
         x = rng.normal(size=10) * [2, *[0.3] * 3, *[0.1] * 6]
-        plausible_payload(x, out)
-        assert 0.0 <= out[0] <= MOST_KG
-        assert np.linalg.norm(out[1:4]) <= out[0] * FARTHEST_M * (1 + 1e-12)
+        plausible_payload(x, np.array([3.0, 0.15]), out)
+        assert 0.0 <= out[0] <= 3.0
+        assert np.linalg.norm(out[1:4]) <= out[0] * 0.15 * (1 + 1e-12)
         xx, yy, zz, xy, xz, yz = out[4:]
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
         j = np.block([[second, out[1:4, None]], [out[None, 1:4], out[None, :1]]])
         assert np.linalg.eigvalsh(j).min() > -1e-12
+    plausible_payload(np.array([3.0, 0.45, *[0.0] * 8]), np.array([3.0, 0.15]), out)
+    np.testing.assert_allclose(out[:4], [3.0, 0.45, 0.0, 0.0])
 
 
 def test_an_adapter_of_zero_changes_no_bit():

@@ -350,11 +350,11 @@ def test_same_seed_same_training(root, trained):
 
 
 MISTAKES = {
-    "stage=identify arm.payload=2": r"arm.payload: expected a number in \[0, 1.5\], got 2",
+    "stage=identify arm.payload=4": r"arm.payload: expected a number in \[0, 3\], got 4",
     "stage=estimate arm.friction_scale=warm": r"arm.friction_scale: expected a number, got 'warm'",
     "stage=estimate arm.friction_scale=nan": r"arm.friction_scale: expected a number in \[0.1, 3\], got nan",
     "stage=estimate arm.extra_delay_s=5": r"arm.extra_delay_s: expected a number in \[0, 0.02\], got 5",
-    "stage=estimate arm.payload=2": r"arm.payload: expected a number in \[0, 1.5\], got 2",
+    "stage=estimate arm.payload=4": r"arm.payload: expected a number in \[0, 3\], got 4",
     "stage=excite excite.seconds=700": r"excite.seconds: expected a number in \[2, 600\], got 700",
     "stage=excite excite.parameters=[ofset]": r"excite.parameters: 'ofset' is not estimated.*did you mean 'offset'",
     "stage=excite excite.obstacles=[{center:[0.4,0,0.3],size:[0.2,0.2,0.6]}]": r"obstacle 1 is .* at robot.q_home",

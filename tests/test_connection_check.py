@@ -45,7 +45,7 @@ def at_rest(robot, version, desk=None, arm=Bare):
 
 def refused(kind, model, state, version=None, declared=None):
     """Return the findings that do not agree, as the error shows them."""
-    found = Connection(kind, payload_of(declared)).findings(model, version or kind.version, state)
+    found = Connection(kind, payload_of(declared, (3.0, 0.15))).findings(model, version or kind.version, state)
     return [str(f) for f in found if f.refused]
 
 
@@ -127,7 +127,7 @@ def test_limits_lie_inside_the_arms_own(robot):
 
 def test_gravity_torque_counts_the_load(robot):
     """The torque is the derivative of the potential energy by the joint angles."""
-    load = payload_of({"mass": 1.2, "centre": [0.02, -0.03, 0.05]})
+    load = payload_of({"mass": 1.2, "centre": [0.02, -0.03, 0.05]}, (3.0, 0.15))
     q, model = robot.q_home + 0.3, robot.model(gravity=True)
     data, site = mujoco.MjData(model), model.site(robot.ee_site).id
 

@@ -622,7 +622,8 @@ def loaded(robot, payload=None, declared=None):
     """Return a simulated arm with a payload, which its gravity compensation may know."""
     friction = nominal_dynamics(robot, **conf("friction/paper"))
     still = {"position_noise": 0, "velocity_noise": 0}
-    return SimulatedArm(robot, friction, payload=payload_of(payload), declared_payload=payload_of(declared), **still)
+    carried, declared = (payload_of(x, (3.0, 0.15)) for x in (payload, declared))
+    return SimulatedArm(robot, friction, payload=carried, declared_payload=declared, **still)
 
 
 def field(control, name):
@@ -657,7 +658,7 @@ def test_a_load_that_is_set_is_no_external_force(panda):
     control = Control(loaded(panda, body), 5)
     before = field(control, "tau_ext_hat_filtered")
     assert np.abs(before).max() > 3
-    load = payload_of(body)
+    load = payload_of(body, (3.0, 0.15))
     control.set("SetLoad", np.array((1.2, load.centre, load.inertia.ravel()), fci.LOAD))
     assert np.abs(field(control, "tau_ext_hat_filtered")).max() < 1e-9
     assert field(control, "m_load") == 1.2

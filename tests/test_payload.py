@@ -35,7 +35,7 @@ def swung(arm, cycles=60):
 
 def test_arm_and_payload_are_one_body(panda):
     """Kinetic energy and weight are those of the bare arm and of the body, each by itself, at any posture."""
-    rng, payload = np.random.default_rng(0), payload_of(PAYLOAD)
+    rng, payload = np.random.default_rng(0), payload_of(PAYLOAD, (3.0, 0.15))
     arm = links_of(panda, *with_payload(panda, payload, bare(panda)))
     alone = links_of(panda, *bare(panda))
     engine = DartEngine(panda, gravity=True)
@@ -76,7 +76,7 @@ def test_training_physics_takes_a_payload_and_a_declared_one(panda):
     """A correctly declared payload leaves the arm at rest; a declared but missing payload accelerates it upwards."""
     nominal = nominal_dynamics(panda, **conf("friction/gaz2019"))
     free = replace(nominal, phi=np.zeros((7, 3)))
-    payload, still = payload_of(PAYLOAD), {"position_noise": 0.0, "velocity_noise": 0.0}
+    payload, still = payload_of(PAYLOAD, (3.0, 0.15)), {"position_noise": 0.0, "velocity_noise": 0.0}
 
     def after(payload, load):
         arm = SimulatedArm(panda, free, payload=payload, declared_payload=load, **still)
@@ -110,7 +110,7 @@ def test_drawn_payloads_are_carried_by_arms_in_training(panda):
     sim.rollout(np.zeros((16, 100, 7)), record=())
     sim.kinematics()
     assert np.corrcoef(added, sim.ee[:, 2])[0, 1] < -0.5
-    for wrong in ([1.0, 0.5], [0.0, 2.0], 1.0):
+    for wrong in ([1.0, 0.5], [0.0, 4.0], 1.0):
         with pytest.raises(UserError, match=r"dr.payload"):
             UniformRandomization(panda, center, 0.1, 0.05, wrong)
 
@@ -118,12 +118,12 @@ def test_drawn_payloads_are_carried_by_arms_in_training(panda):
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
-        (-0.1, r"arm.payload: expected a number in \[0, 1.5\], got -0.1"),
-        (1.6, r"arm.payload: expected .*, got 1.6"),
-        ({"mass": 2}, r"arm.payload.mass: expected .*, got 2"),
+        (-0.1, r"arm.payload: expected a number in \[0, 3\], got -0.1"),
+        (3.1, r"arm.payload: expected .*, got 3.1"),
+        ({"mass": 4}, r"arm.payload.mass: expected .*, got 4"),
         ({"centre": [0, 0, 0]}, "got no mass"),
         ({"mass": 1, "center": [0, 0, 0]}, "got 'center'.*did you mean 'centre'"),
-        ({"mass": 1, "centre": [0, 0.06, 0.06]}, "at most 0.075 m from the end effector, got 0.0849 m"),
+        ({"mass": 1, "centre": [0, 0.12, 0.12]}, "at most 0.15 m from the end effector, got 0.17 m"),
         ({"mass": 1, "centre": [0, float("nan"), 0]}, "3 finite numbers"),
         ({"mass": 1, "inertia": [1e-3, 1e-3, 3e-3]}, "no moment above the sum of the others"),
         ({"mass": 1, "inertia": [1e-3, 1e-3, 1e-3, 2e-3, 0, 0]}, "expected positive moments"),
@@ -133,4 +133,4 @@ def test_drawn_payloads_are_carried_by_arms_in_training(panda):
 )
 def test_an_invalid_payload_is_an_error(value, expected):
     with pytest.raises(UserError, match=expected):
-        payload_of(value)
+        payload_of(value, (3.0, 0.15))

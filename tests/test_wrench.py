@@ -150,7 +150,7 @@ def test_a_command_within_the_band_changes_no_force_at_rest():
 
 def test_a_payload_is_no_contact_once_it_is_known():
     """A payload pulls with its weight, wherever the arm moves; declared to the observer, no force remains."""
-    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03]})
+    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03]}, (3.0, 0.15))
     recording = swing(lambda t: np.zeros(3), payload=load)
     unknown, _, _ = run(WrenchObserver(ROBOT, truth()), recording)
     settled = slice(1500, None)
@@ -229,7 +229,7 @@ def test_a_surface_that_was_never_identified_changes_nothing():
 
 def test_a_payload_hung_on_in_the_air_is_no_contact_and_a_press_no_payload():
     """Both pull with 10 N from 1.5 s on, the payload down, the press up: mass is found for the first alone."""
-    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03], "on_s": 1.5})
+    load = payload_of({"mass": 1.0, "centre": [0.0, 0.0, 0.03], "on_s": 1.5}, (3.0, 0.15))
     push = lambda t: np.array([0.0, 0.0, 9.81 if t > 1.5 else 0.0])  # noqa: E731
     for recording, hung in ((swing(lambda t: np.zeros(3), payload=load), True), (swing(push), False)):
         estimator = Estimator(*AdapterContext(ROBOT, truth()).corrected)

@@ -43,6 +43,7 @@ class ArmModel(NamedTuple):
     level: np.ndarray  # (n,) Nm, sliding friction
     breakaway: np.ndarray  # (n,) Nm, the most that stiction carries
     latency: np.ndarray  # (2,) cycles, delay and lag
+    payload_max: np.ndarray  # (2,) kg, m, as in `Robot`
 
 
 def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
@@ -79,6 +80,7 @@ def make_arm_model(robot: Robot, d: Dynamics) -> ArmModel:
         level=0.5 * np.abs(d.friction(sliding) - d.friction(-sliding)),
         breakaway=np.maximum(np.abs(d.breakaway).max(-1), slow_friction),
         latency=np.array(latency),
+        payload_max=np.array(robot.payload_max, dtype=float),
     )
 
 

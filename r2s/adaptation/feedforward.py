@@ -24,7 +24,7 @@ from r2s.adaptation.momentum import BODY
 from r2s.adaptation.momentum_residual import BEFORE
 from r2s.adaptation.tuning import ACCELERATION_S, BLENDING
 from r2s.compiled import njit
-from r2s.physics.payload import FARTHEST_M, MOST_KG, WATER
+from r2s.physics.payload import WATER
 from r2s.physics.robot import SIM_DT
 
 
@@ -60,7 +60,7 @@ class Feedforward:
         new = self.estimator(q, dq, tau)
         filter, state, residual = self.estimator.internals
         if new:
-            plausible_payload(filter.x, self._payload)
+            plausible_payload(filter.x, self._arm.payload_max, self._payload)
             shrinkage_weights(filter, residual, self._payload, self._weight)
             before = self._torque.copy()
         _estimated_torque(filter.x, state, self._payload, self._weight, self._slow, self._torque)
@@ -71,18 +71,18 @@ class Feedforward:
 
 
 @njit(cache=True, error_model="numpy")
-def plausible_payload(x, out):
-    """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within physical limits.
+def plausible_payload(x, most, out):
+    """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within the arm's limits.
 
-    The mass is up to MOST_KG, the centre up to FARTHEST_M from the payload frame. The tensor is that of a ball of
-    water: data hardly show a tensor, and a wrong one feeds back the acceleration.
+    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is that of a
+    ball of water: data hardly show a tensor, and a wrong one feeds back the acceleration.
     """
-    m = min(max(x[0], 0.0), MOST_KG)
+    m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0
     if m == 0.0:
         return
     far = np.sqrt(x[1] ** 2 + x[2] ** 2 + x[3] ** 2) / x[0]
-    within = min(1.0, FARTHEST_M / far) if far > 0.0 else 1.0
+    within = min(1.0, most[1] / far) if far > 0.0 else 1.0
     cx, cy, cz = within * x[1] / x[0], within * x[2] / x[0], within * x[3] / x[0]
     own = 0.4 * m * (3.0 * m / (4.0 * np.pi * WATER)) ** (2.0 / 3.0)
     out[0], out[1], out[2], out[3] = m, m * cx, m * cy, m * cz

@@ -7,7 +7,6 @@ on development twins (seeds 0 to 9); it also compares other values: NAME=VALUE o
 import numpy as np
 from scipy.stats import chi2
 
-from r2s.physics.payload import FARTHEST_M, MOST_KG
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import RATE
 
@@ -34,9 +33,9 @@ LEAST_SPANS = 50  # sliding spans that a fit needs
 CORRELATED_SPANS = 15  # spans that share one error: 0.3 s, see CORRELATION_S
 
 # noise model (noise_model.py)
-PAYLOAD_MASS = MOST_KG / np.sqrt(3)  # kg, root mean square of a uniform mass up to MOST_KG
-PAYLOAD_MOMENT = PAYLOAD_MASS * FARTHEST_M / np.sqrt(5)  # kg m per axis, for centres uniform in the ball
-PAYLOAD_TENSOR = 4e-3  # kg m^2: 0.87 kg of 5 cm size, 5 cm from the payload frame
+# of an arm's largest payload and distance, root mean squares: a uniform mass up to half of it, centres uniform in a
+# ball of half the distance; and a tensor of 0.87 kg of 5 cm size, 5 cm from the payload frame, for 3 kg and 0.15 m
+PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5), 4e-3 / (3.0 * 0.15**2)
 WARMED = 0.07  # share of friction that may have changed by temperature since the identification
 FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
 OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # of the friction level; per sqrt(s)

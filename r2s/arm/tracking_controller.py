@@ -8,7 +8,7 @@ from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import friction_margin
 from r2s.physics.newton_euler import WORK, equations, links_of
-from r2s.physics.payload import MOST_KG, Payload, sphere_inertia, with_payload
+from r2s.physics.payload import USUAL, Payload, sphere_inertia, with_payload
 from r2s.physics.rigid_body import mass_matrix, mujoco_inverse_dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
@@ -87,7 +87,7 @@ class TrackingController:
 
 
 class LoadedTrackingController(TrackingController):
-    """Tracking for an arm that may carry an undeclared payload of up to 1.5 kg.
+    """Tracking for an arm that may carry an undeclared payload of a usual size, up to half its largest.
 
     Its gains assume half of that, because the sag of a strong joint would otherwise swing the wrist. It allows a
     larger deviation and a larger correction.
@@ -95,7 +95,7 @@ class LoadedTrackingController(TrackingController):
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
         super().__init__(robot, excitation, allowed or DeviationLimits.uniform(robot.n, LOADED_DEVIATION))
-        half = np.array(0.5 * MOST_KG)
+        half = np.array(0.5 * USUAL * robot.payload_max[0])
         payload = Payload(half, np.zeros(3), sphere_inertia(half))
         links = with_payload(robot, payload, (robot.mass, robot.com, robot.inertia))
         mass, bias, work = np.empty((robot.n, robot.n)), np.empty(robot.n), np.empty((robot.n, WORK))

@@ -12,7 +12,7 @@ from r2s.errors import UserError, check_number
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.payload import FARTHEST_M, MOST_KG, Payload, dynamics_with_payload, sphere_inertia
+from r2s.physics.payload import USUAL, Payload, dynamics_with_payload, sphere_inertia
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import nominal_plane, tilted
@@ -54,7 +54,7 @@ class UniformRandomization:
     def __post_init__(self):
         check_number("dr.phi_relative", self.phi_relative, "[0, 1)")
         check_number("dr.inertia_relative", self.inertia_relative, "[0, 1)")
-        check_payload(self.payload)
+        check_payload(self.payload, self.robot)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return the dynamics of m arms."""
@@ -88,7 +88,7 @@ class PosteriorRandomization:
     payload: Sequence[float] | None = None
 
     def __post_init__(self):
-        check_payload(self.payload)
+        check_payload(self.payload, self.space.robot)
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return the dynamics of m arms."""
@@ -220,14 +220,14 @@ def posterior_randomization(
     return PosteriorRandomization(space, load_posterior(calibration, space), payload)
 
 
-def check_payload(payload: Sequence[float] | None) -> None:
-    """Raise UserError unless this is None or [least, most] kg."""
+def check_payload(payload: Sequence[float] | None, robot: Robot) -> None:
+    """Raise UserError unless this is None or [least, most] kg that the arm may carry."""
     if payload is None:
         return
     if not isinstance(payload, list | tuple) or len(payload) != 2:
         raise UserError(f"dr.payload: expected [least, most] kg, got {payload!r}")
     for value in payload:
-        check_number("dr.payload", value, f"[0, {MOST_KG}]")
+        check_number("dr.payload", value, f"[0, {robot.payload_max[0]:g}]")
     if payload[0] > payload[1]:
         raise UserError(f"dr.payload: expected [least, most] kg, got {list(payload)}")
 
@@ -237,15 +237,15 @@ def with_payloads(
 ) -> Dynamics:
     """Return the dynamics of m arms, each with a random payload of [least, most] kg; None: no payload.
 
-    mass ~ U(least, most); center ~ U(ball of FARTHEST_M about the end effector); inertia of a ball of water. Gravity
-    compensation does not include the payload.
+    mass ~ U(least, most); center ~ U(ball about the end effector, half as large as `payload_max` allows); inertia of
+    a ball of water. Gravity compensation does not include the payload.
     """
     if payload is None:
         return dynamics
     least, most = payload
     mass, direction = rng.uniform(least, most, m), rng.normal(size=(m, 3))
     radius = rng.uniform(size=(m, 1)) ** (1 / 3)
-    center = FARTHEST_M * direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius
+    center = USUAL * robot.payload_max[1] * direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius
     return dynamics_with_payload(robot, dynamics, Payload(mass, center, sphere_inertia(mass)))
 
 

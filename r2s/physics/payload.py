@@ -19,8 +19,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
 
 Links = tuple[np.ndarray, np.ndarray, np.ndarray]  # masses (..., n) kg, centres (..., n, 3) m, tensors (..., n, 3, 3)
-MOST_KG, FARTHEST_M = 1.5, 0.075  # kg, m: largest payload, and largest distance of its centre from the end effector
-MOST_TENSOR = 0.05  # kg m^2, largest moment: a rod of 1.5 kg and 0.6 m
+USUAL = 0.5  # of an arm's largest payload and distance: what is usually carried
 WATER = 1000.0  # kg/m^3
 
 
@@ -45,8 +44,10 @@ class Payload:
         return (self.on_s <= t) & (t < self.off_s)
 
 
-def payload_of(value: Any, name: str = "arm.payload") -> Payload | None:
+def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
     """Return the payload that a setting describes, a number of kg or a mapping; None for 0 kg.
+
+    most: kg, m, `Robot.payload_max`.
 
     A number is a point mass at the end effector. A mapping has `mass`, and optionally `centre` (3,) m, `inertia` (3
     principal moments, or xx, yy, zz, xy, xz, yz, in kg m^2 about the centre; default: a sphere of water), `on_s`,
@@ -58,7 +59,7 @@ def payload_of(value: Any, name: str = "arm.payload") -> Payload | None:
     if value is None:
         return None
     if not isinstance(value, Mapping):
-        check_number(name, value, f"[0, {MOST_KG}]")
+        check_number(name, value, f"[0, {most[0]:g}]")
         return Payload(np.array(float(value)), np.zeros(3), np.zeros((3, 3))) if value else None
     allowed = ("mass", "centre", "inertia", "on_s", "off_s")
     for key in value:
@@ -67,15 +68,15 @@ def payload_of(value: Any, name: str = "arm.payload") -> Payload | None:
             raise UserError(f"{name}: expected the keys {choices(allowed)}, got '{key}'{near}")
     if "mass" not in value:
         raise UserError(f"{name}: expected a number of kg or {{mass: ..., centre: [...], ...}}, got no mass")
-    check_number(f"{name}.mass", value["mass"], f"[0, {MOST_KG}]")
+    check_number(f"{name}.mass", value["mass"], f"[0, {most[0]:g}]")
     mass = float(value["mass"])
     centre = _numbers(f"{name}.centre", value.get("centre"), (3,), np.zeros(3))
-    if (distance := np.linalg.norm(centre)) > FARTHEST_M:
+    if (distance := np.linalg.norm(centre)) > most[1]:
         raise UserError(
-            f"{name}.centre: expected at most {FARTHEST_M:g} m from the end effector, got {distance:.3g} m "
+            f"{name}.centre: expected at most {most[1]:g} m from the end effector, got {distance:.3g} m "
             f"({centre.tolist()})"
         )
-    inertia = _tensor(f"{name}.inertia", value.get("inertia"), mass)
+    inertia = _tensor(f"{name}.inertia", value.get("inertia"), mass, most)
     on, off = value.get("on_s"), value.get("off_s")
     on, off = 0.0 if on is None else on, np.inf if off is None else off
     check_number(f"{name}.on_s", on, "[0, inf)")
@@ -97,8 +98,11 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], default: np.ndarray)
     return array
 
 
-def _tensor(name: str, value: Any, mass: float) -> np.ndarray:
-    """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is that of a sphere of water."""
+def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
+    """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is that of a sphere of water.
+
+    No moment is larger than that of the largest payload as a rod, three times as long as its largest distance.
+    """
     if value is None:
         return sphere_inertia(np.array(mass))
     count = 6 if isinstance(value, list | tuple) and len(value) == 6 else 3
@@ -113,8 +117,8 @@ def _tensor(name: str, value: Any, mass: float) -> np.ndarray:
     if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # round-off of a flat body
         listed = ", ".join(f"{m:.3g}" for m in moments)
         raise UserError(f"{name}: expected no moment above the sum of the others, got {listed} kg m^2")
-    if moments[2] > MOST_TENSOR:
-        raise UserError(f"{name}: expected moments of at most {MOST_TENSOR:g} kg m^2, got {moments[2]:.3g}")
+    if moments[2] > (largest := most[0] * (3.0 * most[1]) ** 2 / 12.0):
+        raise UserError(f"{name}: expected moments of at most {largest:.3g} kg m^2, got {moments[2]:.3g}")
     return tensor
 
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, check_number, choices, nearest
 from r2s.files import located
 from r2s.physics.obstacle import Box
 from r2s.physics.robot_checks import check_arm, check_limits, check_masses, gravity_of, torque_limits
@@ -28,6 +28,9 @@ PANDA = "r2s:models/panda.xml"
 RATE_SHARE = 0.99
 SIM_DT = 1e-3  # s, control cycle of the arm
 DQ_MAX = 2.0  # rad/s, default velocity limit, conservative for an arm of this size
+# payload of an arm without a published one: kg g reach over the largest torque limit, and distance over reach, as of
+# a Panda (3 kg and 0.15 m, 87 Nm)
+PAYLOAD_SHARE, PAYLOAD_FAR = 0.33, 0.15
 OF_TASKS = ("torque_fraction", "tracking_fraction", "reach")  # keys of conf/robot for tasks, not for `load_robot`
 
 
@@ -52,6 +55,7 @@ class Robot:
             deceleration distance + offset^2) - offset at a distance from the position limit; None: no such limit.
         tool: the tip that touches; None: a bare end effector.
         lock: {joint: rad or m} of the file that are welded.
+        payload_max: (2,) kg and m, the heaviest payload, and the farthest place of its centre from the end effector.
     """
 
     name: str
@@ -74,6 +78,7 @@ class Robot:
     velocity_envelope: tuple[np.ndarray, np.ndarray] | None = None
     tool: Tool | None = None
     lock: Mapping[str, float] = field(default_factory=dict)
+    payload_max: tuple[float, float] = (3.0, 0.15)
 
     @property
     def n(self) -> int:
@@ -161,6 +166,8 @@ def load_robot(
     armature: list[float] | float | None = None,
     tool: str | None = None,
     lock: Mapping[str, float] | None = None,
+    payload_max: float | None = None,
+    payload_far: float | None = None,
 ) -> Robot:
     """Read an arm from an MJCF or URDF file; the other arguments override the file's values.
 
@@ -176,6 +183,7 @@ def load_robot(
         armature: kg m^2, rotor inertia at the joints; None: the file's.
         tool: JSON file of the tool's tip (r2s/physics/surface.py); None: no tool.
         lock: {joint: rad or m} of the file that are welded there, such as a gripper's; None: none.
+        payload_max, payload_far: kg, m, of `Robot.payload_max`; None: from the torque limits and the reach.
 
     Raises:
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
@@ -226,7 +234,25 @@ def load_robot(
         frictionloss=model.dof_frictionloss.copy(),
         tool=None if tool is None else load_tool(tool),
         lock=dict(lock or {}),
+        payload_max=_payload_max(model, site, torque, payload_max, payload_far),
     )
+
+
+def _payload_max(
+    model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
+) -> tuple[float, float]:
+    """Return `Robot.payload_max`: what is given, the rest in proportion to the reach from the second joint."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    sites = [model.site(i).name for i in range(model.nsite)]
+    end = data.site(ee).xpos if ee in sites else data.body(ee).xpos
+    reach = np.linalg.norm(np.diff(np.concatenate([data.xanchor[1:], end[None]]), axis=0), axis=1).sum()
+    reach = max(float(reach), 1e-3)
+    for name, value in (("payload_max", mass), ("payload_far", far)):
+        if value is not None:
+            check_number(f"robot.{name}", value, "(0, inf)")
+    own = PAYLOAD_SHARE * float(torque.max()) / (9.81 * reach)
+    return float(own if mass is None else mass), float(PAYLOAD_FAR * reach if far is None else far)
 
 
 def _tensors(model: mujoco.MjModel) -> np.ndarray:

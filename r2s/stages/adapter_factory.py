@@ -47,7 +47,8 @@ def with_declared_payload(cfg, robot, dynamics):
     key = "declared_payload"
     if not cfg.arm.get(key):
         return dynamics
-    return replace(dynamics, declared_payload=mass_and_moment(robot, payload_of(plain(cfg.arm)[key], f"arm.{key}")))
+    declared = payload_of(plain(cfg.arm)[key], robot.payload_max, f"arm.{key}")
+    return replace(dynamics, declared_payload=mass_and_moment(robot, declared))
 
 
 def make_adapter(cfg, robot, source):

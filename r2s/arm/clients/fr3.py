@@ -66,7 +66,8 @@ class FR3(Franka):
         speed_share: float = 1.0,
     ):
         thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        expected = Connection(connection_check.FR3, payload_of(declared_payload, "arm.declared_payload"), moves)
+        declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
+        expected = Connection(connection_check.FR3, declared, moves)
         client = _FR3Client(address, realtime)
         super().__init__(within_fr3(robot), client, operator, thresholds, expected, realtime, speed_share)
 

@@ -55,7 +55,8 @@ class Panda(Franka):
         speed_share: float = 1.0,
     ):
         thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        expected = Connection(PANDA, payload_of(declared_payload, "arm.declared_payload"), moves)
+        declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
+        expected = Connection(PANDA, declared, moves)
         client = _PandaClient(address, realtime)
         super().__init__(PANDA.within(robot), client, operator, thresholds, expected, realtime, speed_share)
 

@@ -63,8 +63,8 @@ class TwinBase:
         surface: Any = False,
     ):
         check_number("arm.seed", seed, "[0, inf)", whole=True)
-        self._payload = payload_of(payload)
-        self.declared_payload = payload_of(declared_payload, "arm.declared_payload")
+        self._payload = payload_of(payload, robot.payload_max)
+        self.declared_payload = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
         self._declared, self._load_torque = mass_and_moment(robot, self.declared_payload), LoadTorque(robot)
         self._carries = False
         if stiffness is not None:
