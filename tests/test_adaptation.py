@@ -20,7 +20,14 @@ from r2s.adaptation.model_correction import (
 from r2s.adaptation.momentum import BODY, MOMENTUM_WORK, MomentumTerms, momentum
 from r2s.adaptation.momentum_residual import MomentumResidual
 from r2s.adaptation.noise_model import default_noise, fit_noise, momentum_residuals
-from r2s.adaptation.offline_estimation import at_rate, estimate_recording, fit_correction, table
+from r2s.adaptation.offline_estimation import (
+    UNKNOWN_PAUSE_S,
+    at_rate,
+    estimate_recording,
+    fit_correction,
+    pauses,
+    table,
+)
 from r2s.adaptation.payload_jump import MEAN
 from r2s.adaptation.tuning import HUBER, SPAN
 from r2s.errors import UserError
@@ -34,7 +41,7 @@ from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
 from r2s.recordings.recording import Recording
 
-PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]})
+PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]}, (3.0, 0.15))
 DELAY = 3e-3
 
 
@@ -456,3 +463,37 @@ def test_the_old_name_of_the_stage_gives_the_new_one():
 
     with pytest.raises(UserError, match=r"^stage=watch is now stage=estimate$"):
         check_overrides(["stage=watch"], None)
+
+
+def test_a_pause_widens_the_estimate_by_the_clock():
+    """Ten seconds without rows add the drift of ten seconds, a restarted clock that of a minute, and `t` has both."""
+    data, half = recording(noise=2e-3), round(1.5 / SIM_DT)
+    arm = make_arm_model(robot(), truth())
+    noise, trajectory = default_noise(arm), np.arange(len(data.t)) // half
+    offset, after = BODY + 7, {}
+    for pause in (0.0, 10.0, -1.5):  # s
+        cut = replace(data, t=data.t + pause * trajectory, trajectory=trajectory)
+        assert pauses(cut)[1] == pytest.approx(max(pause + SIM_DT, 0.0) or UNKNOWN_PAUSE_S)
+        estimator = Estimator(arm, noise)
+        estimates = estimate_recording(robot(), estimator, cut.select(cut.trajectory == 0))
+        before = estimator.internals[0].P.diagonal().copy()
+        estimator.begin(pauses(cut)[1])
+        after[pause] = estimator.internals[0].P.diagonal() - before
+        assert estimator.now.t == pytest.approx(estimates[-1].t + pauses(cut)[1], abs=2 * SPAN * SIM_DT)
+    for pause, seconds in ((10.0, 10.0 + SIM_DT), (-1.5, UNKNOWN_PAUSE_S)):
+        np.testing.assert_allclose(after[pause][offset : offset + 7], seconds * noise.offset_drift**2, rtol=1e-9)
+        np.testing.assert_allclose(after[pause][BODY:offset], seconds * noise.friction_drift**2, rtol=1e-9)
+    assert after[10.0][0] > 0.1 * noise.prior[0] ** 2  # the payload may have been changed unseen
+
+
+def test_payload_limits_are_those_of_the_arm():
+    """The configuration says them, else torque limits and reach do; a Panda's are 3 kg and 15 cm within a fifth."""
+    assert robot().payload_max == (3.0, 0.15)
+    np.testing.assert_allclose(load_robot().payload_max, robot().payload_max, rtol=0.2)
+    strong = load_robot(tau_max=[870.0, 870, 870, 870, 120, 120, 120])
+    assert strong.payload_max[0] == pytest.approx(10 * load_robot().payload_max[0])
+    heavy = replace(robot(), payload_max=(10.0, 0.3))
+    small, large = (default_noise(make_arm_model(r, truth())).prior[:BODY] for r in (robot(), heavy))
+    np.testing.assert_allclose(large[:4] / small[:4], [10 / 3, *[20 / 3] * 3])
+    with pytest.raises(UserError, match=r"robot\.payload_max"):
+        load_robot(payload_max=-1.0)

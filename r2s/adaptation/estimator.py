@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2s.adaptation.arm_model import ArmModel
-from r2s.adaptation.kalman import AT_REST, Filter, Noise, update
+from r2s.adaptation.kalman import AT_REST, Filter, Noise, pause, update
 from r2s.adaptation.momentum import BODY
 from r2s.adaptation.momentum_residual import MomentumResidual, ResidualState, update_residual
 from r2s.adaptation.payload_jump import JUMP, MEAN, apply_jump
@@ -28,7 +28,8 @@ Z = 1.96  # standard deviations of a 95 % interval
 class Estimate:
     """The estimate at one moment; `_half` marks half widths of 95 % intervals."""
 
-    t: float  # s
+    cycle: int  # since the start
+    t: float  # s, with pauses
     mass: float  # kg
     mass_half: float
     centre: np.ndarray  # (3,) m in the payload frame; nan if the mass may as well be zero
@@ -41,6 +42,7 @@ class Estimate:
     rests: bool  # no joint slides
     odds: float  # log odds of a payload change
     changed: bool  # a payload change was detected at this moment
+    beyond: bool = False  # the mass is above the arm's largest payload, which is all that is compensated
 
 
 class Estimator:
@@ -59,15 +61,18 @@ class Estimator:
         self.changes: list[float] = []
         self.held = False
         self._filter = Filter.fresh(noise)
-        self._cycle, self._changed = 0, False
+        self._cycle, self._paused_s, self._changed = 0, 0.0, False
         self._before = self._payload()
         self._moved = 0  # spans since a rest, up to SETTLING_SPANS
         self._now: Estimate | None = None
         apply_jump(Filter.fresh(noise), noise)  # compile before an arm waits
         self.begin()
 
-    def begin(self) -> None:
-        """Begin a motion from rest, and keep the estimate."""
+    def begin(self, pause_s: float = 0.0) -> None:
+        """Begin a motion from rest; the estimate of `pause_s` before is kept, and as uncertain as after that time."""
+        if pause_s:
+            pause(self._filter, self._noise, pause_s)
+            self._paused_s, self._now = self._paused_s + pause_s, None
         self._state, self._residual = ResidualState.fresh(self._n), MomentumResidual.empty(self._n)
 
     def __call__(self, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> bool:
@@ -90,11 +95,15 @@ class Estimator:
         jumped, replaced = bool(self._filter.log_odds[MEAN] > THRESHOLD), self._replaced_at_rest()
         self._changed, self._now = jumped or replaced, None
         if self._changed:
-            self.changes.append(self._cycle * SIM_DT)
+            self.changes.append(self._t)
             self._moved = SETTLING_SPANS
         if jumped:
             apply_jump(self._filter, self._noise)
         return True
+
+    @property
+    def _t(self) -> float:
+        return self._cycle * SIM_DT + self._paused_s
 
     def _payload(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the payload's mass and first moments (4,), and their covariance (4, 4)."""
@@ -142,7 +151,8 @@ class Estimator:
         spread = Z * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", of_centre, P[:4, :4], of_centre), 0.0))
         heavy = mass > max(half[0], LEAST_KG)
         return Estimate(
-            t=self._cycle * SIM_DT,
+            cycle=self._cycle,
+            t=self._t,
             mass=mass,
             mass_half=float(half[0]),
             centre=centre if heavy else np.full(3, np.nan),
@@ -155,6 +165,7 @@ class Estimator:
             rests=not (self._residual.sliding > 0).any(),
             odds=float(self._filter.log_odds[MEAN]),
             changed=changed,
+            beyond=bool(mass - half[0] > self._arm.payload_max[0]),
         )
 
 

@@ -17,7 +17,16 @@ from typing import NamedTuple
 import numpy as np
 
 from r2s.adaptation.momentum import BODY
-from r2s.adaptation.payload_jump import JUMP, SINCE_JUMP, USED, begin_onset, detect, update_onsets, widen_payload
+from r2s.adaptation.payload_jump import (
+    JUMP,
+    NEXT,
+    SINCE_JUMP,
+    USED,
+    begin_onset,
+    detect,
+    update_onsets,
+    widen_payload,
+)
 from r2s.adaptation.tuning import HUBER, MOMENTUM_CORRELATION, MOST_SURPRISE, ONSETS, REST_SPANS, STICTION_S, T
 from r2s.compiled import njit
 
@@ -102,6 +111,26 @@ def predict(filter, noise, residual):
         _predict_joint(filter, noise, residual, j)
     if moving and counts[SINCE_JUMP] == 0:
         begin_onset(filter)
+
+
+@njit(cache=True, error_model="numpy")
+def pause(filter, noise, seconds):
+    """Widen the estimate by `seconds` without a measurement, at most to the prior; the payload may change unseen."""
+    P, prior, n = filter.P, noise.prior, len(noise.level)
+    for i in range(BODY + 2 * n):
+        if i < BODY:
+            share = prior[i] / prior[0]
+            drift = noise.rest_drift * share * share + (noise.payload_drift * prior[i]) ** 2
+        else:
+            drift = noise.friction_drift**2 if i < BODY + n else noise.offset_drift[i - BODY - n] ** 2
+        P[i, i] = min(P[i, i] + drift * seconds, max(prior[i] ** 2, P[i, i]))
+    for i in range(BODY + 2 * n, len(prior)):  # the model's error in the last posture
+        filter.x[i] = 0.0
+        P[i, :] = 0.0
+        P[:, i] = 0.0
+        P[i, i] = prior[i] ** 2
+    filter.counts[USED] = 0
+    filter.counts[NEXT] = 0
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,6 +18,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 LEAST_HZ = 200.0
+UNKNOWN_PAUSE_S = 60.0  # s, taken for a pause of unknown length: time to change what an arm carries
 
 
 def fit_correction(
@@ -63,14 +64,22 @@ def estimate_recording(
 ) -> list[Estimate]:
     """Return the estimate at the end of each span of the recording; `report` gets each one at once."""
     recording, out = at_rate(robot, recording), []
-    for stretch in recording.stretches:
-        estimator.begin()
+    for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
+        estimator.begin(pause_s)
         for k in range(stretch.start, stretch.stop):
             if estimator(recording.q[k], recording.dq[k], recording.tau[k]):
                 out.append(estimator.now)
                 if report is not None:
                     report(estimator.now)
     return out
+
+
+def pauses(recording: Recording) -> list[float]:
+    """Return the time without rows before each trajectory, s; UNKNOWN_PAUSE_S where the clock restarts."""
+    starts = [recording.t[s.start] for s in recording.stretches]
+    ends = [recording.t[s.stop - 1] for s in recording.stretches]
+    between = [float(b - a) for a, b in zip(ends[:-1], starts[1:], strict=True)]
+    return [0.0, *(p if p > 0 else UNKNOWN_PAUSE_S for p in between)]
 
 
 def table(estimates: list[Estimate]) -> pd.DataFrame:
@@ -94,4 +103,5 @@ def format_estimate(estimate: Estimate) -> str:
         values = zip(estimate.centre, estimate.centre_half, strict=True)
         payload += f" at ({', '.join(f'{100 * c:.1f} ± {100 * h:.1f}' for c, h in values)}) cm"
     friction = " ".join(f"{100 * f:.0f}" for f in estimate.friction)
+    payload += " above the arm's largest payload" if estimate.beyond else ""
     return f"{estimate.t:7.2f} s  {payload}; friction {friction} %{'; at rest' if estimate.rests else ''}"

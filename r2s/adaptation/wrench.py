@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
-from r2s.adaptation.offline_estimation import at_rate
+from r2s.adaptation.offline_estimation import at_rate, pauses
 from r2s.adaptation.wrench_filter import update_wrench
 from r2s.adaptation.wrench_state import HANGING, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
@@ -169,10 +169,10 @@ def observe_recording(
     recording = at_rate(robot, recording)
     touch = 1 + 2 * len(observer.wrench)  # column of `in_contact`
     rows = np.empty((len(recording.t), touch + 5))
-    for stretch in recording.stretches:
+    for stretch, pause_s in zip(recording.stretches, pauses(recording), strict=True):
         observer.begin()
         if estimator is not None:
-            estimator.begin()
+            estimator.begin(pause_s)
         begun = stretch.start
         for k in range(stretch.start, stretch.stop):
             sample = recording.q[k], recording.dq[k], recording.tau[k]

@@ -35,7 +35,6 @@ def estimate(cfg, overrides):
     from r2s.adaptation.estimator import Estimator
     from r2s.adaptation.offline_estimation import format_estimate, table
     from r2s.adaptation.wrench import contacts, observe_recording
-    from r2s.physics.robot import SIM_DT
     from r2s.reporting.estimate_page import draw_estimate, write_estimate_recording
     from r2s.reporting.wrench_page import draw_wrench
 
@@ -55,6 +54,11 @@ def estimate(cfg, overrides):
             recording.save(run.folder / "recording.npz")
         estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
         observer, threshold_from = wrench_observer(cfg, robot, dynamics, surface)
+        print(
+            "compensated payload: up to {:g} kg at {:g} m (robot.payload_max, robot.payload_far)".format(
+                *robot.payload_max
+            )
+        )
         printed, estimates = -float("inf"), []
 
         def report(now):
@@ -71,7 +75,7 @@ def estimate(cfg, overrides):
         if not estimates:
             raise UserError(f"data: {recording.duration:g} s are too short for an estimate")
         rows, last, touched = table(estimates), estimates[-1], contacts(wrench)
-        at = (rows["t"] / SIM_DT).round().astype(int) - 1
+        at = [e.cycle - 1 for e in estimates]
         rows = rows.join(wrench.drop(columns="t").iloc[at].reset_index(drop=True))
         rows.to_csv(run.folder / "estimate.csv", index=False, float_format="%.6g")
         source = "calibration" if unloaded else "priors"
