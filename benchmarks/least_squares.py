@@ -47,10 +47,10 @@ class ConvergedError(Exception):
 
 
 class CountedProblem:
-    """Residual (C, P) -> (C, R) and Jacobian (P,) -> (R, P) with call counts and the best u (P,)."""
+    """Residual (C, P) -> (C, R) and its linearization (P,) -> parts with call counts and the best u (P,)."""
 
-    def __init__(self, residual: Callable, jacobian: Callable):
-        self._residual, self._jacobian = residual, jacobian
+    def __init__(self, residual: Callable, linearize: Callable):
+        self._residual, self._linearize = residual, linearize
         self.candidates, self.jacobians, self.cost, self.u = 0, 0, np.inf, np.empty(0)
 
     def residual(self, u: np.ndarray) -> np.ndarray:
@@ -64,8 +64,12 @@ class CountedProblem:
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """Return (R, P) at u (P,)."""
+        return np.concatenate([j for _, j in self.linearize(u)])
+
+    def linearize(self, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return residual and Jacobian at u (P,), in parts."""
         self.jacobians += 1
-        return self._jacobian(u)
+        return list(self._linearize(u))
 
 
 DECISION = (  # from the first tables; check it against new ones
@@ -77,7 +81,7 @@ DECISION = (  # from the first tables; check it against new ones
 
 def ours(problem: CountedProblem, start: np.ndarray, jacobians: int, ftol: float) -> None:
     """Run the solver of r2s from `start` (P,) with at most `jacobians` Jacobians."""
-    minimize(problem.residual, problem.jacobian, start, jacobians, ftol)
+    minimize(problem.residual, problem.linearize, start, jacobians, ftol)
 
 
 def mujocos(problem: CountedProblem, start: np.ndarray, jacobians: int, ftol: float, **options) -> None:
@@ -125,18 +129,18 @@ class Comparison:
         """Return u (P,), found from `start` (P,)."""
         if self.level == "residual":
             runs = len({r["problem"] for r in self.rows if r["problem"].startswith("replays")})
-            return self.solve(f"replays, {runs + 1}", problem.residual, lambda u: problem.linearize(u)[1], start)
+            return self.solve(f"replays, {runs + 1}", problem.residual, problem.linearize, start)
         for name in ("torque", "torque, reweighted"):
-            start = self.solve(name, problem.torque_residual, problem.torque_jacobian, start)
+            start = self.solve(name, problem.torque_residual, problem.torque_linearize, start)
             problem = problem.torque_reweighted(start)
         return start
 
-    def solve(self, name: str, residual: Callable, jacobian: Callable, start: np.ndarray) -> np.ndarray:
+    def solve(self, name: str, residual: Callable, linearize: Callable, start: np.ndarray) -> np.ndarray:
         """Return u (P,) of the first solver, found from `start` (P,)."""
         residual(start[None])  # compile before the clock runs
         found, rows = {}, []
         for solver in self.solvers if self.first else reversed(self.solvers):
-            p = CountedProblem(residual, jacobian)
+            p = CountedProblem(residual, linearize)
             began = time.perf_counter()
             SOLVERS[solver](p, start, self.max_evaluations, self.ftol)
             seconds = time.perf_counter() - began

@@ -670,7 +670,7 @@ def test_rows_that_fill_a_window_up_make_nothing_surer():
         full[:, :rows] = np.column_stack([j, r]).reshape(windows, rows, 3)
         full = full.reshape(-1, 3)
         problem = SimpleNamespace(
-            linearize=lambda u, full=full: (np.append(full[:, 2], u), np.concatenate([full[:, :2], np.eye(2)])),
+            linearize=lambda u, full=full: [(np.append(full[:, 2], u), np.concatenate([full[:, :2], np.eye(2)]))],
             clusters=np.repeat(np.arange(windows), rows + filled),
             weight=np.ones(2),
             start=np.zeros(2),
@@ -685,7 +685,7 @@ def test_what_trades_stays_known_together():
     r = 1e-3 * rng.standard_normal(windows * rows)
     weights = np.ones((windows * rows, 2)) / 1e-3 / np.sqrt(windows * rows)
     problem = SimpleNamespace(
-        linearize=lambda u: (np.append(r / 1e-3, 0 * u), np.concatenate([weights, 10 * np.eye(2)])),
+        linearize=lambda u: [(np.append(r / 1e-3, 0 * u), np.concatenate([weights, 10 * np.eye(2)]))],
         clusters=np.repeat(np.arange(windows), rows),
     )
     for u in (np.full(2, 0.5), np.array([1.0, 0.5])):

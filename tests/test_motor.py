@@ -27,6 +27,7 @@ from r2s.physics.robot import load_robot
 from r2s.physics.simulator import Simulator, single_arm
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
+from r2s.recordings.speed_noise import lateness
 
 SETTINGS = conf("identify/default")
 NOISE = 0.5  # Nm, white, of every sample
@@ -316,3 +317,34 @@ def test_a_wrong_current_is_named_in_one_line(tmp_path, change, how, said):
         read(path, **{"torque": "motor"} | how)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def late(recording, *, dq_s=0.0, tau_rows=0):
+    """Return a recording whose dq is behind a first-order filter of dq_s, and whose torque comes some rows late."""
+    dq, tau = recording.dq.copy(), recording.tau
+    factor = -np.expm1(-1e-3 / dq_s) if dq_s else 1.0
+    for k in range(1, len(dq)):
+        dq[k] = dq[k - 1] + factor * (dq[k] - dq[k - 1])
+    tau = np.concatenate([np.repeat(tau[:1], tau_rows, axis=0), tau[: len(tau) - tau_rows]])
+    return replace(recording, dq=dq, tau=tau)
+
+
+@pytest.mark.parametrize("lateness", [{}, {"dq_s": 0.01}, {"tau_rows": 8}, {"dq_s": 0.01, "tau_rows": 8}])
+def test_a_late_signal_does_not_go_into_the_rotors(arm, start, motion, lateness):
+    """With dq behind a filter of 10 ms and torque 8 ms late, rotors and torque delay are within their intervals."""
+    recording = late(motion, **lateness)
+    own = found_in(arm, start, recording, terms=["offset", "armature", "signal_delay"], prior={"signal_delay": 0.004})
+    rotors, delay = (own.space.where(name) for name in ("armature", "signal_delay"))
+    true = np.append(ARMATURE, 1e-3 * lateness.get("tau_rows", 0))
+    at = np.append(rotors, delay)
+    half = 0.5 * (own.found.high - own.found.low)[at]
+    assert np.all(np.abs(own.x[at] - true) < 1.5 * half)  # of eight intervals at 95 % one may miss narrowly
+    assert np.all(half < np.append(0.1 * ARMATURE, 1e-3))
+
+
+def test_the_lateness_of_dq_is_found(motion):
+    """Noise of the sensor is no lateness, a filter of 10 ms is one of 10 ms, and another scale is another signal."""
+    noisy = replace(motion, dq=motion.dq + 3e-3 * np.random.default_rng(0).standard_normal(motion.dq.shape))
+    np.testing.assert_array_equal(lateness(noisy, 10.0), 0.0)
+    np.testing.assert_allclose(lateness(late(motion, dq_s=0.01), 10.0), 0.01, rtol=0.05)
+    assert np.isnan(lateness(replace(motion, dq=motion.dq * [1.0, 1.2, 1.0]), 10.0)).tolist() == [False, True, False]

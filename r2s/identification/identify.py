@@ -23,6 +23,7 @@ from r2s.identification.friction.static_friction import StaticFriction
 from r2s.identification.friction.stiction import choose_stiction
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.posterior import posterior
+from r2s.identification.prediction import REPLAYED_S
 from r2s.identification.problem import Problem, Report, Search, fits_torque, implicit_friction
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.torque_residual import TorqueResidual
@@ -38,12 +39,14 @@ from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import STICTION_MODELS, Dynamics, with_family
 from r2s.physics.friction import FAMILIES
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.parts import spread
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
 STANDSTILL = 0.02  # rad/s, below which friction of a commanded arm is not a function of velocity
 CLEAR = 1.5  # times dq_min, below which a replayed joint may stick
 MAX_BATCH = 64  # candidates replayed at once
+SELECTED_S = 240.0  # s of a longer recording in which terms are selected
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual before
 ALIKE = 0.2  # relative error of the number of independent rows
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
@@ -116,7 +119,7 @@ class State:
     @property
     def cross_validation(self) -> CrossValidation:
         """Data and settings of the selection steps."""
-        s, data = self.settings, (self.robot, self.nominal, self.recording)
+        s, data = self.settings, (self.robot, self.nominal, spread(self.recording, SELECTED_S))
         return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add)
 
     def fitted(self) -> Dynamics:
@@ -201,6 +204,7 @@ def formulate(s: State) -> State:
     """Set up the parameter space, the residuals and the problem."""
     how, memory = s.settings, s.nominal.family.has_memory
     space = search_space(s.robot, s.nominal, how.bounds, s.terms, s.recording)
+    s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # repetitions are one block
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
     edges = estimate_breakaway(s.ramps) if s.commanded and s.ramps is not None else None
@@ -208,9 +212,10 @@ def formulate(s: State) -> State:
     if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
         slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
         released = None if edges is None else np.where(np.isnan(edges.command), [-np.inf, np.inf], edges.command)
-        windows = cut_windows(s.recording, how.window_s, slowest=slowest, edges=released)
+        replayed = spread(s.recording, REPLAYED_S)
+        windows = cut_windows(replayed, how.window_s, slowest=slowest, edges=released)
         batch = min(len(space.start) + 1, MAX_BATCH)
-        data = ReplayResidual(space, s.recording, windows, stride=how.stride, batch=batch, nthread=how.nthread)
+        data = ReplayResidual(space, replayed, windows, stride=how.stride, batch=batch, nthread=how.nthread)
     static = None
     if s.ramps is not None and edges is not None and "rise" in space.blocks:
         static = StaticFriction(s.robot, s.ramps, edges)
@@ -249,7 +254,7 @@ def fit_presliding(s: State) -> State:
     if s.problem.uses_replays or not s.commanded or PRESLIDING not in s.space.blocks:
         return s
     how, torque_data = s.settings, s.problem.torque_data
-    given = s.fitted(), s.recording, torque_data, how.bounds, s.prior
+    given = s.fitted(), spread(s.recording, REPLAYED_S), torque_data, how.bounds, s.prior
     rest: dict[str, Any] = {"report": s.history.add, "seed": how.seed, "nthread": how.nthread}
     found = s.history.step("presliding", lambda: estimate_presliding(*given, **rest))
     rest = {"cutoff_hz": how.cutoff_hz, "slowest": s.slowest, "presliding_rad": found["presliding"]}
@@ -299,7 +304,7 @@ def fit_stiction(s: State) -> State:
     how, ramped = s.settings, s.ramps is not None
     if not s.commanded or s.nominal.family.has_memory or not (ramped or how.breakaway):
         return s
-    given = s.robot, s.dynamics, s.recording, None if ramped else how.breakaway, s.history.add
+    given = s.robot, s.dynamics, spread(s.recording, REPLAYED_S), None if ramped else how.breakaway, s.history.add
     rest: dict[str, Any] = {"window_s": how.window_s, "stride": how.stride, "nthread": how.nthread}
     found = s.history.step("stiction", lambda: choose_stiction(*given, **rest))
     own: dict[str, Any] = {"stiction_model": STICTION_MODELS[int(found["model"])], "dq_min": float(found["dq_min"])}

@@ -9,6 +9,7 @@ OLD), and `link_...`, the ten log-Cholesky parameters of a link (link_inertia.py
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,9 @@ from r2s.physics.robot import Robot
 
 OTHER_UNITS = {"offset": "Nm", "armature": "kg m^2", "load": "1", "drag_sin": "Nm", "drag_cos": "Nm", "gain": "1"}
 OTHER_UNITS |= {name: "1" for name in ("inertia_scale", *LINK)}
-OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s"}
+OTHER_UNITS |= {"breakaway_positive": "Nm", "breakaway_negative": "Nm", "delay": "s", "lag": "s", "signal_delay": "s"}
 OTHER_UNITS |= {name: "kg" if name == "payload_mass" else "m" for name in PAYLOAD}
-TIMING = ("delay", "lag")
+TIMING = ("delay", "lag", "signal_delay")
 # standard deviation of a parameter among arms by its unit, of torque-like ones per Nm of tau_max; 1 of a logarithm
 USUAL = {"Nm": 0.02, "Nm s/rad": 0.02, "kg m^2": 0.002, "kg": 0.02, "1": 0.1, "rad/s": 0.03, "m": 0.1, "s": 2e-3}
 WHOLE_ARM = (*TIMING, *PAYLOAD)
@@ -92,6 +93,7 @@ class ParameterSpace:
         values |= {"drag_sin": d.drag[:, 0], "drag_cos": d.drag[:, 1]}
         values |= {"breakaway_negative": d.breakaway[:, 0], "breakaway_positive": d.breakaway[:, 1]}
         values |= {"delay": np.array([d.delay]), "lag": np.array([d.lag])}
+        values |= {"signal_delay": np.array([d.signal_delay])}
         values |= {"inertia_scale": inertia_scale(d.inertia, self.robot.inertia)}
         if any(b in LINK for b in self.blocks):
             values |= dict(zip(LINK, log_cholesky(self.robot, d).T, strict=True))
@@ -111,7 +113,7 @@ class ParameterSpace:
         """Return (P,) with the given value of each block, one or per joint (n,); other blocks get `default`."""
         return np.concatenate([np.broadcast_to(values.get(b, default), self.size(b)) for b in self.blocks])
 
-    @property
+    @cached_property
     def _log(self) -> np.ndarray:
         return self.expand(dict.fromkeys(logarithmic(), True), False)
 

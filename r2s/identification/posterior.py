@@ -1,9 +1,11 @@
 """Posterior of an identification: a normal approximation about the fit, drawn inside the bounds."""
 
-from itertools import pairwise
+from collections.abc import Iterable
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 DRAWS = 512  # of the joint distribution
 LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
@@ -17,8 +19,8 @@ class Linearized(Protocol):
         """(R,) block of each data row."""
         ...
 
-    def linearize(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual (R + B,) and Jacobian (R + B, P) at u (P,)."""
+    def linearize(self, u: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray]]:
+        """Yield residual and Jacobian at u (P,) in parts: in all R rows of data, then those of the prior."""
         ...
 
 
@@ -36,37 +38,50 @@ def posterior(problem: Linearized, u: np.ndarray, seed: int) -> Posterior:
     Errors within a block are correlated, so the scatter of block scores s, a block's part of the gradient, sets the
     covariance H^-1 (sum of s s^T + prior) H^-1 (White, Econometrica 48(4), 1980; clusters: Liang and Zeger,
     Biometrika 73(1), 1986). With few blocks the fit follows each one, so a block's residual is smaller than its
-    error, by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002). The mean
-    score, which is not 0 at a bound, is removed. Few blocks underestimate the covariance where single blocks decide,
-    so it never falls below the one for independent rows, in any direction. A bootstrap over blocks would sometimes
-    draw an H with hardly any information on a value that few blocks determine; such tails describe no arm.
+    error, by its share of the information (CR2 of Bell and McCaffrey, Survey Methodology 28(2), 2002), and their
+    scatter widens the draws as in Student's t. The mean score, which is not 0 at a bound, is removed. Few blocks
+    underestimate the covariance where single blocks decide, so it never falls below the one for independent rows, in
+    any direction. A bootstrap over blocks would sometimes draw an H with hardly any information on a value that few
+    blocks determine; such tails describe no arm.
     """
-    rng = np.random.default_rng(seed)
-    residual, jacobian = problem.linearize(u)
-    rows, p = len(problem.clusters), len(u)
-    j, r = jacobian[:rows], residual[:rows]
-    count = int(problem.clusters.max()) + 1
-    order = np.argsort(problem.clusters, kind="stable")
-    edges = np.searchsorted(problem.clusters[order], np.arange(count + 1))
-    j, r = j[order], r[order]
-    gram = np.stack([j[a:b].T @ j[a:b] for a, b in pairwise(edges)])
-    score = np.stack([j[a:b].T @ r[a:b] for a, b in pairwise(edges)])
-    rest = jacobian[rows:]
-    # a flat prior has no row; the bounds alone leave a variance of 1/12
-    prior = rest.T @ rest + np.diag(np.where(rest.any(0), 0.0, 12.0))
-    counts = j.any(1)  # padding rows have neither a residual nor a slope
-    factor = max(1.0, float(np.sqrt(np.mean(r[counts] ** 2)))) if counts.any() else 1.0
-    information = gram.sum(0)
+    gram, score, prior, factor = _sums(problem, u)
+    information, few = gram.sum(0), max(len(gram) - 1, 1)
     covariance = np.linalg.inv(information + prior)
     root = np.linalg.cholesky(covariance)
-    share, axes = np.linalg.eigh(root.T @ gram @ root)  # a block's share of the information, by direction
-    left = np.maximum(1.0 - share, LEAST_LEFT)[..., None]
-    within = axes @ ((axes.swapaxes(1, 2) @ (root.T @ score[..., None])) / np.sqrt(left))
-    score = np.linalg.solve(root.T, within[..., 0].T).T
-    score -= score.mean(0)
+    for own, s in zip(gram, score, strict=True):
+        share, axes = np.linalg.eigh(root.T @ own @ root)  # a block's share of the information, by direction
+        left = np.sqrt(np.maximum(1.0 - share, LEAST_LEFT))
+        s[:] = np.linalg.solve(root.T, axes @ (axes.T @ (root.T @ s) / left))
+    score = (score - score.mean(0)) * np.sqrt((few + 1) / few) * student.ppf(0.975, few) / norm.ppf(0.975)
     least, robust = (covariance @ np.linalg.cholesky(m + prior) for m in (factor**2 * information, score.T @ score))
-    steps = rng.standard_normal((DRAWS, p)) @ _at_least(least, robust).T
+    normal = np.random.default_rng(seed).standard_normal((DRAWS, len(u)))
+    normal -= normal.mean(0)
+    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / DRAWS), normal.T).T  # of covariance 1, exactly
+    steps = normal @ _at_least(least, robust).T
     return Posterior(u, _inside(u, steps, information + prior), information)
+
+
+def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the information (K, P, P) and score (K, P) of each block, the prior's information, and the residual.
+
+    The residual is the RMS of data rows, at least 1.
+    """
+    clusters, p = problem.clusters, len(u)
+    count, square, seen, row = int(clusters.max()) + 1, 0.0, 0, 0
+    gram, score, prior = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros((p, p))
+    for r, j in problem.linearize(u):
+        own = clusters[row : row + len(r)]
+        row, rest, j, r = row + len(r), j[len(own) :], j[: len(own)], r[: len(own)]
+        prior += rest.T @ rest
+        for block in np.unique(own):
+            some = np.flatnonzero(own == block)
+            gram[block] += j[some].T @ j[some]
+            score[block] += j[some].T @ r[some]
+        counts = j.any(1)  # padding rows have neither a residual nor a slope
+        square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
+    # a flat prior has no row; the bounds alone leave a variance of 1/12
+    prior += np.diag(np.where(prior.any(0), 0.0, 12.0))
+    return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 
 def _at_least(least: np.ndarray, root: np.ndarray) -> np.ndarray:

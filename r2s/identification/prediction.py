@@ -9,9 +9,11 @@ from r2s.identification.residuals.windows import cut_windows, replay
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import Simulator
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
+REPLAYED_S = 240.0  # s of a longer recording that are replayed
 MAX_WINDOWS = 100  # per horizon
 
 
@@ -37,6 +39,7 @@ def prediction_errors(
         out[f"{name}torque_rmse_Nm"] = np.sqrt((torque.error(dynamics) ** 2).mean(0)).tolist()
     if recording.torque != "commanded":
         return out
+    recording = spread(recording, REPLAYED_S)
     windows = cut_windows(recording, window_s)
     for name, dynamics in sides.items():
         error = replay(robot, dynamics, windows, nthread) - windows.q

@@ -1,6 +1,6 @@
 """The least-squares problem of an identification on the unit cube, and the interface of its searches."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -124,19 +124,21 @@ class Problem:
         """Return (C, R + B) for u (C, P): data, prior and extra rows, in standard deviations."""
         return self._with_prior(self.data, u)
 
-    def linearize(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `residual` (R + B,) and its Jacobian (R + B, P) at u (P,)."""
+    def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield `residual` and its Jacobian (., P) at u (P,) in parts of rows: data, then prior and extra rows."""
         if not self.uses_replays:
-            return self.torque_residual(u[None])[0], self.torque_jacobian(u)
-        return _differences(self.residual, u)
+            yield from self.torque_linearize(u)
+        else:
+            yield _differences(self.residual, u)
 
     def torque_residual(self, u: np.ndarray) -> np.ndarray:
         """Return `residual` with the torque residual as data."""
         return self._with_prior(self.torque_data, u)
 
-    def torque_jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (R + B, P) of `torque_residual` at u (P,)."""
-        return np.concatenate([self.torque_data.jacobian(u), _differences(self._prior, u)[1]])
+    def torque_linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield `torque_residual` and its Jacobian at u (P,) like `linearize`."""
+        yield from self.torque_data.linearize(u)
+        yield _differences(self._prior, u)
 
     def prior_information(self, u: np.ndarray) -> np.ndarray:
         """Return (P, P), half the Hessian at u (P,) of the prior and extra rows."""
@@ -186,7 +188,7 @@ def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
     """Return u (P,) by least squares on torque, reweighted between rounds, and the problem with the last weights."""
     u, rounds = problem.start, MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
     for k in range(rounds):
-        u = minimize(problem.torque_residual, problem.torque_jacobian, u, FIT_STEPS, FIT_FTOL)
+        u = minimize(problem.torque_residual, problem.torque_linearize, u, FIT_STEPS, FIT_FTOL)
         if k < rounds - 1:
             problem = problem.torque_reweighted(u)
     return u, problem
@@ -199,9 +201,15 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
     effect must have about the expected size and be `significant` standard deviations. A missing rotor has a similar
     effect, a hundred times larger.
     """
-    r, j = problem.torque_residual(u[None])[0], problem.torque_jacobian(u)
+    r = problem.torque_residual(u[None])[0]
     ahead = problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT))
     moved = ahead.torque_residual(u[None])[0] - r
-    own = moved - j @ np.linalg.lstsq(j, moved, rcond=None)[0]  # the part that no parameter explains
-    share = -(own @ r) / (own @ own)
-    return bool(EXPECTED[0] < share < EXPECTED[1] and share * np.linalg.norm(own) > significant)
+    row, products, hessian = 0, 0.0, 0.0
+    for own, j in problem.torque_linearize(u):
+        both = np.stack([own, moved[row : row + len(own)]], 1)
+        row, products, hessian = row + len(own), products + j.T @ both, hessian + j.T @ j
+    gradient, slope = np.asarray(products).T
+    best = np.linalg.lstsq(hessian, slope, rcond=None)[0]
+    size = moved @ moved - best @ slope  # of the part that no parameter explains
+    share = -(moved @ r - best @ gradient) / size
+    return bool(EXPECTED[0] < share < EXPECTED[1] and share * np.sqrt(size) > significant)

@@ -15,12 +15,16 @@ from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
 TERMS = (
-    *("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "load", "gain"),
+    *("offset", "inertia_scale", "link", "payload", "armature", "delay", "lag", "signal_delay", "load", "gain"),
     *("drag", "drag_sin", "drag_cos"),
 )
 # terms without effect on the recorded torque: delay and lag lie between command and motion, gain in the sensor, and a
 # link-side sensor does not measure rotors
-NO_EFFECT = {"commanded": ("gain",), "measured": ("delay", "lag", "armature"), "motor": ("delay", "lag")}
+NO_EFFECT = {
+    "commanded": ("gain", "signal_delay"),
+    "measured": ("delay", "lag", "armature"),
+    "motor": ("delay", "lag"),
+}
 
 
 def optional_friction() -> list[str]:

@@ -33,6 +33,7 @@ class Dynamics:
         drag: (..., n, 2) Nm, offset proportional to sin q and cos q of the joint, such as a cable's.
         gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; a property of
             the recording, not of the arm's motion.
+        signal_delay: (...) s, by which measured or motor torque is logged later than the angles; of the recording.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: of the friction.
         stiction_model: the torque that the breakaway edges limit. "command" is eq. (6) of the paper: command and
@@ -61,6 +62,7 @@ class Dynamics:
     stiction_model: str = "command"
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
+    signal_delay: np.ndarray | float = 0.0
     declared_payload: np.ndarray = field(default_factory=lambda: np.zeros(4))
     surface: Surface | None = None
 
@@ -110,7 +112,8 @@ class Dynamics:
 
 # Number of axes of each array for one arm.
 AXES = {"phi": 2, "offset": 1, "breakaway": 2, "mass": 1, "com": 2, "inertia": 3, "armature": 1}
-AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "speed_noise": 1, "declared_payload": 1}
+AXES |= {"load": 1, "drag": 2, "gain": 1, "delay": 0, "lag": 0, "signal_delay": 0}
+AXES |= {"speed_noise": 1, "declared_payload": 1}
 
 
 def nominal_dynamics(

@@ -105,7 +105,7 @@ class ContactProblem:
 
     def minimized(self, u: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
         """Return u (8,) at a minimum near u, and the sum of squares there."""
-        u = minimize(self.residual, self.jacobian, u, steps, FTOL)
+        u = minimize(self.residual, lambda u: [(self.residual(u[None])[0], self.jacobian(u))], u, steps, FTOL)
         return u, float((self.residual(u[None]) ** 2).sum())
 
     def reweighted(self, u: np.ndarray) -> "ContactProblem":
@@ -122,12 +122,12 @@ class ContactProblem:
         """Return (8 + r,) on the unit cube: u (8,) and its best w, for `linearize`."""
         return np.concatenate([u, 0.5 + self.best_arm(u) / (2 * REACH)])
 
-    def linearize(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual (R + 8 + r,) and derivative at (8 + r,), surface and arm together."""
+    def linearize(self, whole: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return residual (R + 8 + r,) and derivative, in one part, at (8 + r,), surface and arm together."""
         u, w = whole[:8], (whole[8:] - 0.5) * 2 * REACH
         prior = np.concatenate([np.full(8, FLAT), np.full(len(w), 2 * REACH)])
         r = np.concatenate([self.data(u) + self.arm @ w, prior * (whole - 0.5)])
-        return r, np.concatenate([np.concatenate([self.slope(u), 2 * REACH * self.arm], 1), np.diag(prior)])
+        return [(r, np.concatenate([np.concatenate([self.slope(u), 2 * REACH * self.arm], 1), np.diag(prior)]))]
 
 
 def contact_problem(

@@ -6,14 +6,15 @@ reverses (modulating functions: Shinbrot, Trans. ASME 79, 1957). Rigid-body torq
 weights. Close reversals make windows shorter and rows noisier; the encoder noise gives the amount.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
 from scipy.signal import savgol_filter
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array
 
-from r2s.identification.residuals.zero_phase import EDGE_S, too_short
+from r2s.identification.residuals.zero_phase import EDGE_S, cubic, too_short
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
 from r2s.recordings.recording import Recording
@@ -112,6 +113,16 @@ class SlidingMotion:
             means, half > 0, gain[half], encoder, delayed, smooth.t[own], own == began,
         )  # fmt: skip
 
+    @staticmethod
+    def joined(parts: "Sequence[SlidingMotion]") -> "SlidingMotion":
+        """Return consecutive parts of a recording as one."""
+        if len(parts) == 1:
+            return parts[0]
+        names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
+        arrays = {name: np.concatenate([getattr(m, name) for m in parts]) for name in names}
+        means = [csr_array(block_diag(own, format="csr")) for own in zip(*(m.means for m in parts), strict=True)]
+        return SlidingMotion(means=tuple(means), encoder=np.median([m.encoder for m in parts], axis=0), **arrays)
+
     @property
     def friction_dq(self) -> np.ndarray:
         """(F, n) rad/s, velocity in the friction law."""
@@ -137,19 +148,9 @@ class SlidingMotion:
         late = np.clip(late, 1.0, self.delayed.shape[1] - 3)
         at = late.astype(int)
         weights = np.zeros(self.delayed.shape[1])
-        for k, weight in enumerate(_cubic(late - at), start=-1):
+        for k, weight in enumerate(cubic(late - at), start=-1):
             np.add.at(weights, at + k, weight * LAG_WEIGHTS / len(HOLD_STEPS))
         return np.einsum("tkn,k->tn", self.delayed, weights)
-
-
-def _cubic(x: np.ndarray) -> list[np.ndarray]:
-    """Return the weights of samples at -1, 0, 1 and 2 in their Lagrange interpolation at x in [0, 1]."""
-    return [
-        -x * (x - 1) * (x - 2) / 6,
-        (x + 1) * (x - 1) * (x - 2) / 2,
-        -(x + 1) * x * (x - 2) / 2,
-        (x + 1) * x * (x - 1) / 6,
-    ]
 
 
 def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:

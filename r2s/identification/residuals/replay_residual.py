@@ -8,6 +8,7 @@ from copy import copy
 
 import numpy as np
 
+from r2s.identification.blocks import blocks_of
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.windows import StartState, Windows
 from r2s.physics.dynamics import Dynamics
@@ -30,7 +31,7 @@ class ReplayResidual:
         window, per joint;   e ~ N(0, s^2): encoder noise.
     Z is computed by finite differences about a candidate; d and s come from the recording, later from the residual.
 
-    `clusters` (R,) is the window of each row.
+    `clusters` (R,) is the block of each row, at first its window.
 
     Args:
         space, recording, windows: see `cut_windows`.
@@ -50,7 +51,7 @@ class ReplayResidual:
         self.space, self.windows, self._batch = space, windows, batch
         n = space.n
         self.count = len(windows.q0)
-        self._stride = stride
+        self._stride, self._period = stride, recording.period
         self._target = self._means(windows.q)
         last = stride * (1 + np.arange(self._target.shape[1]))
         self._seen = np.repeat((last <= windows.length[:, None])[..., None], n, axis=2)
@@ -117,6 +118,11 @@ class ReplayResidual:
         at_x = np.concatenate(parts)
         steps = np.repeat([Q_STEP, DQ_STEP, TAU_STEP], n)
         z = ((at_x[1:] - at_x[0]) / steps[:, None, None]).transpose(1, 2, 0)  # (W, R', 3 n)
+        if fitted:
+            seconds = SIM_DT * w.tau.shape[1]
+            mean = at_x[0].reshape(self._target.shape).mean(1) / self._noise
+            block = blocks_of(w.t, w.q0, self._period, mean, seconds)
+            self.clusters = np.repeat(block, self._target[0].size)
         self._trust = np.ones(self.count)
         moves = self._seen.any((1, 2))  # the other windows are all padding
         if fitted and moves.any():

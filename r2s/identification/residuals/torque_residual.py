@@ -4,25 +4,32 @@ Link-side and motor torque include gravity and have no command to replay, so thi
 commanded torque it is the fast start of a fit. Rows are in units of their own standard deviation, see `reweighted`.
 """
 
+from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any
 
 import numpy as np
 
+from r2s.identification.blocks import BLOCK_S, blocks_of
 from r2s.identification.parameters import OF_LINKS, WHOLE_ARM, ParameterSpace
 from r2s.identification.residuals.modulating_functions import SlidingMotion
 from r2s.identification.residuals.planned_motion import PlannedMotion
-from r2s.identification.residuals.zero_phase import SmoothMotion
+from r2s.identification.residuals.rigid_body_rows import RigidBodyRows
+from r2s.identification.residuals.zero_phase import EDGE_S, SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
-from r2s.physics.rigid_body import LinkInertia, mass_matrix, regressor, rigid_body
+from r2s.physics.rigid_body import LinkInertia
+from r2s.recordings.parts import pieces
 from r2s.recordings.recording import Recording
+from r2s.recordings.speed_noise import lateness
 
 STEP = 1e-4  # of the unit cube: finite differences, far above round-off and far below the residual's curvature
 MAX_CORRELATION = 40  # rows: a slowly drifting residual still counts as more than one row
 MIN_SIGMA = 1e-9  # Nm
+MOST_ROWS = 60_000  # moments: from ten minutes on they are farther apart, and below the cutoff lose little
+PIECE_S = 60.0  # s of a recording that are filtered at once
+PART = 2048  # moments whose Jacobian is in memory at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
-BLOCK_S = 0.5  # s, length of blocks with independent errors
 
 
 class TorqueResidual:
@@ -49,40 +56,42 @@ class TorqueResidual:
         presliding_rad: np.ndarray | float = PRESLIDING,
         slowest: float = 0.0,
     ):
-        self.space, robot = space, space.robot
-        m: SmoothMotion | SlidingMotion | PlannedMotion
-        if isinstance(recording, PlannedMotion):
-            m, self.seen, self._noise = recording, np.abs(recording.dq) >= slowest, np.zeros_like(recording.q)
-        elif slowest:
-            slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
-            m = sliding = SlidingMotion.of(recording, rate_hz, slowest, slid, presliding_rad)
-            encoder_torque = m.rows(mass_matrix(robot, m.q) ** 2) @ sliding.encoder**2
-            self.seen, self._noise = sliding.seen, sliding.noise * np.sqrt(encoder_torque)
-        else:
-            m = SmoothMotion.of(recording, cutoff_hz, rate_hz, presliding_rad)
-            self.seen, self._noise = np.ones_like(m.q, dtype=bool), np.zeros_like(m.q)
-        self.motion, self.commanded = m, recording.torque == "commanded"
-        # a link-side sensor does not measure the torque that accelerates the rotors
-        self._rotors = 0.0 if recording.torque == "measured" else m.rows(m.ddq)
-        self.at_motor = recording.torque == "motor"
-        gravity = None if self.commanded else robot.gravity
-        rest, y = rigid_body(robot, m.q, m.dq, m.ddq, gravity)
-        self._rest = m.rows(rest - robot.armature * m.ddq)  # the candidate adds its own rotors
-        self._y = m.rows(y.reshape(*m.q.shape, -1))
-        still = np.zeros_like(m.q)
-        y = regressor(robot, m.q, still, still, robot.gravity)
-        self._gravity = m.rows(y.reshape(*m.q.shape, -1))
+        self.space, self._period = space, None if isinstance(recording, PlannedMotion) else recording.period
+        self.commanded, self.at_motor = recording.torque == "commanded", recording.torque == "motor"
+        slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
+        motions: Sequence[Any] = [recording]
+        if isinstance(recording, Recording):
+            rate_hz = min(rate_hz, MOST_ROWS / recording.duration)
+            late = dq_lateness(recording, cutoff_hz)
+            motions = [
+                SlidingMotion.of(piece, rate_hz, slowest, slid, presliding_rad)
+                if slowest
+                else SmoothMotion.of(piece, cutoff_hz, rate_hz, presliding_rad, late)
+                for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / rate_hz)
+            ]
+        self._rigid = RigidBodyRows.joined([RigidBodyRows.of(space.robot, m, recording.torque) for m in motions])
+        robot = space.robot
         self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
-        self._load = np.abs(self._gravity @ self._nominal)
+        m = type(motions[0]).joined(motions)
+        self.motion: SmoothMotion | SlidingMotion | PlannedMotion = m
+        sliding = isinstance(m, SlidingMotion)
+        self.seen: np.ndarray = m.seen if sliding else np.abs(m.dq) >= slowest * isinstance(m, PlannedMotion)
+        self._noise: np.ndarray = self._rigid.encoder * (m.noise if sliding else 1.0)
         self._sin, self._cos = m.rows(np.sin(m.q)), m.rows(np.cos(m.q))
         # sign of friction, by has_memory; a sliding joint has its full friction however slow it is
         dq = m.friction_dq
         self._sign = {False: np.sign(dq) if slowest else np.tanh(dq / WIDTH_DQ), True: m.bristle}
         self._mean_sign = {memory: m.filtered(sign) for memory, sign in self._sign.items()}
-        block = (m.t / BLOCK_S).astype(int)
-        self.clusters = np.repeat(np.unique(block, return_inverse=True)[1], robot.n)
+        self.block = blocks_of(m.t, self._rigid.q, self._period)
+        # of held-out rows in selections: trajectories on one clock count once, or many short ones would decide
+        self.half_second: np.ndarray = np.unique(np.floor(m.t / BLOCK_S), return_inverse=True)[1]
         self.lead_s, self._external = 0.0, np.zeros(1)
-        self._weights = self._weights_at(space.start, fitted=False)
+        self._weights = self._weights_at(self._seen_errors(space.start), fitted=False)
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(R,) block of each row; errors of different blocks are independent."""
+        return np.repeat(self.block, self.space.n)
 
     def _with(self, **changes: Any) -> "TorqueResidual":
         other = copy(self)
@@ -107,16 +116,16 @@ class TorqueResidual:
 
     def predict(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm: torque of rigid bodies, rotors and friction minus offset, at the measured motion."""
-        d, m = dynamics, self.motion
+        d, m, rigid = dynamics, self.motion, self._rigid
         standard = _standard(d).ravel()
-        out = self._rest + self._y @ standard + d.armature * self._rotors
+        out = rigid.rest + rigid.y @ standard + d.armature * rigid.rotors
         if not self.commanded and not self.at_motor:  # a link-side sensor sits before friction
             out = out * (1.0 + d.gain)
         out += m.filtered(self._friction(d)) - d.offset
         if self.commanded:  # error of the gravity compensation
-            out += self._gravity @ (standard - self._nominal)
+            out += rigid.compensation @ (standard - self._nominal)
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
-        out += d.load * self._load * self._mean_sign[d.family.has_memory]
+        out += d.load * rigid.load * self._mean_sign[d.family.has_memory]
         return out * (1.0 + d.gain) if self.at_motor else out
 
     def _friction(self, d: Dynamics) -> np.ndarray:
@@ -136,12 +145,15 @@ class TorqueResidual:
     def error(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
         m, free = self.motion, self.predict(dynamics) - self._external
-        return free - (m.command(float(dynamics.delay), float(dynamics.lag)) if self.commanded else m.tau)
+        if self.commanded:
+            return free - m.command(float(dynamics.delay), float(dynamics.lag))
+        late = float(dynamics.signal_delay)
+        return free - (m.earlier(-late) if late and isinstance(m, SmoothMotion) else m.tau)
 
     def errors(self, x: np.ndarray) -> np.ndarray:
         """Return `error` (C, T, n) for candidates x (C, P)."""
         d = self.space.dynamics(x)
-        out = np.empty((len(x), *self._rest.shape))
+        out = np.empty((len(x), *self.seen.shape))
         for i in range(len(x)):
             out[i] = self.error(d.one(i))
         return out
@@ -152,50 +164,79 @@ class TorqueResidual:
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """Return the Jacobian (R, P) at u (P,) of the unit cube."""
+        return np.concatenate([j for _, j in self.linearize(u)])
+
+    def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield residual (r,) and Jacobian (r, P) at u (P,) of the unit cube, for parts of the rows in turn."""
         h = np.where(u > 0.5, -STEP, STEP)
-        return self.change(self.space.from_unit(u), self.space.from_unit(u + h)) / h
+        x, stepped = self.space.from_unit(u), self.space.from_unit(u + h)
+        r, changes = self(x[None])[0], self._changes(x, stepped)
+        for first in range(0, len(self.seen), PART):
+            rows = slice(first, first + PART)
+            yield r[first * self.space.n :][: PART * self.space.n], self._assembled(changes, rows, len(x)) / h
 
     def change(self, x: np.ndarray, stepped: np.ndarray) -> np.ndarray:
-        """Return (R, P): the change of the residual at x (P,) as each value in turn goes to `stepped` (P,).
+        """Return (R, P): the change of the residual at x (P,) as each value in turn goes to `stepped` (P,)."""
+        return self._assembled(self._changes(x, stepped), slice(None), len(x))
+
+    def _changes(self, x: np.ndarray, stepped: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """Return (block, places in x, change) of each block: of torque (T, n), or of link parameters (n, 10 n, n).
 
         A dozen evaluations suffice: friction acts on its own joint, and torque is linear in standard parameters.
         """
         space, n = self.space, self.space.n
-        d = space.dynamics(x)
-        base, out = self.error(d), np.zeros((*self._rest.shape, len(x)))
-        reach = self._y + self._gravity if self.commanded else self._y * (1.0 + d.gain)[:, None]
-        before = _standard(d).ravel()
-        for block in space.blocks:
-            at = space.where(block)
-            if block in OF_LINKS:
-                trials = np.repeat(x[None], n, axis=0)
-                trials[np.arange(n), at] = stepped[at]
-                after = _standard(space.dynamics(trials)).reshape(n, -1)
-                out[..., at] = reach @ (after - before).T
-                continue
-            trial = x.copy()
+        d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
+        base, before, out = self.error(d), _standard(d).ravel(), []
+        gain = np.zeros(n) if self.commanded else d.gain
+        links = [at for block, at in zip(space.blocks, places, strict=True) if block in OF_LINKS]
+        if links:
+            at = np.concatenate(links)
+            trials = np.repeat(x[None], len(at), axis=0)
+            trials[np.arange(len(at)), at] = stepped[at]
+            after = _standard(space.dynamics(trials)).reshape(len(at), -1)
+            out.append((OF_LINKS[0], at, (1.0 + gain)[:, None, None] * (after - before).T))
+        rest = [(block, at) for block, at in zip(space.blocks, places, strict=True) if block not in OF_LINKS]
+        trials = np.repeat(x[None], len(rest), axis=0)
+        for trial, (_, at) in zip(trials, rest, strict=True):
             trial[at] = stepped[at]
-            moved = self.error(space.dynamics(trial)) - base
-            if block in WHOLE_ARM:
-                out[..., at[0]] = moved
+        moved = space.dynamics(trials)
+        out += [(block, at, self.error(moved.one(k)) - base) for k, (block, at) in enumerate(rest)]
+        return out
+
+    def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
+        """Return the change of the residual in `rows` of the moments, (., P)."""
+        n, weight = self.space.n, (self.seen[rows] / self.scale[rows])[..., None]
+        reach = self._rigid.y[rows] + self._rigid.compensation[rows] if self.commanded else self._rigid.y[rows]
+        out = np.zeros((len(reach), n, count))
+        for block, at, change in changes:
+            if block in OF_LINKS:
+                for j in range(n):
+                    out[:, j, at] = reach[:, j] @ change[j]
+            elif block in WHOLE_ARM:
+                out[..., at[0]] = change[rows]
             else:
-                out[:, np.arange(n), at] = moved
-        return (out * (self.seen / self.scale)[..., None]).reshape(-1, len(x))
+                out[:, np.arange(n), at] = change[rows]
+        return (out * weight).reshape(-1, count)
 
     def reweighted(self, x: np.ndarray, fitted: bool) -> "TorqueResidual":
         """Return this residual in units of the standard deviation of an independent row at x (P,).
 
         Per joint this is the RMS at a `fitted` x, else half of it, times the square root of the correlation length.
-        If the encoder noise is known, the RMS is that noise, larger for short windows, plus a constant.
+        If the encoder noise is known, the RMS is that noise, larger for short windows, plus a constant. At a `fitted`
+        x, the residual also decides what is an independent block.
         """
-        return self._with(_weights=self._weights_at(x, fitted))
+        r = self._seen_errors(x)
+        own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
+        return self._with(_weights=self._weights_at(r, fitted), **own)
 
     def weighted_like(self, other: "TorqueResidual") -> "TorqueResidual":
         """Return this residual with the standard deviations of another one."""
         return self._with(_weights=other._weights)
 
-    def _weights_at(self, x: np.ndarray, fitted: bool) -> tuple[np.ndarray, np.ndarray]:
-        r = self.errors(x[None])[0] * self.seen
+    def _seen_errors(self, x: np.ndarray) -> np.ndarray:
+        return self.errors(x[None])[0] * self.seen
+
+    def _weights_at(self, r: np.ndarray, fitted: bool) -> tuple[np.ndarray, np.ndarray]:
         constant = _constant_sigma(r, self._noise, self.seen)
         length = np.minimum(_correlation_length(r / np.sqrt(constant**2 + self._noise**2)), MAX_CORRELATION)
         return (1.0 if fitted else 0.5) * np.sqrt(length), constant
@@ -205,6 +246,16 @@ class TorqueResidual:
         """(T, n) Nm, standard deviation of an independent row."""
         factor, constant = self._weights
         return factor * np.sqrt(constant**2 + self._noise**2)
+
+
+def dq_lateness(recording: Recording, cutoff_hz: float) -> np.ndarray:
+    """Return `lateness` (n,) s of the logged dq as a torque residual corrects it; nan: dq comes from q."""
+    if recording.torque == "commanded":  # the delay is estimated, and logged velocities lag by a filter or a step
+        return np.full(recording.n_joints, np.nan)
+    late = lateness(recording, cutoff_hz)
+    if recording.torque == "measured":  # no rotors: a correction of dq only adds noise (benchmarks/real_panda.py)
+        late = np.where(np.isnan(late), late, 0.0)
+    return late
 
 
 def _standard(d: Dynamics) -> np.ndarray:

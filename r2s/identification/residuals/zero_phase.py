@@ -1,10 +1,11 @@
 """A recording low-pass filtered without phase lag, for differentiation; friction passes the same filter."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import butter, sosfiltfilt
-from scipy.sparse import csr_array
 
 from r2s.errors import UserError
 from r2s.physics.friction import PRESLIDING, presliding
@@ -14,6 +15,10 @@ from r2s.recordings.recording import Recording
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
 HOLD_STEPS = 0.5  # mean latency of a command that is held for one step
 FRICTION_CUTOFF = 4.0  # cutoff of the velocity in the friction law over that of the torque: keeps reversals sharp
+SHIFT = 0.05  # periods of the cutoff between the stored shifts of the torque: cubic interpolation errs by 2e-4
+SHIFTS = -0.03, 0.05  # s, that torque may be early or late
+MOST_SHIFT = 20  # ms: four shifts, as many as the interpolation needs
+AT_ONCE = 1024  # moments whose kernels are in memory at once
 EDGE_S = 0.05  # s, dropped at both ends of a trajectory, where the filter has transients
 
 
@@ -23,9 +28,10 @@ class SmoothMotion:
 
     Attributes:
         t: (T,) s. q, dq, ddq, tau: (T, n), low-passed forward and backward.
-        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), its presliding state.
-        low_pass: (T, F), sparse matrix of `filtered`.
-        delayed: (T, L, n) Nm, tau at the moment and each ms before it.
+        friction_dq: (F, n) rad/s at FRICTION_HZ, with the higher cutoff. bristle: (F, n), its presliding state. Both
+            repeat the ends of a trajectory for the length of the kernel.
+        kernel: (K,) of `filtered`. spans: first row in F of each moment's kernel, by trajectory.
+        delayed: (T, L, n) Nm, tau each `shift_s` s, from the first of SHIFTS after the moment on.
     """
 
     t: np.ndarray
@@ -35,14 +41,23 @@ class SmoothMotion:
     tau: np.ndarray
     friction_dq: np.ndarray
     bristle: np.ndarray
-    low_pass: csr_array
+    kernel: np.ndarray
+    spans: tuple[range, ...]
     delayed: np.ndarray
+    shift_s: float
 
     @staticmethod
     def of(
-        recording: Recording, cutoff_hz: float, rate_hz: float, presliding_rad: np.ndarray | float = PRESLIDING
+        recording: Recording,
+        cutoff_hz: float,
+        rate_hz: float,
+        presliding_rad: np.ndarray | float = PRESLIDING,
+        late: np.ndarray | None = None,
     ) -> "SmoothMotion":
         """Resample to 1 kHz, low-pass forward and backward, differentiate, and keep `rate_hz` without the edges.
+
+        late: (n,) s, of the logged dq against q, which is corrected; nan: the derivative of q replaces dq. None: dq
+            as logged.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -51,35 +66,50 @@ class SmoothMotion:
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
         kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
         every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
-        dq, fastest = smooth.dq, quick.dq
-        if recording.torque == "commanded":  # delay is estimated, and logged velocities lag by a filter or a step
-            dq, fastest = smooth.derivative(smooth.q), quick.derivative(quick.q)
-        ddq, keep, rows, friction_dq, bristle = smooth.derivative(dq), [], [], [], []
-        step, edge, base = round(1 / (rate_hz * SIM_DT)), round(EDGE_S / SIM_DT), 0
+        dq, fastest = (_velocity(x, late) for x in (smooth, quick))
+        ddq, keep = smooth.derivative(dq), []
+        spans: list[range] = []
+        friction_dq: list[np.ndarray] = []
+        bristle: list[np.ndarray] = []
+        step, edge, base = every * round(1 / (rate_hz * SIM_DT) / every), round(EDGE_S / SIM_DT), 0
         for s in smooth.stretches:
             some = np.arange(s.start + edge, s.stop - edge, step)
-            at = np.arange(s.start, s.stop, every)
-            near = np.clip((some[:, None] - s.start) // every + np.arange(-reach, reach + 1), 0, len(at) - 1)
+            if not len(some):
+                continue
             keep.append(some)
-            rows.append(base + near)
-            friction_dq.append(fastest[at])
-            bristle.append(presliding(fastest[s], SIM_DT, presliding_rad)[::every])
-            base += len(at)
-        kept = np.concatenate(keep)
-        if not len(kept):
+            for out, x in (friction_dq, fastest[s]), (bristle, presliding(fastest[s], SIM_DT, presliding_rad)):
+                out.append(np.pad(x[::every], ((reach, reach), (0, 0)), mode="edge"))
+            first = base + edge // every
+            own = range(first, first + len(some) * (step // every), step // every)
+            spans += [own[k : k + AT_ONCE] for k in range(0, len(own), AT_ONCE)]
+            base += len(friction_dq[-1])
+        if not keep:
             raise too_short(recording)
-        columns = np.concatenate(rows)
-        ends = len(kernel) * np.arange(len(kept) + 1)
-        low_pass = csr_array((np.tile(kernel, len(kept)), columns.ravel(), ends), shape=(len(kept), base))
-        delayed = np.stack([smooth.tau[np.maximum(kept - k, 0)] for k in range(edge)], 1)
+        kept = np.concatenate(keep)
+        shift = min(max(1, round(SHIFT / cutoff_hz / SIM_DT)), MOST_SHIFT)
+        first, last = (round(s / SIM_DT) for s in SHIFTS)
+        delayed = np.stack([smooth.tau[kept - k] for k in range(first, last, shift)], 1)
         return SmoothMotion(
             smooth.t[kept], smooth.q[kept], dq[kept], ddq[kept], smooth.tau[kept],
-            np.concatenate(friction_dq), np.concatenate(bristle), low_pass, delayed,
+            np.concatenate(friction_dq), np.concatenate(bristle), kernel, tuple(spans), delayed, shift * SIM_DT,
         )  # fmt: skip
+
+    @staticmethod
+    def joined(parts: "Sequence[SmoothMotion]") -> "SmoothMotion":
+        """Return consecutive parts of a recording as one."""
+        if len(parts) == 1:
+            return parts[0]
+        names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
+        arrays = {name: np.concatenate([getattr(m, name) for m in parts]) for name in names}
+        base = np.cumsum([0, *(len(m.friction_dq) for m in parts)]).tolist()
+        spans = [range(b + s.start, b + s.stop, s.step) for b, m in zip(base, parts, strict=False) for s in m.spans]
+        return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         """Return (T, n): the low-pass of x (F, n) at the moments."""
-        return self.low_pass @ x
+        windows = sliding_window_view(x, len(self.kernel), axis=0)
+        parts = [windows[s.start : s.stop : s.step] @ self.kernel for s in self.spans]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def rows(self, x: np.ndarray) -> np.ndarray:
         """Return (T, n, ...), a function of q, dq, ddq at the moments; its arguments are already filtered."""
@@ -87,14 +117,36 @@ class SmoothMotion:
 
     def command(self, delay: float, lag: float) -> np.ndarray:
         """Return (T, n) Nm: the command at the joints; below the cutoff a lag acts like a delay."""
-        at = min(max((delay + lag + HOLD_STEPS * SIM_DT) / SIM_DT, 0.0), self.delayed.shape[1] - 2)
-        k = int(at)
-        return self.delayed[:, k] + (at - k) * (self.delayed[:, k + 1] - self.delayed[:, k])
+        return self.earlier(delay + lag + HOLD_STEPS * SIM_DT)
+
+    def earlier(self, seconds: float) -> np.ndarray:
+        """Return (T, n) Nm: tau as it was logged `seconds` before the moments; negative: after them."""
+        at = (seconds - SHIFTS[0]) / self.shift_s
+        k = int(np.clip(at, 1, self.delayed.shape[1] - 3))
+        weights = cubic(min(max(at - k, -1.0), 2.0))
+        return np.einsum("tkn,k->tn", self.delayed[:, k - 1 : k + 3], weights)
 
 
 def too_short(recording: Recording) -> UserError:
     """Return the error for a recording whose trajectories are shorter than both edges."""
     return UserError(f"no trajectory is longer than {2 * EDGE_S:g} s; the recording lasts {recording.duration:g} s")
+
+
+def _velocity(x: Recording, late: np.ndarray | None) -> np.ndarray:
+    """Return (T, n) rad/s: dq as it was before a filter with a time constant of `late` (n,) s, or from q."""
+    if late is None:
+        return x.dq
+    return np.where(np.isnan(late), x.derivative(x.q), x.dq + np.nan_to_num(late) * x.derivative(x.dq))
+
+
+def cubic(x: float | np.ndarray) -> np.ndarray:
+    """Return (4, ...): weights of samples at -1, 0, 1 and 2 in their Lagrange interpolation at x in [0, 1]."""
+    return np.stack([
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    ])  # fmt: skip
 
 
 def _impulse_response(cutoff_hz: float, rate_hz: float) -> np.ndarray:

@@ -29,8 +29,8 @@ class LeastSquares:
         """Return u (P,) from `start` (P,)."""
         limits = (self.max_evaluations, self.ftol, self.minutes, report)
         if self.level != "torque":
-            return minimize(problem.residual, lambda u: problem.linearize(u)[1], start, *limits)
+            return minimize(problem.residual, problem.linearize, start, *limits)
         for _ in range(ROUNDS):  # iteratively reweighted
-            start = minimize(problem.torque_residual, problem.torque_jacobian, start, *limits, "torque")
+            start = minimize(problem.torque_residual, problem.torque_linearize, start, *limits, "torque")
             problem = problem.torque_reweighted(start)
         return start

@@ -5,7 +5,7 @@ scipy's trust region factors the whole Jacobian by SVD at every step, which cost
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -17,7 +17,7 @@ RETRIES = 3  # batches of trials at one Jacobian
 
 def minimize(
     residual: Callable[[np.ndarray], np.ndarray],
-    jacobian: Callable[[np.ndarray], np.ndarray],
+    linearize: Callable[[np.ndarray], Iterable[tuple[np.ndarray, np.ndarray]]],
     start: np.ndarray,
     max_evaluations: int,
     ftol: float,
@@ -28,7 +28,7 @@ def minimize(
     """Return u (P,) in the unit cube at a local minimum of the sum of squares near `start` (P,).
 
     Args:
-        residual: (C, P) -> (C, R). jacobian: (P,) -> (R, P).
+        residual: (C, P) -> (C, R). linearize: (P,) -> parts of the residual and its Jacobian, (r,) and (r, P).
         start, max_evaluations, ftol, minutes: see r2s/identification/search/least_squares.py.
         report: called after every step. name: of the search, in its rows.
     """
@@ -36,8 +36,7 @@ def minimize(
     r = residual(u[None])[0]
     cost, tried = float(r @ r), 1
     for k in range(max_evaluations):
-        j = jacobian(u)
-        gradient, hessian = j.T @ r, j.T @ j
+        gradient, hessian = normal_equations(linearize(u))
         tried += len(u) + 1
         free = ~(((u <= 0.0) & (gradient > 0.0)) | ((u >= 1.0) & (gradient < 0.0)))
         before = cost
@@ -56,6 +55,14 @@ def minimize(
         if before - cost < ftol * before or time.perf_counter() - began > 60 * minutes:
             break
     return u
+
+
+def normal_equations(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return J^T r (P,) and J^T J (P, P), summed over parts r (r,), J (r, P)."""
+    gradient, hessian = 0.0, 0.0
+    for r, j in parts:
+        gradient, hessian = gradient + j.T @ r, hessian + j.T @ j
+    return gradient, hessian  # type: ignore[return-value]
 
 
 def _step(u: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:

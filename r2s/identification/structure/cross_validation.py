@@ -48,7 +48,7 @@ class Fold(NamedTuple):
         own, test = self.fit.on(space), self.test
         u, _ = fit_torque(Problem.of(own, own, prior))
         square = test.seen * test.error(space.dynamics(space.from_unit(u)[None]).one(0)) ** 2
-        block = test.clusters[:: space.n]
+        block = test.half_second
         sums = [(square[block == b].sum(0), test.seen[block == b].sum(0)) for b in np.unique(block)]
         return np.stack([total / np.maximum(count, 1) for total, count in sums])
 

@@ -74,14 +74,15 @@ class _LinearizedFold:
         at_test = test.on(space).weighted_like(fit), test.on(more).weighted_like(fit)
         self._own = len(u)
         self._where = {name: [more.where(block) for block in blocks_of(name)] for name in candidates}
-        r, own, rows = problem.torque_residual(u[None])[0], problem.torque_jacobian(u), len(fit.clusters)
+        r, own = (np.concatenate(x) for x in zip(*problem.torque_linearize(u), strict=True))
+        rows = len(fit.clusters)
         more_rows = np.concatenate([fit_more.jacobian(wide.start), np.zeros((len(r) - rows, len(wide.start)))])
         j = np.concatenate([own, more_rows], 1)
         prior = np.diag(np.concatenate([np.zeros(len(u)), wide.weight]) ** 2)
         self._hessian, self._gradient = j.T @ j + prior, j.T @ r
         self._change = np.concatenate([at_test[0].jacobian(u), at_test[1].jacobian(wide.start)], 1)
         self._left = at_test[0](space.from_unit(u)[None])[0]
-        self._joints, self._block = space.n, np.unique(test.clusters, return_inverse=True)[1]
+        self._joints, self._block = space.n, np.repeat(test.half_second, space.n)
 
     def squares(self, chosen: Sequence[str]) -> np.ndarray:
         """Return (blocks, n), the sum of squares of held-out torque in each block with the terms `chosen`."""

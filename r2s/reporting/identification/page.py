@@ -11,14 +11,17 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from r2s.identification.blocks import BLOCK_S
 from r2s.identification.parameters import parameter_space
-from r2s.identification.residuals.torque_residual import BLOCK_S, TorqueResidual
+from r2s.identification.prediction import REPLAYED_S
+from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.residuals.windows import cut_windows, replay
 from r2s.identification.residuals.zero_phase import FRICTION_CUTOFF
 from r2s.identification.result import IdentificationResult
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import SIGMOID
 from r2s.physics.robot import Robot
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 from r2s.reporting.document import Item, report_html, report_markdown
 from r2s.reporting.identification.figures import convergence_figure, friction_figure, position_figure, torque_figure
@@ -90,7 +93,7 @@ def identification_page(
     if validation.torque == "commanded":
         block_s = window_s
         seconds = max(window_s, FIGURE_WINDOW_S) if validation.duration > 2 * FIGURE_WINDOW_S else window_s
-        windows = cut_windows(validation, seconds)
+        windows = cut_windows(spread(validation, REPLAYED_S), seconds)
         replays = {label: replay(robot, d, windows) for label, d in both.items()}
         pictures["position"] = position_figure(run.figure("position"), windows.q, replays)
     fastest = np.maximum(np.quantile(np.abs(motion.dq), 0.995, axis=0), 0.02)

@@ -3,13 +3,16 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from r2s.recordings.recording import Recording
 from r2s.tasks.measures import Measure, MeasureTable
-from r2s.tasks.rollout import Episodes
+
+if TYPE_CHECKING:
+    from r2s.tasks.rollout import Episodes  # imports torch, which an identification does not need
 
 SHOWN = 4  # episodes of a recording or figure, as in the paper's
 
@@ -98,13 +101,15 @@ def external_overlay(r: Recording) -> dict[str, Overlay]:
     return {"external, and contact": Overlay(r.t, torque, {"contact": (contact > 0).astype(float)})}
 
 
-def first(e: Episodes) -> list[Episode]:
+def first(e: "Episodes") -> list[Episode]:
     """Return the first `SHOWN` episodes."""
     return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i]) for i in range(min(SHOWN, len(e.goal)))]
 
 
 def saved_episodes(run: Path) -> dict[str, list[Episode]]:
     """Return {simulator or arm: its first episodes} of a run of stage=transfer; empty for other runs."""
+    from r2s.tasks.rollout import Episodes
+
     out = {}
     for path in sorted(run.glob("episodes_*.npz")):
         with np.load(path, allow_pickle=False) as saved:

@@ -1,0 +1,100 @@
+"""Blocks of a recording whose errors count as independent: the clusters of a posterior's covariance.
+
+A misfit that is not noise lasts, torque ripple at low speed for seconds, and the same motion repeats it. So a block
+lasts several correlation times of the residual, and repetitions of a motion are one block where residuals repeat.
+"""
+
+import numpy as np
+
+BLOCK_S = 0.5  # s, shortest block
+BLOCKS = 20, 400  # fewest and most in a recording: with fewer their scatter is unknown, and more cost time
+LENGTH = 5.0  # correlation times in a block: its sum then has nine tenths of the variance of a long one
+WINDOW = 5.0  # correlation times, after which the autocorrelation is noise (Sokal, Monte Carlo Methods, 1989)
+LONGEST_S = 60.0  # s, lags of the autocorrelation
+REPEATED = 0.3  # growth of the variance by repetition, from which repetitions are one block
+SAME = 0.1  # distance of two repetitions' mean angle, in standard deviations of the motion
+
+
+def blocks_of(
+    t: np.ndarray,
+    q: np.ndarray,
+    period: float | None,
+    residual: np.ndarray | None = None,
+    shortest_s: float = BLOCK_S,
+) -> np.ndarray:
+    """Return the block (T,) of each moment, 0 to B - 1.
+
+    Args:
+        t: (T,) s, rising within a trajectory. q: (T, n) rad. period: s, of the motion; None: it does not repeat.
+        residual: (T, n) of a fit; without one, blocks last `shortest_s` and repetitions are blocks of their own.
+    """
+    run = np.concatenate([[0], np.cumsum(np.diff(t) <= 0)])  # the clock restarts
+    steps = np.diff(t)[np.diff(run) == 0]
+    step = float(np.median(steps)) if len(steps) else shortest_s
+    seconds, visit, at = step * len(t), run, run
+    if residual is None:
+        return _labels(run, np.floor(t / max(shortest_s, seconds / BLOCKS[1])))
+    if period is not None:
+        visit, at = _labels(run, np.floor(t / period)), np.round(t % period / step).astype(int)
+    repeats = period is not None and _repeats(at, visit, residual)
+    seconds = step * len(np.unique(at)) if repeats else seconds
+    length = min(LENGTH * step * correlation_time(t, step, residual), seconds / BLOCKS[0])
+    length = max(length, shortest_s, seconds / BLOCKS[1])
+    if repeats:
+        return _merged(_labels(np.floor(t % period / length)), visit, q)
+    return _labels(run, np.floor(t / length))
+
+
+def _merged(block: np.ndarray, visit: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return blocks (T,) of phase in all repetitions `visit` (T,); other motion q (T, n) has blocks of its own."""
+    own = _labels(block, visit)
+    mean = np.stack([np.bincount(own, x) for x in q.T], 1) / np.bincount(own)[:, None]
+    place = block[np.unique(own, return_index=True)[1]]
+    usual = np.stack([np.median(mean[place == k], axis=0) for k in range(block.max() + 1)])
+    other = (np.abs(mean - usual[place]) > SAME * q.std(0)).any(1)
+    return _labels(block, np.where(other[own], own + 1, 0))
+
+
+def correlation_time(t: np.ndarray, step: float, residual: np.ndarray) -> float:
+    """Return the longest correlation time of the residual (T, n) at t (T,), in rows: the integral of its square.
+
+    The square bounds the correlation of a score, residual times slope, also where the residual oscillates.
+    """
+    lags = min(len(t), round(LONGEST_S / step) + 1)
+    total = np.zeros((lags, residual.shape[1]))
+    for part in np.split(residual - residual.mean(0), np.flatnonzero(np.abs(np.diff(t) - step) > 0.5 * step) + 1):
+        power = np.abs(np.fft.rfft(part, 2 * len(part), axis=0)) ** 2
+        own = np.fft.irfft(power, axis=0)[: min(len(part), lags)]
+        total[: len(own)] += own
+    correlation = total / np.maximum(total[0], 1e-300)
+    integral = 2 * np.cumsum(correlation**2, axis=0) - 1.0
+    enough = np.arange(lags)[:, None] >= WINDOW * integral
+    last = np.where(enough.any(0), enough.argmax(0), lags - 1)
+    return float(integral[last, np.arange(len(last))].max())
+
+
+def _repeats(at: np.ndarray, visit: np.ndarray, residual: np.ndarray) -> bool:
+    """Return whether residuals (T, n) of one phase, `at` (T,), are alike in several repetitions `visit` (T,)."""
+    cell = _labels(at, visit)
+    count = np.bincount(cell)
+    phase = at[np.unique(cell, return_index=True)[1]]
+    more = np.bincount(phase)  # repetitions of each phase
+    if (often := more.max()) < 2:
+        return False
+    for x in (residual - residual.mean(0)).T:
+        mean = np.bincount(cell, x) / count
+        square = np.bincount(phase, mean**2)[more > 1]
+        between = np.bincount(phase, mean)[more > 1] ** 2 - square  # sum over pairs, twice
+        growth = between.sum() / max(square.sum(), 1e-300)  # (often - 1) times the correlation of two repetitions
+        if growth > max(REPEATED, 2.0 / np.sqrt(len(square) / often)):
+            return True
+    return False
+
+
+def _labels(*keys: np.ndarray) -> np.ndarray:
+    """Return (T,) the index of each moment's combination of keys (T,)."""
+    out = np.zeros(len(keys[0]), dtype=int)
+    for key in keys:
+        index = np.unique(key, return_inverse=True)[1]
+        out = np.unique(out * (index.max() + 1) + index, return_inverse=True)[1]
+    return out

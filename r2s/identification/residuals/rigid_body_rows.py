@@ -1,0 +1,62 @@
+"""Rigid-body torque at the moments of a torque residual, linear in the standard parameters of the links."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from r2s.identification.residuals.modulating_functions import SlidingMotion
+from r2s.identification.residuals.zero_phase import SmoothMotion
+from r2s.physics.rigid_body import LinkInertia, mass_matrix, regressor, rigid_body
+from r2s.physics.robot import Robot
+
+
+@dataclass(frozen=True)
+class RigidBodyRows:
+    """Rigid-body torque at T moments.
+
+    Attributes:
+        q: (T, n) rad.
+        rest: (T, n) Nm, torque of what is no link: damping of the file, springs.
+        y: (T, n, 10 n), regressor of the torque.
+        compensation: (T, n, 10 n), regressor of the gravity compensation's error; without rows unless commanded.
+        load: (T, n) Nm, magnitude of the nominal gravity torque.
+        rotors: (T, n) rad/s^2, acceleration of the rotors that the torque moves.
+        encoder: (T, n) Nm per unit of `SlidingMotion.noise`, torque of the encoder noise.
+    """
+
+    q: np.ndarray
+    rest: np.ndarray
+    y: np.ndarray
+    compensation: np.ndarray
+    load: np.ndarray
+    rotors: np.ndarray
+    encoder: np.ndarray
+
+    @staticmethod
+    def of(robot: Robot, m: SmoothMotion | SlidingMotion, torque: str) -> "RigidBodyRows":
+        """Return the rows at the motion m of a recording of this kind of torque."""
+        commanded, still, shape = torque == "commanded", np.zeros_like(m.q), (*m.q.shape, -1)
+        rest, y = rigid_body(robot, m.q, m.dq, m.ddq, None if commanded else robot.gravity)
+        rest = m.rows(rest - robot.armature * m.ddq)  # the candidate adds its own rotors
+        weight = m.rows(regressor(robot, m.q, still, still, robot.gravity).reshape(shape))
+        nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
+        encoder = np.zeros_like(rest)
+        if isinstance(m, SlidingMotion):
+            encoder = np.sqrt(m.rows(mass_matrix(robot, m.q) ** 2) @ m.encoder**2)
+        return RigidBodyRows(
+            q=m.rows(m.q),
+            rest=rest,
+            y=m.rows(y.reshape(shape)),
+            compensation=weight if commanded else weight[:0],
+            load=np.abs(weight @ nominal),
+            # a link-side sensor does not measure the torque that accelerates the rotors
+            rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
+            encoder=encoder,
+        )
+
+    @staticmethod
+    def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
+        """Return consecutive parts of a recording as one."""
+        names = [f.name for f in fields(RigidBodyRows)]
+        return RigidBodyRows(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
