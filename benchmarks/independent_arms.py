@@ -23,6 +23,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import expit
 
 from r2s.files import atomic_write
+from r2s.physics.payload import ee_pose, with_payload
 
 FAMILIES = ("sigmoid", "coulomb", "stribeck", "lugre", "paper")  # paper: eq. (5), edges of eq. (6)
 LEVEL = np.array([1.0, 0.8, 0.65, 1.15, 0.65, 0.35, 0.5])  # Nm, median of the drawn sliding friction
@@ -116,7 +117,16 @@ def make_arm(truth: dict, step: float | None = None) -> Arm:
     links = (np.array(truth[k], dtype=float) for k in ("mass", "com", "inertia"))
     held = (np.array(truth[k], dtype=float) for k in ("offset", "breakaway_net_neg", "breakaway_net_pos"))
     rest = truth["v_stick"], truth["delay_s"], truth["lag_s"]
-    return Arm(*links, kind, law, *held, *rest, step or (5e-5 if kind == LUGRE else 1e-4))
+    return Arm(*links, kind, law, *held, *rest, step or (5e-5 if kind == LUGRE else 1e-4), np.zeros((len(law), 4)))
+
+
+def carrying(arm: Arm, payload) -> Arm:
+    """Return the arm with a payload (r2s.physics.payload) that its gravity compensation does not know."""
+    place, axes = ee_pose(ROBOT)
+    mass, com, tensor = with_payload(ROBOT, payload, (arm.mass, arm.com, arm.tensor))
+    carried = np.zeros((len(mass), 4))
+    carried[-1] = payload.mass, *(place + axes @ payload.centre)
+    return arm._replace(mass=mass, com=com, tensor=tensor, carried=carried)
 
 
 def motion(rng: np.random.Generator) -> np.ndarray:

@@ -2,11 +2,11 @@
 
     M(q) ddq + c(q, dq) + g(q) = tau_drive + g_nominal(q) + offset - tau_f,    tau_drive = lag(delay(command))
 
-Masses and centres are nominal, so gravity and its compensation cancel. A joint at rest holds while its net torque
-(all but friction) lies in its band. The net torque includes the accelerations of the other joints, so one joint can
-pull another one loose. A joint comes to rest if its velocity crosses 0, or is at most `v_stick`, with the net torque
-inside the band (not within 5 ms of its release). Both events are located in time to 1e-12 s. LuGre has no such rule:
-bristles hold the joint.
+Masses and centres are nominal, so gravity and its compensation cancel, except for the weight of a payload, which
+gravity compensation does not know. A joint at rest holds while its net torque (all but friction) lies in its band. The
+net torque includes the accelerations of the other joints, so one joint can pull another one loose. A joint comes to
+rest if its velocity crosses 0, or is at most `v_stick`, with the net torque inside the band (not within 5 ms of its
+release). Both events are located in time to 1e-12 s. LuGre has no such rule: bristles hold the joint.
 
 Rigid bodies are spatial vectors about the base's origin (Featherstone 2008, ch. 5 and 6); the arm is Franka's table
 of (modified) Denavit-Hartenberg parameters. Integration is the classical fourth-order Runge-Kutta method.
@@ -28,8 +28,9 @@ A = np.array([0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088])  # m
 D = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])  # m
 
 # mass (N,), com (N, 3), tensor (N, 3, 3) about com; kind, law (N, 9): phi1..3, or fc, fv, fs of + and -, vs, sigma0
-# and sigma1; offset, low, high (N,) Nm; v_stick rad/s, delay and lag s, step: the longest step, s
-Arm = namedtuple("Arm", "mass com tensor kind law offset low high v_stick delay lag step")
+# and sigma1; offset, low, high (N,) Nm; v_stick rad/s, delay and lag s, step: the longest step, s; carried (N, 4) kg
+# and m: mass and centre of a payload in the last link's row, whose inertia the links contain
+Arm = namedtuple("Arm", "mass com tensor kind law offset low high v_stick delay lag step carried")
 # q, dq, bristle (N,) rad, rad/s, rad; stuck (N,) 1 or 0; way (N,) direction of motion; since (N,) s after release;
 # drive (N,) Nm after the lag; line (HISTORY, N) Nm, commands, the newest last
 State = namedtuple("State", "q dq bristle stuck way since drive line")
@@ -138,7 +139,13 @@ def friction(kind, p, v, way, bristle):
 @njit(cache=True)
 def accelerate(arm, q, dq, bristle, stuck, way, drive, M, bias, ddq, bends, net):
     """Fill ddq, bristle rates, and net (N,) Nm: the torque that static friction balances in a stuck joint."""
+    if arm.carried[N - 1, 0] > 0.0:
+        rigid_body(q, np.zeros(N), arm.carried[:, 0], arm.carried[:, 1:], np.zeros((N, 3, 3)), 9.81, M, net)
+        weight = net.copy()
+    else:
+        weight = np.zeros(N)
     rigid_body(q, dq, arm.mass, arm.com, arm.tensor, 0.0, M, bias)
+    bias += weight
     free, at = np.empty(N, np.int64), 0
     for j in range(N):
         net[j] = drive[j] + arm.offset[j] - bias[j]

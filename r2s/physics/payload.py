@@ -8,10 +8,12 @@ not represent it, because that force would depend on the resulting acceleration.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import yaml
 
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.dynamics import Dynamics
@@ -45,19 +47,22 @@ class Payload:
 
 
 def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload") -> Payload | None:
-    """Return the payload that a setting describes, a number of kg or a mapping; None for 0 kg.
-
-    most: kg, m, `Robot.payload_max`.
+    """Return the payload that a setting describes, a number of kg, a mapping or a file; None for 0 kg.
 
     A number is a point mass at the end effector. A mapping has `mass`, and optionally `centre` (3,) m, `inertia` (3
     principal moments, or xx, yy, zz, xy, xz, yz, in kg m^2 about the centre; default: a sphere of water), `on_s`,
-    `off_s`.
+    `off_s`. A file is the payload.yaml of an identification, or its run folder.
+
+    Args:
+        value: the setting. name: of it, for errors. most: kg and m, as `Robot.payload_max`.
 
     Raises:
-        UserError: mass, centre, tensor or times out of range; the message begins with `name`.
+        UserError: mass, centre, tensor or times out of range, or no such file; the message begins with `name`.
     """
     if value is None:
         return None
+    if isinstance(value, str):
+        value = _of_file(name, Path(value))
     if not isinstance(value, Mapping):
         check_number(name, value, f"[0, {most[0]:g}]")
         return Payload(np.array(float(value)), np.zeros(3), np.zeros((3, 3))) if value else None
@@ -96,6 +101,19 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], default: np.ndarray)
     if array.shape != shape or not np.isfinite(array).all():
         raise UserError(f"{name}: expected {' x '.join(map(str, shape))} finite numbers, got {value!r}")
     return array
+
+
+def _of_file(name: str, path: Path) -> Any:
+    """Return the mapping of a payload.yaml, or of the one in a run folder."""
+    file = path / "payload.yaml" if path.is_dir() else path
+    if not file.is_file():
+        siblings = [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else []
+        raise UserError(f"{name}: no payload.yaml at {path}{nearest(path.name, siblings)}")
+    try:
+        return yaml.safe_load(file.read_text())["payload"]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        seen = " ".join(str(error).split())
+        raise UserError(f"{name}: {file} is not a payload.yaml of r2s ({seen})") from None
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
@@ -158,7 +176,7 @@ def with_payload(robot: Robot, payload: Payload | None, links: Links) -> Links:
         r = c - middle
         square = (r**2).sum(-1)[..., None, None] * np.eye(3) - r[..., :, None] * r[..., None, :]
         added = added + m[..., None, None] * square
-    lead = np.broadcast_shapes(total.shape, added.shape[:-2])
+    lead = np.broadcast_shapes(total.shape, added.shape[:-2], com.shape[:-2], inertia.shape[:-3])
     out = [np.broadcast_to(a, (*lead, *a.shape[k:])).copy() for a, k in ((mass, -1), (com, -2), (inertia, -3))]
     out[0][..., -1], out[1][..., -1, :] = total, middle
     out[2][..., -1, :, :] += added

@@ -44,11 +44,10 @@ def with_declared_payload(cfg, robot, dynamics):
     """Return the dynamics with arm.declared_payload in the gravity compensation."""
     from r2s.physics.payload import mass_and_moment, payload_of
 
-    key = "declared_payload"
-    if not cfg.arm.get(key):
+    if not (value := plain(cfg.arm).get("declared_payload")):
         return dynamics
-    declared = payload_of(plain(cfg.arm)[key], robot.payload_max, f"arm.{key}")
-    return replace(dynamics, declared_payload=mass_and_moment(robot, declared))
+    payload = payload_of(value, robot.payload_max, "arm.declared_payload")
+    return replace(dynamics, declared_payload=mass_and_moment(robot, payload))
 
 
 def make_adapter(cfg, robot, source):

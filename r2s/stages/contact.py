@@ -22,13 +22,6 @@ class ContactData:
     files: list[Path]
 
 
-def only_contact(cfg):
-    """Return whether the config asks for a surface on top of an arm that `calibration=` gives."""
-    from omegaconf import OmegaConf
-
-    return bool(cfg.data.get("contact")) and OmegaConf.is_missing(cfg.data, "path")
-
-
 def contact_data(cfg, robot, file):
     """Return the `ContactData` of data.contact and data.contact_validation; None without data.contact.
 
@@ -47,8 +40,6 @@ def contact_data(cfg, robot, file):
         raise UserError("robot.tool: data.contact needs the tip that touches: robot.tool=TOOL.json")
     if file.torque not in (None, "commanded"):
         raise UserError(f"data.contact: a surface is identified from commanded torque, not data.torque={file.torque}")
-    if only_contact(cfg) and not cfg.calibration:
-        raise UserError("data.contact: give the arm by calibration=RUN_FOLDER, or its free motion by data.path=FILE")
     files = [located(path) for path in (file.contact, file.contact_validation) if path]
     recordings = [read_file(robot, file, path, torque="commanded") for path in files]
     for recording in recordings:
@@ -58,7 +49,7 @@ def contact_data(cfg, robot, file):
 
 def calibrated_arm(cfg, robot):
     """Return the `Arm` of `calibration=`."""
-    from r2s.identification.contact.estimate import Arm
+    from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.parameter_file import load_parameters, load_posterior
     from r2s.stages.run_config import modules
 

@@ -4,6 +4,7 @@ import os
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, choices
 from r2s.files import located
@@ -89,6 +90,8 @@ class FileData:
     command_hz: float | None = None
     contact: str | None = None
     contact_validation: str | None = None
+    loaded: str | None = None
+    declared_payload: Any = None
 
     def __post_init__(self):
         check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")

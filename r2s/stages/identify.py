@@ -4,11 +4,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import check_number
+from r2s.errors import UserError, check_number
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
-from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration, only_contact
+from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration
 from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
 from r2s.stages.parts import called, part, plain
+from r2s.stages.payload import identify_load, loaded_data, torque_of_calibration
 
 WHY = {
     "arm": "only data=arm moves an arm",
@@ -52,6 +53,7 @@ class Parts:
     validation: Any = None
     ramps: Any = None
     contact: Any = None
+    loaded: Any = None
 
 
 def make_parts(cfg):
@@ -70,12 +72,12 @@ def make_parts(cfg):
         make_settings(cfg, cfg.data.torque)
     if cfg.data.kind == "recording":
         file = file_data(cfg)
-        contact = contact_data(cfg, robot, file)
+        contact, loaded = contact_data(cfg, robot, file), loaded_data(cfg, robot, file)
         train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
         check_cutoff(cfg.identify.cutoff_hz, (train, validation))
         ramps = read_user_ramps(robot, file)
-        files = [*file.files, *(contact.files if contact else [])]
-        return Parts(robot, nominal, searches, files, None, train, validation, ramps, contact)
+        files = [*file.files, *(f for more in (contact, loaded) if more for f in more.files)]
+        return Parts(robot, nominal, searches, files, None, train, validation, ramps, contact, loaded)
     check_data(cfg)
     check_cutoff(cfg.identify.cutoff_hz, ())
     ramp_poses(cfg, robot)
@@ -85,28 +87,50 @@ def make_parts(cfg):
     return Parts(robot, nominal, searches, [cfg.data.excitation], load(cfg.data.excitation, robot))
 
 
-def identify_only_contact(cfg, overrides):
-    """Presses -> contact.yaml, on top of the arm of `calibration=`."""
+def with_known_arm(cfg):
+    """Return the data option to identify on top of the arm that `calibration=` gives, or None.
+
+    Raises:
+        UserError: neither `calibration=` nor data.path= gives the arm.
+    """
+    from omegaconf import OmegaConf
+
+    key = next((k for k in ("contact", "loaded") if cfg.data.get(k)), None)
+    if key is None or not OmegaConf.is_missing(cfg.data, "path"):
+        return None
+    if not cfg.calibration:
+        what = {"contact": "its free motion", "loaded": "its motion without payload"}[key]
+        raise UserError(f"data.{key}: give the arm by calibration=RUN_FOLDER, or {what} by data.path=FILE")
+    return key
+
+
+def identify_with_known_arm(cfg, overrides, key):
+    """Presses -> contact.yaml, or a loaded recording -> payload.yaml, on top of the arm of `calibration=`."""
     robot = make_robot(cfg)
-    data = contact_data(cfg, robot, file_data(cfg, cfg.data.contact))
+    file = file_data(cfg, cfg.data[key])
+    if key == "contact":
+        data = contact_data(cfg, robot, file)
+    else:
+        data = loaded_data(cfg, robot, file, torque_of_calibration(cfg, file.torque))
     arm = calibrated_arm(cfg, robot)
     with open_run(cfg, overrides, data.files) as run:
-        entry = identify_surface(cfg, run, arm, data)
+        entry = (identify_surface if key == "contact" else identify_load)(cfg, run, arm, data)
         keep_calibration(cfg, run)
-        run.summary({"contact": entry})
+        run.summary({"contact" if key == "contact" else "payload": entry})
     print(f"written: {run.folder}")
 
 
 def identify(cfg, overrides):
     """Recording -> parameters.yaml, errors on training and validation motion, figures."""
-    if only_contact(cfg):
-        identify_only_contact(cfg, overrides)
+    if key := with_known_arm(cfg):
+        identify_with_known_arm(cfg, overrides, key)
         return
-    from r2s.identification.contact.estimate import Arm
+    from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
     from r2s.identification.prediction import prediction_errors
     from r2s.identification.verdict import judge
+    from r2s.physics.crisp import write_crisp
     from r2s.physics.description import write_description
     from r2s.progress import Progress
     from r2s.recordings.speed_noise import speed_noise
@@ -151,10 +175,14 @@ def identify(cfg, overrides):
             run.track("metrics", row)
         for line in write_description(run.folder / "model", robot, found.dynamics):
             print(line)
+        if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
+            write_crisp(run.folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
         run.summary(summary)
         identification_page(run, robot, nominal, found, validation, summary, **how)
         identification_table(console(), robot, found, summary)
+        arm = Arm(found.space, found.x, found.found.samples)
         if made.contact:
-            arm = Arm(found.space, found.x, found.found.samples)
             run.summary(summary | {"contact": identify_surface(cfg, run, arm, made.contact)})
+        if made.loaded:
+            run.summary(summary | {"payload": identify_load(cfg, run, arm, made.loaded)})
     print(f"written: {run.folder}")

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from r2s.errors import UserError
+from r2s.identification.arm_uncertainty import Arm
 from r2s.identification.contact.problem import SLOWEST, ContactProblem, contact_problem
 from r2s.identification.contact.start import LEAST_S, first_guesses
 from r2s.identification.contact.surface_space import LOWER, NAMES, UPPER, WIDTH
 from r2s.identification.contact.validation import ROWS_HZ, Press, press_errors, presses
-from r2s.identification.parameters import ParameterSpace
 from r2s.identification.posterior import posterior
 from r2s.identification.result import SHARPER
-from r2s.physics.robot import Robot
 from r2s.physics.surface import UNIT_DEPTH, Surface
 from r2s.recordings.recording import Recording
 
@@ -24,20 +23,6 @@ COVERED = (2.5, 97.5)  # %, of a 95 % interval
 # height m, tilt rad. They are those of simulated arms on exact surfaces (benchmarks/contact_identification.py).
 SYSTEMATIC = {"tilt_a": 5e-6, "tilt_b": 5e-6, "height": 1e-6, "slope": 6e-4, "exponent": 3e-3}
 SYSTEMATIC |= {"damping": 0.1, "friction": 1.5e-4, "bristle": 0.15}
-
-
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """An identified arm: its parameters' space and values (P,), and draws of their posterior (S, P) or None."""
-
-    space: ParameterSpace
-    x: np.ndarray
-    samples: np.ndarray | None
-
-    @property
-    def robot(self) -> Robot:
-        """The arm's kinematics, limits and tool."""
-        return self.space.robot
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from r2s.identification.arm_uncertainty import arm_directions
 from r2s.identification.contact.surface_space import SurfaceSpace
 from r2s.identification.contact.tip import TipMotion
 from r2s.identification.parameters import ParameterSpace
@@ -148,7 +149,7 @@ def contact_problem(
     noise = np.sqrt(2 * CUTOFF_HZ * SIM_DT) * np.linalg.norm(lever * motion.encoder)
     tip = replace(tip, play=PLAY * float(noise))
     own = torque.reweighted(x, fitted=True)
-    directions = _arm_directions(own, x, samples)
+    directions = arm_directions(own, x, samples, DRIFT, DRIFT * space.dynamics(x).level)
     effect = np.linalg.norm((directions / own.scale[..., None])[own.seen], axis=0)
     error = own.error(space.dynamics(x))
     return ContactProblem(own, x, tip, error, directions[..., effect > SEEN], _sigma(own, x), surfaces)
@@ -157,17 +158,3 @@ def contact_problem(
 def _sigma(torque: TorqueResidual, x: np.ndarray) -> np.ndarray:
     """Return (T, n) Nm, standard deviation of an independent row."""
     return np.maximum(torque.scale, EXACT * torque.space.dynamics(x).level)
-
-
-def _arm_directions(torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None) -> np.ndarray:
-    """Return (T, n, r) Nm: changes of the residual along independent directions of the arm's uncertainty."""
-    d, n = torque.space.dynamics(x), torque.space.n
-    friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, np.sign(torque.motion.friction_dq)))
-    parts = [DRIFT * friction[..., None] * np.eye(n), DRIFT * np.broadcast_to(np.diag(d.level), (*friction.shape, n))]
-    if samples is not None and len(x):
-        sd = samples.std(0)
-        some = sd > 1e-9 * np.abs(x)
-        change = (torque.change(x, x + sd) * torque.scale.reshape(-1, 1))[:, some].reshape(*friction.shape, -1)
-        size, axes = np.linalg.eigh(np.atleast_2d(np.corrcoef(samples[:, some].T)))
-        parts.append(change @ (axes * np.sqrt(np.maximum(size, 0.0))))
-    return np.concatenate(parts, -1)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from r2s.identification.base_parameters import base_table
 from r2s.identification.blocks import BLOCK_S
 from r2s.identification.parameters import parameter_space
 from r2s.identification.prediction import REPLAYED_S
@@ -27,6 +28,7 @@ from r2s.reporting.document import Item, report_html, report_markdown
 from r2s.reporting.identification.figures import convergence_figure, friction_figure, position_figure, torque_figure
 from r2s.reporting.identification.identifiability import identifiability
 from r2s.reporting.identification.paper_tables import (
+    base_items,
     breakaway_table,
     family_table,
     friction_table,
@@ -55,12 +57,14 @@ class Evidence(NamedTuple):
 
     Attributes:
         pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, speeds of the validation motion.
-        whiteness: `whiteness_table` of its torque residual. window_s: s, of replays. cutoff_hz: of the low-pass.
+        whiteness: `whiteness_table` of its torque residual. base: `base_table`.
+        window_s: s, of replays. cutoff_hz: of the low-pass.
     """
 
     pictures: Mapping[str, Path]
     fastest: np.ndarray
     whiteness: pd.DataFrame
+    base: pd.DataFrame
     window_s: float
     cutoff_hz: float
 
@@ -76,7 +80,7 @@ def identification_page(
     window_s: float,
     cutoff_hz: float,
 ) -> None:
-    """Write figures, report.md, report.html and recording.rrd on the validation motion.
+    """Write figures, report.md, report.html, base_parameters.csv and recording.rrd, on the validation motion.
 
     Args:
         run, robot: of the identification. nominal: model before. found: result. validation: held-out motion.
@@ -109,7 +113,9 @@ def identification_page(
     timeless = {name: p for name, p in pictures.items() if name != "torque"}
     write_recording(run.folder / "recording.rrd", robot, Content(overlays=overlays, figures=timeless))
     whiteness = whiteness_table(motion.t, error["identified"], cutoff_hz)
-    evidence = Evidence(pictures, fastest, whiteness, window_s, cutoff_hz)
+    base = base_table(found.space, found.found, rotors=validation.torque != "measured")
+    base.to_csv(run.folder / "base_parameters.csv", index=False, float_format="%.6g")
+    evidence = Evidence(pictures, fastest, whiteness, base, window_s, cutoff_hz)
     sections = identification_sections(robot, nominal, found, validation, summary, evidence)
     report_markdown(run.folder / "report.md", sections)
     report_html(run.folder / "report.html", sections)
@@ -144,6 +150,7 @@ def identification_sections(
         "Table I: torque offsets": offset_table(robot, found),
         "Table II: breakaway": breakaway_table(robot, nominal, found, commanded),
         "Table III: inertia": inertia_tables(robot, found),
+        "Base parameters": base_items(robot, evidence.base),
         "Table IV: friction": [
             *friction_table(robot, nominal, found, evidence.fastest),
             *shown("friction"),

@@ -87,6 +87,20 @@ def _presliding(robot: Robot, found: IdentificationResult, held: Callable[[np.nd
     return [words, per_joint(robot, columns)]
 
 
+def base_items(robot: Robot, base: pd.DataFrame) -> list[Item]:
+    """Return the base parameters, a row per link; each stands under the standard parameter that it begins with."""
+    columns: dict[str, list[str]] = {}
+    rows = base[["nominal", "value", "interval95_low", "interval95_high"]].to_numpy()
+    for first, row in zip(base["parameter"], rows.tolist(), strict=True):
+        name, _, link = first.rstrip("]").partition("[")
+        columns.setdefault(name, [""] * robot.n)[int(link) - 1] = Value(*row).cell
+    words = (
+        f"The {len(base)} combinations of inertial parameters on which torque depends, old → new, SI units, about "
+        "each link's origin. base_parameters.csv lists the parameters that each one combines."
+    )
+    return [words, per_joint(robot, columns, "link")]
+
+
 def inertia_tables(robot: Robot, found: IdentificationResult) -> list[Item]:
     """Return Table III; with the full parametrisation also mass and centre of mass."""
     space, d = found.space, found.dynamics

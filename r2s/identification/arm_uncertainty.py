@@ -1,0 +1,54 @@
+"""An identified arm, and its uncertainty as changes of a torque residual."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.residuals.modulating_functions import SlidingMotion
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.physics.friction import WIDTH_DQ
+from r2s.physics.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """An identified arm: its parameters' space and values (P,), and draws of their posterior (S, P) or None."""
+
+    space: ParameterSpace
+    x: np.ndarray
+    samples: np.ndarray | None
+
+    @property
+    def robot(self) -> Robot:
+        """The arm's kinematics, limits and tool."""
+        return self.space.robot
+
+
+def sliding_sign(torque: TorqueResidual) -> np.ndarray:
+    """Return (F, n): the sign of friction at the instants of a residual's motion, smooth where a joint may rest."""
+    dq = torque.motion.friction_dq
+    return np.sign(dq) if isinstance(torque.motion, SlidingMotion) else np.tanh(dq / WIDTH_DQ)
+
+
+def arm_directions(
+    torque: TorqueResidual, x: np.ndarray, samples: np.ndarray | None, friction_drift: float, offset_drift: np.ndarray
+) -> np.ndarray:
+    """Return (T, n, r) Nm: changes of the residual along independent directions of an arm's uncertainty.
+
+    Args:
+        torque: the residual. x: (P,) parameters of the arm. samples: (S, P), draws of their posterior, or None.
+        friction_drift: share of its friction, and offset_drift: (n,) Nm, standard deviations of what has changed in
+            each joint since the calibration.
+    """
+    d, n = torque.space.dynamics(x), torque.space.n
+    friction = torque.motion.filtered(d.friction(torque.motion.friction_dq, sliding_sign(torque)))
+    offset = np.broadcast_to(np.diag(offset_drift), (*friction.shape, n))
+    parts = [friction_drift * friction[..., None] * np.eye(n), offset]
+    if samples is not None and len(x):
+        sd = samples.std(0)
+        some = sd > 1e-9 * np.abs(x)
+        change = (torque.change(x, x + sd) * torque.scale.reshape(-1, 1))[:, some].reshape(*friction.shape, -1)
+        size, axes = np.linalg.eigh(np.atleast_2d(np.corrcoef(samples[:, some].T)))
+        parts.append(change @ (axes * np.sqrt(np.maximum(size, 0.0))))
+    return np.concatenate(parts, -1)

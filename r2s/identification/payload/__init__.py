@@ -1,0 +1,1 @@
+"""The payload of an identified arm: mass, centre and tensor from a loaded recording."""

@@ -1,0 +1,181 @@
+"""Identify the payload of a loaded arm: mass, centre and tensor, with intervals."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from r2s.errors import UserError
+from r2s.identification.arm_uncertainty import Arm
+from r2s.identification.payload.body import BodySpace
+from r2s.identification.payload.problem import REACH, LoadedTorque, Rows
+from r2s.identification.posterior import posterior
+from r2s.identification.result import EDGE, SHARPER
+from r2s.physics.payload import Payload
+from r2s.physics.rigid_body import tensor_elements
+from r2s.recordings.recording import Recording
+
+ROUNDS = 5  # fits with weights from the residual of the one before
+LEAST_SHARE = 0.02  # of the rated mass: weight from which a ball of water gets its size
+COVERED = 2.5, 97.5  # %, of a 95 % interval
+ELEMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadEstimate:
+    """An identified payload, in the end effector's frame.
+
+    Attributes:
+        mass: kg. centre: (3,) m. tensor: (3, 3) kg m^2 about it, of a body that exists.
+        draws: {"mass": (S,), "centre": (S, 3), "inertia": (S, 6)} of the posterior; inertia by ELEMENTS.
+        identifiable: {name: bool, or one per element}: whether the recording determines them.
+        t, measured, without, predicted: (T,) s and (T, n) Nm of the loaded recording, low-passed: recorded torque,
+            and that of the arm without and with payload. seen: (T, n) bool, rows that count.
+    """
+
+    mass: float
+    centre: np.ndarray
+    tensor: np.ndarray
+    draws: dict[str, np.ndarray]
+    identifiable: dict[str, np.ndarray]
+    t: np.ndarray
+    measured: np.ndarray
+    without: np.ndarray
+    predicted: np.ndarray
+    seen: np.ndarray
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """{"mass": (), "centre": (3,), "inertia": (6,)}."""
+        return {"mass": np.array(self.mass), "centre": self.centre, "inertia": tensor_elements(self.tensor)}
+
+    def interval(self, name: str) -> np.ndarray:
+        """Return (2, ...), the 95 % interval of mass, centre or inertia."""
+        return np.percentile(self.draws[name], COVERED, axis=0)
+
+    @property
+    def payload(self) -> Payload:
+        """The payload, as arms carry it."""
+        return Payload(np.array(self.mass), self.centre, self.tensor)
+
+    def rmse(self, predicted: np.ndarray) -> np.ndarray:
+        """Return (n,) Nm, the root mean square of a predicted minus the recorded torque; nan for a resting joint."""
+        square = np.where(self.seen, (predicted - self.measured) ** 2, 0.0).sum(0)
+        return np.sqrt(square / np.where(self.seen.any(0), self.seen.sum(0), np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearized:
+    """A loaded recording about its fit, on the unit cube of body and arm, for `posterior`."""
+
+    rows: Rows
+    space: BodySpace
+    z: np.ndarray
+    w: np.ndarray
+
+    @property
+    def u(self) -> np.ndarray:
+        low, high = self.space.bounds
+        return np.concatenate([(self.z - low) / (high - low), 0.5 + self.w / (2 * REACH)])
+
+    @property
+    def clusters(self) -> np.ndarray:
+        return self.rows.clusters
+
+    def linearize(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        width, count = np.subtract(*self.space.bounds[::-1]), len(self.w)
+        slope = self.space.slope(self.z) * width
+        phi = self.space.standard(self.z)
+        data = self.rows.error + self.rows.body @ phi + self.rows.arm @ self.w
+        prior = np.concatenate([self.space.prior(self.z), self.w])
+        jacobian = np.zeros((len(data) + len(prior), len(u)))
+        jacobian[: len(data)] = np.concatenate([self.rows.body @ slope, 2 * REACH * self.rows.arm], 1)
+        jacobian[len(data) : len(data) + 9, 1:10] = np.diag((width / self.space.sigma)[1:])
+        jacobian[len(data) + 9 :, 10:] = 2 * REACH * np.eye(count)
+        return np.concatenate([data, prior]), jacobian
+
+
+def identify_payload(
+    arm: Arm,
+    recording: Recording,
+    *,
+    declared: Payload | None = None,
+    cutoff_hz: float = 10.0,
+    seed: int = 0,
+    report: Callable[[float, str], None] = lambda share, what: None,
+) -> PayloadEstimate:
+    """Estimate the payload of a loaded recording.
+
+    Args:
+        arm: identified from the same kind of torque, without the payload; its uncertainty enters the intervals.
+        recording: of the arm with the payload.
+        declared: payload that gravity compensation assumed (commanded torque).
+        cutoff_hz: of the low-pass of measured or motor torque. seed: of the posterior's draws.
+        report: called with the share that is done, and what is next.
+
+    Raises:
+        UserError: the recording does not move, or its payload is beyond HEAVIEST times the rated mass.
+    """
+    report(0.0, "torque of the loaded arm")
+    loaded = LoadedTorque(arm, recording, declared, cutoff_hz)
+    if not loaded.torque.seen.any():
+        raise UserError("data.loaded: no joint moves fast enough to show its torque")
+    rated, far = arm.robot.payload_max
+    phi, w, payload, space = np.zeros(10), None, None, BodySpace.about(rated, far, rated)
+    for k in range(ROUNDS):
+        report((k + 1) / (ROUNDS + 2), "payload")
+        rows = loaded.rows(payload, phi, w)
+        z = _fit(rows, space)
+        phi = space.standard(z)
+        w = rows.best_arm(phi)
+        space = BodySpace.about(rated, far, max(float(z[0]), LEAST_SHARE * rated))
+        payload = Payload(*(np.asarray(x) for x in space.body(z)))
+    z = _fit(rows, space)
+    return _concluded(loaded, _Linearized(rows, space, z, rows.best_arm(space.standard(z))), seed)
+
+
+def _fit(rows: Rows, space: BodySpace) -> np.ndarray:
+    """Return z (10,) of the least sum of squares of rows and prior."""
+    slope, constant = rows.reduced
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([slope @ space.standard(z) + constant, space.prior(z)])
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        prior = np.concatenate([np.zeros((9, 1)), np.diag(1.0 / space.sigma[1:])], 1)
+        return np.concatenate([slope @ space.slope(z), prior])
+
+    start = np.zeros(10)
+    start[0] = 0.5 * space.heaviest
+    return least_squares(residual, start, jacobian, space.bounds, xtol=1e-12, ftol=1e-12, x_scale="jac").x
+
+
+def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEstimate:
+    """Return the estimate with its draws."""
+    rng, (low, high) = np.random.default_rng(seed), fit.space.bounds
+    u = fit.u
+    if u[0] > 1 - EDGE:
+        raise UserError(
+            f"data.loaded: the torque wants a payload above {high[0]:g} kg, HEAVIEST times robot.payload_max="
+            f"{fit.space.heaviest:g}; is it of {loaded.arm.robot.name}, and the calibration of the unloaded arm?"
+        )
+    drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low
+    mass, centre, tensor = fit.space.body(drawn)
+    draws = {"mass": mass, "centre": centre, "inertia": tensor_elements(tensor)}
+    # what the prior alone says of such a mass: a value is identifiable if its interval is far narrower
+    alone = np.where(
+        np.isinf(fit.space.sigma), fit.z, rng.normal(size=drawn.shape) * np.nan_to_num(fit.space.sigma, posinf=0.0)
+    )
+    wide = {"mass": np.array(fit.space.heaviest / np.sqrt(12)), "centre": np.full(3, fit.space.far)}
+    wide["inertia"] = tensor_elements(fit.space.body(alone)[2]).std(0)
+    known = {k: 0.5 * np.ptp(np.percentile(x, COVERED, axis=0), axis=0) < wide[k] / SHARPER for k, x in draws.items()}
+    m, c, i = fit.space.body(fit.z)
+    payload = Payload(np.asarray(m), c, i)
+    own = loaded.torque
+    x, motion = loaded.arm.x, own.motion
+    errors = [loaded.with_payload(p).errors(x[None])[0] for p in (None, payload)]
+    measured = own.predict(loaded.arm.space.dynamics(x)) - own.error(loaded.arm.space.dynamics(x))
+    return PayloadEstimate(
+        float(m), c, i, draws, known, motion.t, measured, *(measured + e for e in errors), own.seen
+    )

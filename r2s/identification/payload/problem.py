@@ -1,0 +1,156 @@
+"""Joint torque of a loaded arm, linear in the payload's standard parameters and in the arm's uncertainty."""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from r2s.identification.arm_uncertainty import Arm, arm_directions, sliding_sign
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass_and_moment
+from r2s.physics.rigid_body import LinkInertia, mujoco_inverse_dynamics
+from r2s.recordings.recording import Recording
+
+# changes since the calibration, standard deviations: friction warms by as much in minutes (WARMED in adaptation); an
+# offset, of the joint's friction; one of link-side sensors, of the largest torque (the prior of conf/identify)
+FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
+LOAD_FRICTION = 0.015  # Nm of friction per Nm of load, of gears (adaptation/tuning.py: PAYLOAD_FRICTION)
+STANDSTILL = 0.02  # rad/s, of commanded torque, as in identify.py
+RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; of longer recordings fewer
+REACH = 10.0  # standard deviations of an arm direction within the unit cube
+
+
+@dataclass(frozen=True)
+class LoadedSpace(ParameterSpace):
+    """The parameters of an arm that carries a given payload."""
+
+    payload: Payload | None = None
+
+    def dynamics(self, x: np.ndarray) -> Dynamics:
+        """Return the dynamics of x (..., P) with the payload."""
+        return dynamics_with_payload(self.robot, super().dynamics(x), self.payload)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The R rows of a loaded recording that count, in standard deviations: error + body phi + arm w.
+
+    Attributes:
+        error: (R,) without payload. body: (R, 10), per standard parameter phi about the end effector.
+        arm: (R, r), per direction w of the arm's uncertainty, standard normal. clusters: (R,) independent blocks.
+    """
+
+    error: np.ndarray
+    body: np.ndarray
+    arm: np.ndarray
+    clusters: np.ndarray
+
+    @cached_property
+    def _eliminated(self) -> tuple[np.ndarray, np.ndarray]:
+        """(r, 10), (r,): the best w is their product with phi plus the constant."""
+        h = self.arm.T @ self.arm + np.eye(self.arm.shape[1])
+        solved = -np.linalg.solve(h, self.arm.T @ np.column_stack([self.body, self.error]))
+        return solved[:, :-1], solved[:, -1]
+
+    @cached_property
+    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 10), (K,) whose sum of squares of `slope @ phi + constant` is that of all rows with the best w."""
+        gain, constant = self._eliminated
+        h = self.body.T @ (self.body + self.arm @ gain)
+        b = self.body.T @ (self.error + self.arm @ constant)
+        size = 1.0 / np.sqrt(np.maximum(h.diagonal(), 1e-300))  # kg, kg m and kg m^2
+        values, axes = np.linalg.eigh(0.5 * size[:, None] * (h + h.T) * size)
+        some = values > 1e-12 * values.max()
+        root = np.sqrt(values[some])[:, None] * axes[:, some].T
+        return root / size, np.linalg.lstsq(root.T, size * b, rcond=None)[0]
+
+    def best_arm(self, phi: np.ndarray) -> np.ndarray:
+        """Return w (r,) of the least sum of squares for a payload phi (10,)."""
+        gain, constant = self._eliminated
+        return gain @ phi + constant
+
+
+class LoadedTorque:
+    """The torque residual of an arm with a payload to be found.
+
+    Args:
+        arm: identified without it. recording: loaded, of the same kind of torque as the identification.
+        declared: payload that gravity compensation assumed (commanded torque).
+        cutoff_hz: of the low-pass of measured or motor torque.
+    """
+
+    def __init__(self, arm: Arm, recording: Recording, declared: Payload | None = None, cutoff_hz: float = 10.0):
+        self.arm, self.kind = arm, recording.torque
+        commanded = recording.torque == "commanded"
+        how = {"cutoff_hz": cutoff_hz, "slowest": STANDSTILL if commanded else 0.0}
+        rate = RATE_HZ / max(1, round(recording.duration / LONG_S))
+        self._space = LoadedSpace(**{f.name: getattr(arm.space, f.name) for f in fields(arm.space)})
+        self.torque = TorqueResidual(self._space, recording, rate_hz=rate, **how)
+        m, robot, load = self.torque.motion, arm.robot, LoadTorque(arm.robot)
+        still = np.zeros_like(m.q)
+        self._load = load
+        model = robot.model(gravity=True)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+        self._weight = mujoco_inverse_dynamics(model, m.q, still, still)
+        held = mass_and_moment(robot, declared)
+        self._declared = m.rows(np.array([load(q, held) for q in m.q])) if held.any() else np.zeros(m.tau.shape)
+        self._sign = m.filtered(sliding_sign(self.torque))
+
+    def with_payload(self, payload: Payload | None, unexplained: np.ndarray | float = 0.0) -> TorqueResidual:
+        """Return the residual of the arm with a payload, weighted by its error.
+
+        unexplained: (T, n) Nm of this error that the arm's uncertainty explains.
+        """
+        own = self.torque.on(replace(self._space, payload=payload)).with_external(self._declared + unexplained)
+        return own.reweighted(self.arm.x, fitted=True)
+
+    def body_torque(self, torque: TorqueResidual, payload: Payload | None) -> np.ndarray:
+        """Return (T, n, 10) Nm per standard parameter of a body beside `payload` at the end effector."""
+        d, robot = self.arm.space.dynamics(self.arm.x), self.arm.robot
+        d = dynamics_with_payload(robot, d, payload)
+        # ten bodies of 1 kg, points and tensors, whose standard parameters are independent
+        centre, tensor = np.zeros((10, 3)), np.zeros((10, 3, 3))
+        centre[1:4] = np.eye(3)
+        for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4):
+            tensor[k, i, j] = tensor[k, j, i] = 1.0
+        before = torque.predict(d)
+        moved = [
+            torque.predict(dynamics_with_payload(robot, d, Payload(np.ones(()), c, i))) - before
+            for c, i in zip(centre, tensor, strict=True)
+        ]
+        return np.stack(moved, -1) @ np.linalg.inv(LinkInertia(np.ones(10), centre, tensor).standard()).T
+
+    def load_friction(self, payload: Payload | None) -> np.ndarray:
+        """Return (T, n) Nm: change of friction by a payload's weight, per Nm of friction per Nm of load."""
+        m = self.torque.motion
+        carried = mass_and_moment(self.arm.robot, payload)
+        loaded = self._weight + np.array([self._load(q, carried) for q in m.q])
+        return m.rows(np.abs(loaded) - np.abs(self._weight)) * self._sign
+
+    def rows(self, payload: Payload | None, phi: np.ndarray, w: np.ndarray | None = None) -> Rows:
+        """Return the rows, linearized and weighted at a payload of standard parameters phi (10,) and an arm w."""
+        torque, x = self.with_payload(payload), self.arm.x
+        d = self.arm.space.dynamics(x)
+        offset = SENSOR_DRIFT * self.arm.robot.tau_max.max() if self.kind == "measured" else OFFSET_DRIFT * d.level
+        given = FRICTION_DRIFT, np.broadcast_to(offset, d.level.shape)
+        arm = arm_directions(torque, x, self.arm.samples, *given)
+        error = torque.error(torque.space.dynamics(x))
+        if self.kind != "measured" and payload is not None:  # a link-side sensor does not measure it
+            change = self.load_friction(payload)
+            error = error + d.load * change
+            arm = np.concatenate([arm, LOAD_FRICTION * change[..., None] * np.eye(len(d.load))], -1)
+        body = self.body_torque(torque, payload)
+        error = error - body @ phi
+        if w is not None and len(w) == arm.shape[-1]:
+            torque = self.with_payload(payload, -arm @ w)
+        weight = (1.0 / torque.scale)[torque.seen]
+        clusters = np.unique(torque.clusters[torque.seen.ravel()], return_inverse=True)[1]
+        return Rows(
+            error[torque.seen] * weight,
+            body[torque.seen] * weight[:, None],
+            arm[torque.seen] * weight[:, None],
+            clusters,
+        )

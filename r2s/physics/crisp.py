@@ -1,0 +1,63 @@
+"""Friction as crisp_controllers compensate it: the YAML of a ROS 2 controller, by the paper's eq. (5).
+
+The controllers (github.com/utiasDSL/crisp_controllers) add fp1 / (1 + exp(-fp2 (dq + fp3))) - fp1 / (1 + exp(-fp2
+fp3)) to each joint's torque. The sigmoid family is that law; other families are fitted by it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from r2s.files import atomic_write
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.friction import SIGMOID
+from r2s.physics.robot import Robot
+
+SPEEDS, SLOWEST = 100, 0.01  # fitted speeds per direction, up to dq_max; the slowest, of dq_max
+STEEPEST = 100.0  # s/rad, fp2 at most: a steeper step is chatter for a controller that filters dq
+
+
+def sigmoid_law(dq: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Return (...) Nm at dq (...) rad/s for phi (..., 3): fp1 Nm, fp2 s/rad, fp3 rad/s."""
+    fp1, fp2, fp3 = (phi[..., k] for k in range(3))
+    return fp1 / (1 + np.exp(-fp2 * (dq + fp3))) - fp1 / (1 + np.exp(-fp2 * fp3))
+
+
+def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
+    """Return phi (n, 3) closest to an arm's friction, and the RMS error (n,) Nm over speeds up to dq_max."""
+    share = np.geomspace(SLOWEST, 1.0, SPEEDS)
+    dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
+    true = dynamics.friction(dq, np.sign(dq))
+    if dynamics.family is SIGMOID and dynamics.phi.shape[-1] == 3:
+        return dynamics.phi, np.zeros(robot.n)
+    out = np.empty((robot.n, 3))
+    for j in range(robot.n):
+        level = max(float(np.abs(true[:, j]).max()), 1e-9)
+        bounds = [0.0, 0.1, -robot.dq_max[j]], [10 * level, STEEPEST, robot.dq_max[j]]
+        start = [2 * level, min(5 / robot.dq_max[j] + 1.0, 0.5 * STEEPEST), 0.0]
+
+        def error(x: np.ndarray, j: int = j) -> np.ndarray:
+            return sigmoid_law(dq[:, j], x) - true[:, j]
+
+        out[j] = least_squares(error, start, bounds=bounds, x_scale="jac").x
+    return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))
+
+
+def write_crisp(path: Path, robot: Robot, dynamics: Dynamics) -> None:
+    """Write the friction parameters of `ros__parameters`, with the error of the fit as a comment."""
+    phi, rms = fit_sigmoid(robot, dynamics)
+    level = np.maximum(dynamics.family.level(dynamics.phi, robot.dq_max), 1e-9)
+    errors = ", ".join(f"{e:.3g} ({100 * e / x:.0f} %)" for e, x in zip(rms, level, strict=True))
+    rows = "\n".join(f"      fp{k + 1}: [{', '.join(f'{v:.9g}' for v in phi[:, k])}]" for k in range(3))
+    text = f"""# Friction of {robot.name} for crisp_controllers: fp1 Nm, fp2 s/rad, fp3 rad/s per joint.
+# RMS error against the identified {dynamics.family.name} friction up to dq_max, Nm (of the friction there): {errors}.
+# Offset, load and cable torques are not part of this law.
+/**:
+  ros__parameters:
+    use_friction: true
+    friction:
+{rows}
+"""
+    with atomic_write(path) as part:
+        part.write_text(text)

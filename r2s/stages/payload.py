@@ -1,0 +1,99 @@
+"""stage=identify data.loaded=FILE: a recording with a payload -> payload.yaml, its tables and figure."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError
+from r2s.files import located
+from r2s.stages.build import console
+from r2s.stages.data import check_cutoff, read_file
+
+
+@dataclass(frozen=True)
+class LoadedData:
+    """The recording of the loaded arm, the payload that gravity compensation assumed or None, and their files."""
+
+    recording: Any
+    declared: Any
+    files: list[Path]
+
+
+def loaded_data(cfg, robot, file, torque=None):
+    """Return the `LoadedData` of data.loaded; None without it.
+
+    Args:
+        file: `FileData` of the config, for the columns. torque: kind of the torque; None: data.torque.
+
+    Raises:
+        UserError: no arm without payload to compare with, another kind of torque than its, or a wrong file.
+    """
+    from r2s.identification.checks import check_motion
+    from r2s.physics.payload import payload_of
+
+    if not file.loaded:
+        if file.declared_payload is not None:
+            raise UserError("data.declared_payload: there is no data.loaded= for which it was declared")
+        return None
+    if file.contact:
+        raise UserError("data.loaded: identify the payload first, then the surface of data.contact in a second run")
+    path = located(file.loaded)
+    recording = read_file(robot, file, path, torque=torque)
+    check_motion(robot, recording)
+    check_cutoff(cfg.identify.cutoff_hz, (recording,))
+    if file.declared_payload is not None and recording.torque != "commanded":
+        raise UserError(
+            f"data.declared_payload: {recording.torque} torque contains the weight of the payload, whatever was "
+            "declared; leave it out"
+        )
+    declared = payload_of(file.declared_payload, robot.payload_max, "data.declared_payload")
+    return LoadedData(recording, declared, [path])
+
+
+def torque_of_calibration(cfg, given):
+    """Return the kind of torque of a loaded recording: that from which `calibration=` was identified.
+
+    given: data.torque.
+
+    Raises:
+        UserError: data.torque= is another one.
+    """
+    from r2s.stages.adapter_factory import PARAMETERS, TORQUE, run_folder
+    from r2s.stages.run_config import loaded
+
+    path = Path(cfg.calibration)
+    path = path if path.is_file() else run_folder(path) / PARAMETERS
+    if not path.is_file():
+        raise UserError(f"calibration: no parameters.yaml at {cfg.calibration}")
+    torque = (loaded(path).get("source") or {}).get("torque", TORQUE)
+    if given not in (None, torque):
+        raise UserError(
+            f"data.torque: expected {torque}, from which calibration={cfg.calibration} was identified, got {given}"
+        )
+    return torque
+
+
+def identify_load(cfg, run, arm, data):
+    """Write payload.yaml and figure; return the entry of summary.json and print the tables."""
+    from r2s.identification.payload.estimate import identify_payload
+    from r2s.identification.payload.payload_file import save_payload
+    from r2s.progress import Progress
+    from r2s.reporting.identification.payload import load_error_table, payload_figure, payload_table
+    from r2s.reporting.tables import print_table
+
+    progress = Progress("payload")
+    how = {"declared": data.declared, "cutoff_hz": cfg.identify.cutoff_hz, "seed": cfg.seed}
+    found = identify_payload(arm, data.recording, **how, report=progress)
+    progress.close()
+    source = {"recording": data.recording.name, "torque": data.recording.torque}
+    source |= {"calibration": cfg.calibration or str(run.folder), "run": str(run.folder)}
+    save_payload(run.folder / "payload.yaml", arm.robot, found, source)
+    payload_figure(run.figure("payload"), found)
+    print_table(console(), payload_table(found), f"payload at {arm.robot.ee_site}, 95 % intervals")
+    print_table(console(), load_error_table(found), "loaded recording")
+    entry = {"seconds": data.recording.duration}
+    for name, unit in (("mass", "kg"), ("centre", "m"), ("inertia", "kg_m2")):
+        entry |= {f"{name}_{unit}": found.values[name].tolist()}
+        entry |= {f"{name}_interval95_{unit}": found.interval(name).tolist()}
+    errors = {"torque_rmse_Nm": found.predicted, "without_payload_torque_rmse_Nm": found.without}
+    return entry | {name: found.rmse(x).tolist() for name, x in errors.items()}
