@@ -3,10 +3,10 @@
     M(q) ddq + c(q, dq) + g(q) = tau_drive + g_nominal(q) + offset - tau_f,    tau_drive = lag(delay(command))
 
 Masses and centres are nominal, so gravity and its compensation cancel, except for the weight of a payload, which
-gravity compensation does not know. A joint at rest holds while its net torque (all but friction) lies in its band. The
-net torque includes the accelerations of the other joints, so one joint can pull another one loose. A joint comes to
-rest if its velocity crosses 0, or is at most `v_stick`, with the net torque inside the band (not within 5 ms of its
-release). Both events are located in time to 1e-12 s. LuGre has no such rule: bristles hold the joint.
+gravity compensation does not know. A joint at rest holds while its net torque (all but friction) lies in its band.
+The net torque includes the accelerations of the other joints, so one joint can pull another one loose. A joint
+comes to rest if its velocity crosses 0, or is at most `v_stick`, with the net torque inside the band (not within 5
+ms of its release). Both events are located in time to 1e-12 s. LuGre has no such rule: bristles hold the joint.
 
 Rigid bodies are spatial vectors about the base's origin (Featherstone 2008, ch. 5 and 6); the arm is Franka's table
 of (modified) Denavit-Hartenberg parameters. Integration is the classical fourth-order Runge-Kutta method.

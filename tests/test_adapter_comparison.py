@@ -276,6 +276,7 @@ def test_what_cannot_be_compared_is_set_apart(tmp_path):
         ({"payload": {"mass": 1}}, "1.0 kg"),
         ({"payload": {"mass": 1.0, "on_s": 2}}, "1.0 kg, on_s=2"),
         ({"payload": {"mass": 0.0, "on_s": 2}}, "nominal"),
+        ({"payload": "runs/identify/hand"}, "payload=runs/identify/hand"),
         (
             {"declared_payload": 0.5, "friction_scale": 0.8, "extra_delay_s": 0.005},
             "0.5 kg declared, friction x 0.8, 0.005 s later",

@@ -1,5 +1,7 @@
 """Files of arms as people have them: scenes, grippers, switches of a simulator, placeholders, springs."""
 
+import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import dartpy
@@ -8,9 +10,9 @@ import numpy as np
 import pytest
 
 from r2s.errors import UserError
-from r2s.physics.description import write_description, write_sdf, write_urdf
+from r2s.physics.description import write_description, write_mjcf, write_sdf, write_urdf
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.rigid_body import LinkInertia, mujoco_inverse_dynamics, regressor
 from r2s.physics.robot import load_robot
 from r2s.physics.welds import Bodies
 
@@ -305,6 +307,27 @@ def test_what_is_written_moves_like_the_arm(write, tmp_path, parts):
         )
 
 
+def dart_urdf(path):
+    """Return the skeleton of a URDF, fixed to the world."""
+    loader, options = dartpy.utils.DartLoader(), dartpy.utils.DartLoaderOptions()
+    options.mDefaultRootJointType = dartpy.utils.DartLoaderRootJointType.FIXED
+    loader.setOptions(options)
+    return loader.parseSkeleton(str(path))
+
+
+def dart_torque(skeleton, gravity, at):
+    """Return DART's inverse dynamics (T, n) Nm, without damping and springs."""
+    skeleton.setGravity(gravity)
+    out = []
+    for q, dq, ddq in zip(*at, strict=True):
+        skeleton.setPositions(q)
+        skeleton.setVelocities(dq)
+        skeleton.setAccelerations(ddq)
+        skeleton.computeInverseDynamics(False, False, False)
+        out.append(skeleton.getForces())
+    return np.array(out)
+
+
 @pytest.mark.parametrize(("form", "parts"), [("urdf", {}), ("sdf", {}), ("sdf", {"SPRING": SPRING})])
 def test_what_is_written_moves_alike_in_dart(write, tmp_path, form, parts):
     """Inverse dynamics at 1,000 states to 1e-9 of the largest; DART leaves damping and springs to the caller."""
@@ -315,26 +338,62 @@ def test_what_is_written_moves_alike_in_dart(write, tmp_path, form, parts):
         path.write_text(path.read_text().replace('version="1.9"', 'version="1.6"'))  # what dartpy reads
         skeleton = dartpy.utils.SdfParser.readSkeleton(str(path))
     else:
-        loader, options = dartpy.utils.DartLoader(), dartpy.utils.DartLoaderOptions()
-        options.mDefaultRootJointType = dartpy.utils.DartLoaderRootJointType.FIXED
-        loader.setOptions(options)
-        skeleton = loader.parseSkeleton(str(path))
-    skeleton.setGravity(robot.gravity)
-    at, theirs = states(robot), []
-    for q, dq, ddq in zip(*at, strict=True):
-        skeleton.setPositions(q)
-        skeleton.setVelocities(dq)
-        skeleton.setAccelerations(ddq)
-        skeleton.computeInverseDynamics(False, False, False)
-        theirs.append(skeleton.getForces())
+        skeleton = dart_urdf(path)
+    at = states(robot)
+    theirs = dart_torque(skeleton, robot.gravity, at)
     joints = [j for j in skeleton.getJoints() if j.getNumDofs()]
     rest, stiffness = (
         np.array([getattr(j, f"get{x}")(0) for j in joints]) for x in ("RestPosition", "SpringStiffness")
     )
     damping = np.array([j.getDampingCoefficient(0) for j in joints])
-    theirs = np.array(theirs) + stiffness * (at[0] - rest) + damping * at[1]
+    theirs = theirs + stiffness * (at[0] - rest) + damping * at[1]
     exact = torque(robot, at)
     np.testing.assert_allclose(theirs, exact, atol=1e-9 * np.abs(exact).max())
+
+
+def changed(robot):
+    """Return dynamics with other masses, centres, tensors and rotors than the file's, without friction."""
+    rng, n = np.random.default_rng(5), robot.n
+    factor = rng.uniform(0.8, 1.2, n)
+    plain = nominal_dynamics(robot, **FRICTIONLESS)
+    own = {"mass": factor * robot.mass, "com": robot.com + rng.normal(0, 0.01, (n, 3))}
+    tilt = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]  # other principal axes, the same moments
+    return replace(
+        plain, **own, inertia=tilt @ robot.inertia @ tilt.swapaxes(1, 2), armature=rng.uniform(0.05, 0.2, n)
+    )
+
+
+def test_an_identified_arm_comes_back_in_every_reader(panda, tmp_path):
+    """Of a Panda with other links and rotors: torque at 1,000 states to 1e-9 of the largest.
+
+    r2s reads rotors from MJCF and URDF, MuJoCo and Pinocchio from MJCF; no other reader of the URDF knows them.
+    """
+    d, at = changed(panda), states(panda)
+    write_mjcf(tmp_path / "arm.xml", panda, d)
+    write_urdf(tmp_path / "arm.urdf", panda, d)
+    xml, urdf = str(tmp_path / "arm.xml"), str(tmp_path / "arm.urdf")
+    y = regressor(panda, *at, panda.gravity).reshape(len(at[0]), panda.n, -1)
+    links = y @ LinkInertia(d.mass, d.com, d.inertia).standard().ravel()
+    exact = links + d.armature * at[2]
+    found = {
+        "r2s, MJCF": (exact, torque(load_robot(xml), at)),
+        "r2s, URDF": (exact, torque(load_robot(urdf, ee="ee"), at)),
+    }
+    for name, path, expected in (("MJCF", xml, exact), ("URDF", urdf, links)):
+        model = mujoco.MjModel.from_xml_path(path)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+        found[f"MuJoCo, {name}"] = expected, mujoco_inverse_dynamics(model, *at)
+    found["DART, URDF"] = links, dart_torque(dart_urdf(urdf), panda.gravity, at)
+    if importlib.util.find_spec("pinocchio"):
+        import pinocchio
+
+        for name, build, expected in (("MJCF", "buildModelFromMJCF", exact), ("URDF", "buildModelFromUrdf", links)):
+            model = getattr(pinocchio, build)(str(tmp_path / f"arm.{'xml' if name == 'MJCF' else 'urdf'}"))
+            data = model.createData()
+            rows = [pinocchio.rnea(model, data, *x) for x in zip(*at, strict=True)]
+            found[f"Pinocchio, {name}"] = expected, np.array(rows)
+    for name, (expected, theirs) in found.items():
+        np.testing.assert_allclose(theirs, expected, atol=1e-9 * np.abs(exact).max(), rtol=0, err_msg=name)
 
 
 def test_what_is_written_moves_alike_in_pinocchio(write, tmp_path):

@@ -29,8 +29,8 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
     share = np.geomspace(SLOWEST, 1.0, SPEEDS)
     dq = np.concatenate([-share[::-1], share])[:, None] * robot.dq_max
     true = dynamics.friction(dq, np.sign(dq))
-    if dynamics.family is SIGMOID and dynamics.phi.shape[-1] == 3:
-        return dynamics.phi, np.zeros(robot.n)
+    if dynamics.family is SIGMOID and not dynamics.phi[:, 3:].any():  # no viscous friction beside it
+        return dynamics.phi[:, :3], np.zeros(robot.n)
     out = np.empty((robot.n, 3))
     for j in range(robot.n):
         level = max(float(np.abs(true[:, j]).max()), 1e-9)

@@ -23,7 +23,11 @@ def condition(arm: Mapping[str, Any], typed: Iterable[str] = ()) -> dict[str, An
     own = [k.removeprefix("arm.").split(".")[0] for k in typed if k.startswith("arm.")]
     keys = dict.fromkeys([*SETTINGS, *own])
     values = {k: _plain(arm[k]) for k in keys if k in arm and k not in IDENTITY}
-    return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and (_size(v) or "payload" not in k)}
+
+    def empty(key: str, value: Any) -> bool:
+        return "payload" in key and not isinstance(value, str) and not _size(value)  # a string is a payload.yaml
+
+    return {k: v for k, v in values.items() if v != SETTINGS.get(k, (None,))[0] and not empty(k, v)}
 
 
 def in_words(settings: Mapping[str, Any]) -> str:
@@ -52,7 +56,7 @@ def _size(value: Any) -> float:
 
 
 def _words(key: str, value: Any) -> str:
-    if key not in SETTINGS:
+    if key not in SETTINGS or isinstance(value, str):
         return f"{key}={value}"
     more = ""
     if isinstance(value, Mapping):
