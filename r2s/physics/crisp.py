@@ -35,12 +35,13 @@ def fit_sigmoid(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarra
     for j in range(robot.n):
         level = max(float(np.abs(true[:, j]).max()), 1e-9)
         bounds = [0.0, 0.1, -robot.dq_max[j]], [10 * level, STEEPEST, robot.dq_max[j]]
-        start = [2 * level, min(5 / robot.dq_max[j] + 1.0, 0.5 * STEEPEST), 0.0]
 
         def error(x: np.ndarray, j: int = j) -> np.ndarray:
             return sigmoid_law(dq[:, j], x) - true[:, j]
 
-        out[j] = least_squares(error, start, bounds=bounds, x_scale="jac").x
+        starts = ([2 * level, steep, 0.0] for steep in (3.0, 30.0))  # viscous, and Coulomb friction
+        fits = [least_squares(error, start, bounds=bounds, x_scale="jac") for start in starts]
+        out[j] = min(fits, key=lambda fit: fit.cost).x
     return out, np.sqrt(np.mean((sigmoid_law(dq, out) - true) ** 2, axis=0))
 
 
