@@ -96,4 +96,4 @@ def identify_load(cfg, run, arm, data):
         entry |= {f"{name}_{unit}": found.values[name].tolist()}
         entry |= {f"{name}_interval95_{unit}": found.interval(name).tolist()}
     errors = {"torque_rmse_Nm": found.predicted, "without_payload_torque_rmse_Nm": found.without}
-    return entry | {name: found.rmse(x).tolist() for name, x in errors.items()}
+    return entry | {name: [None if e != e else e for e in found.rmse(x).tolist()] for name, x in errors.items()}

@@ -47,7 +47,7 @@ def torque_figure(
             scores = []
             for label, tau in predicted.items():
                 axis.plot(x, line(tau[:, j]), color=colour[label], linewidth=0.9, label=label)
-                scores.append(f"{label} {np.sqrt(np.mean((tau[:, j] - measured[:, j]) ** 2)):.3g}")
+                scores.append(f"{label} {np.sqrt(np.nanmean((tau[:, j] - measured[:, j]) ** 2)):.3g}")
             axis.set_title(f"joint {j + 1}: RMSE {', '.join(scores)} Nm", loc="left")
             seconds = "time, s, pauses cut short" if len(pauses) else "time, s"
             axis.set(xlabel=seconds, ylabel="torque, Nm", xlim=(0, clock[rows[-1]]))
