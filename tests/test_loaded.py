@@ -95,7 +95,6 @@ def test_every_draw_is_a_body(found):
     assert (moments[:, 0] + moments[:, 1] >= moments[:, 2] * (1 - 1e-9)).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("declared", [None, 0.5])
 def test_from_commands_whatever_was_declared(robot, declared):
     """A declared payload is compensated by the arm, and the estimate is that of the whole payload."""
