@@ -55,7 +55,7 @@ def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:
     order = np.array([10 * k + i for k in range(n) for i in ORDER] + [10 * n + j for j in range(n) if rotors])
     sizes = np.linalg.norm(columns, axis=0)
     order = order[sizes[order] > DEPENDENT * sizes.max()]
-    rest = np.abs(np.linalg.qr(columns[:, order] / sizes[order], mode="r").diagonal())
+    rest = np.abs(np.diagonal(np.asarray(np.linalg.qr(columns[:, order] / sizes[order], mode="r"))))
     kept, others = order[rest > DEPENDENT * n], order[rest <= DEPENDENT * n]
     matrix = np.zeros((len(kept), columns.shape[1]))
     matrix[np.arange(len(kept)), kept] = 1.0

@@ -174,8 +174,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     payload = Payload(np.asarray(m), c, i)
     own = loaded.torque
     x, motion = loaded.arm.x, own.motion
-    errors = [loaded.with_payload(p).errors(x[None])[0] for p in (None, payload)]
+    bare, carrying = (loaded.with_payload(p).errors(x[None])[0] for p in (None, payload))
     measured = own.predict(loaded.arm.space.dynamics(x)) - own.error(loaded.arm.space.dynamics(x))
-    return PayloadEstimate(
-        float(m), c, i, draws, known, motion.t, measured, *(measured + e for e in errors), own.seen
-    )
+    torques = measured, measured + bare, measured + carrying
+    return PayloadEstimate(float(m), c, i, draws, known, motion.t, *torques, own.seen)
