@@ -83,7 +83,7 @@ class _Linearized:
     def clusters(self) -> np.ndarray:
         return self.rows.clusters
 
-    def linearize(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearize(self, u: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         width, count = np.subtract(*self.space.bounds[::-1]), len(self.w)
         slope = self.space.slope(self.z) * width
         phi = self.space.standard(self.z)
@@ -93,7 +93,7 @@ class _Linearized:
         jacobian[: len(data)] = np.concatenate([self.rows.body @ slope, 2 * REACH * self.rows.arm], 1)
         jacobian[len(data) : len(data) + 9, 1:10] = np.diag((width / self.space.sigma)[1:])
         jacobian[len(data) + 9 :, 10:] = 2 * REACH * np.eye(count)
-        return np.concatenate([data, prior]), jacobian
+        return [(np.concatenate([data, prior]), jacobian)]
 
 
 def identify_payload(
