@@ -1,11 +1,12 @@
 # make run: everything on the embedded twin. make test: lint and tests. Both set up what is missing first.
-# make docs: the site, strictly, into site/. make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
+# make docs: the site, strictly, into site/. make gazebo-classic: the world plugin of simulator=gazebo_classic.
+# make test-slow: the tests that take minutes. make test-portable: the numeric ones again, as on other processors.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run test test-slow test-portable lint format bench docs setup uv.lock clean
+.PHONY: run test test-slow test-portable lint format bench docs gazebo-classic setup uv.lock clean
 
 run: $(READY)
 	$(BIN)/python run.py stage=pipeline
@@ -35,6 +36,22 @@ docs: $(READY)
 	@$(BIN)/python -c 'import mkdocs, mkdocstrings_handlers.python' 2> /dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "open site/index.html"
+
+# Compiles where Gazebo's headers are: here, or in the root directory R2S_GAZEBO_ROOT (docs/how_to/gazebo.md).
+GAZEBO := r2s/engines/gazebo_classic.cc
+PLUGIN := r2s/engines/libr2s_gazebo_classic.so
+COMPILE := g++ -std=c++17 -O2 -shared -fPIC
+CHROOT := $(if $(filter 0,$(shell id -u)),chroot,unshare --map-root-user chroot)
+gazebo-classic:
+ifdef R2S_GAZEBO_ROOT
+	@test -x $(R2S_GAZEBO_ROOT)/usr/bin/gzserver || { echo "error: R2S_GAZEBO_ROOT=$(R2S_GAZEBO_ROOT) is no root directory with gzserver; see docs/how_to/gazebo.md" >&2; exit 2; }
+	cp $(GAZEBO) $(R2S_GAZEBO_ROOT)/tmp/r2s.cc
+	$(CHROOT) $(R2S_GAZEBO_ROOT) sh -c '$(COMPILE) /tmp/r2s.cc -o /tmp/r2s.so $$(pkg-config --cflags gazebo)'
+	cp $(R2S_GAZEBO_ROOT)/tmp/r2s.so $(PLUGIN)
+else
+	@pkg-config --exists gazebo || { echo "error: pkg-config finds no headers of Gazebo 11: install libgazebo-dev, or give R2S_GAZEBO_ROOT=FOLDER; see docs/how_to/gazebo.md" >&2; exit 2; }
+	$(COMPILE) $(GAZEBO) -o $(PLUGIN) $$(pkg-config --cflags gazebo)
+endif
 
 setup: $(READY)
 

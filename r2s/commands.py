@@ -1,7 +1,7 @@
 """Commands without a run folder of their own.
 
 `r2s list`, `look` and `export` read run folders, `convert` writes a recording for ROS 2 or LeRobot, `check` judges a
-recording, or connects to an arm.
+recording, or connects to an arm, `engines` lists the physics engines.
 """
 
 import os
@@ -60,6 +60,7 @@ def run_command(words: Sequence[str]) -> None:
         "--to", type=Path, required=True, help="also to=FILE.mcap, or to=FOLDER, a LeRobotDataset"
     )
     converting.add_argument("--trust", help=TRUSTED)
+    commands.add_parser("engines", help="the physics engines: version, or how to install it")
     options = [f"--{w}" for w in words[1:] if w.startswith(("to=", "trust="))]  # first: KEY=VALUE has no fixed number
     others = [w for w in words[1:] if not w.startswith(("to=", "trust="))]
     typed, unknown = parser.parse_known_args([words[0], *options, *others])
@@ -67,9 +68,11 @@ def run_command(words: Sequence[str]) -> None:
         own = commands.choices[typed.command].format_usage().replace("[", " ").replace("]", " ").split()
         options = [w for w in own if w.startswith("--")]
         raise UserError(
-            f"{typed.command}: no argument '{unknown[0]}'; allowed: {choices(options)}{nearest(unknown[0], options)}"
+            f"{typed.command}: no argument '{unknown[0]}'; allowed: {choices(options) or 'none'}"
+            f"{nearest(unknown[0], options)}"
         )
-    {"list": list_runs, "look": look, "export": export, "check": check, "convert": convert}[typed.command](typed)
+    run = {"list": list_runs, "look": look, "export": export, "check": check, "convert": convert, "engines": engines}
+    run[typed.command](typed)
 
 
 def list_runs(typed: Namespace) -> None:
@@ -226,6 +229,14 @@ def convert(typed: Namespace) -> None:
         print(note)
     print(f"{len(recording.t)} rows, {len(recording.stretches)} trajectories, {recording.torque} torque")
     print(f"written: {typed.to}")
+
+
+def engines(typed: Namespace) -> None:
+    """Print a line for each physics engine."""
+    from r2s.engines.installed import installed
+
+    for name, found, needs in installed():
+        print(f"simulator={name:16}{found}{needs and f': {needs}'}")
 
 
 def viewable(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from r2s.errors import UserError, choices, nearest
 from r2s.stages.build import CONF, STAGES, unread
 from r2s.stages.run_config import PROGRAM
 
-COMMANDS = ("look", "list", "export", "check", "convert")
+COMMANDS = ("look", "list", "export", "check", "convert", "engines")
 OPTIONAL = ("tracker", "experiment")  # groups that may have no option
 EXTENSIBLE = ("tune.space",)  # keys that + may add to
 NO_OPTION = "base"  # a file that the options of a group share

@@ -28,6 +28,8 @@ ELSEWHERE = {  # what this file does not type, and why
     r"(python run.py|r2s) (list|look|export)( RUN| runs/train/NAME)?$": "named alone: test_look.py, test_export.py",
     r"(python bundle/r2s_runtime.py|g\+\+) ": "test_export.py; the loop itself needs an arm",
     r"pytest -m gazebo$": "needs Gazebo",
+    r"sudo |export R2S_GAZEBO_ROOT=": "packages of the system, as root; the shell",
+    r"python run.py .*simulator=gazebo_classic": "needs Gazebo Classic: test_gazebo_classic.py",
     r"python run.py resume=": "test_cli.py kills a run first",
     r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli.py runs two of them",
     r"python run.py \+experiment=tune": "test_tune.py",
@@ -78,7 +80,7 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
         wanted = [t for t in TRACKERS if any(w.startswith("tracker=") and t in w for w in words)]
         if [t for t in wanted if not find_spec(t)]:
             continue  # an extra that is not installed here
-        if words[0] not in ("list", "look", "export", "convert", "--help"):
+        if words[0] not in ("list", "look", "export", "convert", "engines", "--help"):
             words += TOY
             name = next((w.removeprefix("name=") for w in words if w.startswith("name=")), None)
             named = name and f"runs/identify/{name}/ramps.npz" in page.read_text()

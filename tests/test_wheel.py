@@ -29,7 +29,7 @@ def installed(tmp_path_factory) -> Path:
 def test_the_wheel_has_every_module_and_every_number(installed):
     """All of r2s and of conf is in it, and nothing else of the checkout."""
     for name, at in (("r2s", "r2s"), ("conf", "r2s/conf")):
-        kinds = ("py", "yaml", "xml", "json", "npz", "md", "typed")
+        kinds = ("py", "yaml", "xml", "json", "npz", "md", "typed", "cc", "sh")
         own = {p.relative_to(ROOT / name) for kind in kinds for p in (ROOT / name).rglob(f"*.{kind}")}
         there = {p.relative_to(installed / at) for p in (installed / at).rglob("*.*") if "__pycache__" not in str(p)}
         assert {p for p in there if p.parts[0] != "conf"} == own if name == "r2s" else there == own

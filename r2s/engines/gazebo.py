@@ -11,15 +11,17 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.physics.description import chain, write_sdf
+from r2s.physics.description import chain, write_world
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 
 RELEASES = ("gz.sim", "gz.sim9", "gz.sim8")  # Jetty, Ionic, Harmonic
+PHYSICS = {"filename": "gz-sim-physics-system", "name": "gz::sim::systems::Physics"}
 
 
 class GazeboEngine:
@@ -51,7 +53,7 @@ class GazeboEngine:
         self._q, self._dq = robot.q_home.copy(), np.zeros(robot.n)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "world.sdf"
-            write_sdf(path, robot, dynamics, world=True)
+            write_world(path, robot, dynamics, ET.Element("plugin", PHYSICS))
             self._fixture = self._sim.TestFixture(str(path))
             self._fixture.on_pre_update(self._guarded(self._before))
             self._fixture.on_post_update(self._guarded(self._after))

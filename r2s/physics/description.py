@@ -193,30 +193,57 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
     return root
 
 
-def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = False) -> None:
+def write_sdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     """Write the arm as SDF 1.9, fixed to the world, with a frame `ee` at the end effector.
 
-    With `world` the file contains the world of r2s/engines/gazebo.py: physics in 1 ms steps without a real-time
-    limit, no gravity (libfranka's convention), no limits of velocity or torque (the driver has them), and no friction
-    (r2s applies it as a torque). A rotor becomes damping, armature / 1 ms; gazebo.py compensates that torque.
-
     Raises:
-        UserError: without `world`, the joints have armature, or a nonlinear spring or damping; SDF has none.
+        UserError: the joints have armature, or a nonlinear spring or damping; SDF has none.
     """
-    links, tip = chain(robot, dynamics, friction=not world)
-    if not world and any(link.armature for link in links):
+    links, tip = chain(robot, dynamics)
+    if any(link.armature for link in links):
         raise UserError("robot.armature: expected 0, as SDF has no rotor inertia; add it to the links")
-    if not world:
-        _check_linear(links, "SDF", springs=True)
+    _check_linear(links, "SDF", springs=True)
     root = ET.Element("sdf", version="1.9")
-    place = root
-    if world:
-        place = ET.SubElement(root, "world", name="r2s")
-        physics = ET.SubElement(place, "physics", name="1ms", type="ignored")
-        _text(physics, max_step_size=SIM_DT, real_time_factor=0)
-        _text(place, gravity="0 0 0")
-        plugin = {"filename": "gz-sim-physics-system", "name": "gz::sim::systems::Physics"}
-        ET.SubElement(place, "plugin", plugin)
+    _sdf_model(root, robot, links, tip, world=False)
+    _write(path, root)
+
+
+def write_world(
+    path: Path,
+    robot: Robot,
+    dynamics: Dynamics,
+    plugin: ET.Element,
+    *,
+    version: str = "1.9",
+    physics: str = "ignored",
+) -> None:
+    """Write the world of r2s/engines/gazebo.py and gazebo_classic.py as SDF.
+
+    It contains physics in 1 ms steps without a real-time limit, no gravity (libfranka's convention), no limits of
+    velocity or torque (the driver has them), and no friction (r2s applies it as a torque). A rotor becomes damping,
+    armature / 1 ms; the engines compensate that torque.
+
+    Args:
+        path: file. robot, dynamics: the arm. plugin: of the world. version: of SDF.
+        physics: type of the physics engine; gz-sim ignores it.
+    """
+    links, tip = chain(robot, dynamics, friction=False)
+    root = ET.Element("sdf", version=version)
+    place = ET.SubElement(root, "world", name="r2s")
+    _text(
+        ET.SubElement(place, "physics", name="1ms", type=physics),
+        max_step_size=SIM_DT,
+        real_time_factor=0,
+        real_time_update_rate=0,
+    )
+    _text(place, gravity="0 0 0")
+    place.append(plugin)
+    _sdf_model(place, robot, links, tip, world=True)
+    _write(path, root)
+
+
+def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarray, *, world: bool) -> None:
+    """Append the model; `world`: for `write_world`."""
     model = ET.SubElement(place, "model", name=robot.name)
     parent = "world"
     pose = np.eye(4)
@@ -245,7 +272,6 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics, *, world: bool = Fal
         parent = link.name
     frame = ET.SubElement(model, "frame", name="ee", attached_to=parent)
     _text(frame, pose=_pose_words(tip))
-    _write(path, root)
 
 
 def _polynomial(coefficients: np.ndarray) -> str:
