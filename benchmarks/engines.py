@@ -39,7 +39,7 @@ MAKERS = {
     ),
 }
 MOTIONS = 4
-SWING = 0.25  # rad, half of what each joint would move alone in a motion
+SWING = 0.12  # rad, half of what each joint would move alone in a motion
 STOP_SHARE = 0.03  # of each torque limit: pushes every joint into a stop
 ROTORS = 2e-3 * ROBOT.tau_max  # kg m^2, of the size that identification finds on a Panda
 GOALS = 4  # of the figure, as in the paper's
