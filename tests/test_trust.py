@@ -150,6 +150,7 @@ def test_an_honest_run_reads_as_it_was(honest):
         "arm=panda",
         "arm=fr3_emulated",
         "simulator=gazebo",
+        "simulator=gazebo_classic",
         "task=track",
         "search=ga",
         "tracker=[mlflow,wandb,tensorboard]",
