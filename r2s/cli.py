@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, choices, nearest
 from r2s.override_checks import COMMANDS, check_overrides
@@ -167,7 +168,7 @@ def differing(saved, cfg, most=3):
 
     from r2s.reporting.trackers.tracker import flat
 
-    both = (OmegaConf.to_container(c, resolve=True) for c in (saved, cfg))
+    both: Any = [OmegaConf.to_container(c, resolve=True) for c in (saved, cfg)]
     before, now = (dict(flat({k: v for k, v in c.items() if k not in FREE})) for c in both)
     keys = [k for k in dict.fromkeys([*before, *now]) if before.get(k) != now.get(k)]
     words = [f"{k} was {str(before.get(k, ABSENT))[:60]}, is {str(now.get(k, ABSENT))[:60]}" for k in keys[:most]]

@@ -304,7 +304,7 @@ def tune(cfg, overrides):
     seeds = ",".join(str(cfg.seed + k) for k in range(1, 4))
     lines = [
         line,
-        *at_edges(best, how.space),
+        *at_edges({str(k): v for k, v in best.items()}, how.space),
         f"its seed chose it: confirm with python run.py -m {settings} seed={seeds}",
     ]
     for line in lines:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import pandas as pd
 
@@ -88,7 +89,8 @@ def _sections(
         note = (
             "held_out scores the best setting at seeds that did not choose it; without two seeds there is no spread."
         )
-        section = [table, note, *([edges] if (edges := at_edges(grouped.members)) else [])]
+        edges = at_edges(grouped.members)
+        section: list[Any] = [table, note, *([edges] if edges else [])]
         sections[f"Sensitivity of the last {what} to the settings (small spread: little tuning)"] = section
     return sections
 

@@ -100,7 +100,7 @@ def at_edges(grouped: Grouped) -> list[str]:
         settings = [g for g in grouped.values() if g[0].algo == algo]
         best = max(settings, key=lambda g: by.sign * float(interquartile_mean(scores(g, by.key))))[0].settings
         for key, value in ((k, v) for k, v in best.items() if k.startswith(("algo.", "reward."))):
-            tried = {g[0].settings.get(key) for g in settings if is_number(g[0].settings.get(key))}
+            tried = [x for x in {g[0].settings.get(key) for g in settings} if x is not None and is_number(x)]
             if len(tried) > 2 and value in (min(tried), max(tried)):
                 lines.append(edge(f"best setting of {algo}", key, value, value == max(tried)))
     return lines
