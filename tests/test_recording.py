@@ -301,7 +301,8 @@ def test_overlap_of_two_recordings():
     late = again.select(again.t > 3.3)
     assert replace(late, t=late.t + 100.0).overlap(first) == 1.0
     off = 0.015 * np.sqrt(2) * np.stack([np.sin(1.7 * t), np.cos(2.3 * t)], -1)  # tracking error of 15 mrad RMS
-    assert replace(again, q=again.q + off).overlap(first) == 1.0
+    for scale in (1.0, 0.3):
+        assert replace(again, q=scale * again.q + off).overlap(moved(t, (scale, scale))) == 1.0
     for other in (moved(1.1 * t), moved(t, (1.0, -1.0)), moved(t + 7.0, (0.8, 1.0))):
         assert other.overlap(first) < 0.2
     assert moved(0 * t).overlap(first) == 0.0

@@ -16,7 +16,9 @@ OVERLAP_S = 0.5  # s, minimum length of a repetition
 PAUSE_S = 60.0  # s, a longer pause in a log separates two motions
 MAX_COMPARED = 60  # tracks compared with each track, and pieces searched for; bounds the computing time
 PIECE_S, PIECE_MOTION = 1.0, 2.0  # s, and deviations of the motion: least duration and range of a piece in `overlap`
-SIMILAR = 0.04  # deviations of the motion: a tracking error, 20 mrad of a swing by 0.7 rad
+TRACKING = 0.02  # rad RMS, tracking error of a slow or soft arm
+# deviations of the motion: least and largest tolerance; single joints of other Fourier motions pass from 0.2 on
+SIMILAR = 0.04, 0.12
 STILL = 0.25  # of the largest joint's deviation: least one of a joint that hardly moves
 
 
@@ -76,11 +78,11 @@ def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
 def overlap(training: Sequence[Track], other: Sequence[Track]) -> float:
     """Return the share (0 to 1) of the motion in `other` that also occurs in `training`, in all joints at once.
 
-    It occurs if each joint's RMS distance is less than SIMILAR standard deviations of its motion in `other`: tracking
-    errors of a slow or soft arm reach tens of mrad, and a small motion repeats itself within less.
+    It occurs if each joint's RMS distance is within a tracking error, or SIMILAR standard deviations of its motion in
+    `other`, of a large or small motion.
     """
     deviation = np.nanstd(np.concatenate([track.q for track in other]), axis=0) if other else np.zeros(1)
-    tolerance = SIMILAR * np.maximum(deviation, STILL * deviation.max())
+    tolerance = np.clip(TRACKING, *np.outer(SIMILAR, np.maximum(deviation, STILL * deviation.max())))
     pieces = [piece for track in other for piece in _pieces(track.q, PIECE_MOTION * deviation.max())]
     pieces = pieces[:: 1 + len(pieces) // MAX_COMPARED]
     repeated = 0
