@@ -172,7 +172,7 @@ def test_runs_that_are_not_comparable_are_listed_with_a_reason(user_folder):
     assert others["found"] == "stage=identify"
     assert others["cut"] == others["edited"] == "unreadable"
     assert others["notes"] == others["readme.txt"] == "no run folder"
-    assert comparable([r for r in trained if r.toy])[1] == {}
+    assert comparable([r for r in trained if r.toy])[1] == {"toy2": "seed 0 again, as toy"}
 
 
 def test_one_commit_and_one_machine_or_set_apart(tmp_path):

@@ -25,6 +25,7 @@ from scipy.stats import t as student
 
 from r2s.errors import UserError
 from r2s.export.card import card
+from r2s.identification.base_parameters import base_table
 from r2s.identification.friction.breakaway import Breakaway
 from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import ParameterEstimate, parameter_space
@@ -346,7 +347,8 @@ def test_ten_numbers_per_link_take_one_line_in_the_terminal(console, panda):
 
 
 def everything(robot, found, recording, nominal=None) -> dict:
-    evidence = Evidence({}, np.ones(robot.n), pd.DataFrame(), window_s=0.2, cutoff_hz=10.0)
+    base = base_table(found.space, found.found, rotors=True)
+    evidence = Evidence({}, np.ones(robot.n), pd.DataFrame(), base, window_s=0.2, cutoff_hz=10.0)
     summary = {"train": SUMMARY | {"seconds": 8.0}, "validation": SUMMARY | {"seconds": 2.0}}
     return identification_sections(robot, nominal or found.space.nominal, found, recording, summary, evidence)
 

@@ -36,8 +36,8 @@ class BaseParameters(NamedTuple):
         """Return (..., K) of the dynamics of one or many arms."""
         links = LinkInertia(d.mass, d.com, d.inertia).standard()
         links = links.reshape(*links.shape[:-2], -1)
-        rotors = np.broadcast_to(d.armature, (*links.shape[:-1], d.armature.shape[-1]))
-        return np.concatenate([links, rotors], -1) @ self.matrix.T
+        count = links.shape[-1]  # links of one arm, if only the rotors differ
+        return links @ self.matrix[:, :count].T + d.armature @ self.matrix[:, count:].T
 
 
 def base_parameters(robot: Robot, rotors: bool) -> BaseParameters:

@@ -250,7 +250,11 @@ class Training:
     def save(self, checkpoint: Checkpoint) -> None:
         """Write a checkpoint."""
         state: dict[str, Any] = {"env_steps": self.env_steps, "updates": self.updates, "next_eval": self.next_eval}
-        state |= {"factor": torch.as_tensor(self.factor), "seconds": self.seconds, "evaluation": self.evaluation}
+        state |= {
+            "factor": torch.as_tensor(np.asarray(self.factor, dtype=float)),
+            "seconds": self.seconds,
+            "evaluation": self.evaluation,
+        }
         state |= {"terms": torch.tensor(np.array(self._terms))} | generators(self._device)
         state |= {"algo": self._algo.state_dict(), "env": _tensors(self._env.state()), "state": self._state.to_dict()}
         checkpoint.save(state, self._replay, self.env_steps, self._loop.replay_size)

@@ -119,7 +119,7 @@ def _of_file(name: str, path: Path) -> Any:
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
     """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is that of a sphere of water.
 
-    No moment is larger than that of the largest payload as a rod, three times as long as its largest distance.
+    No moment is larger than that of the largest payload with its mass twice as far away as its centre may be.
     """
     if value is None:
         return sphere_inertia(np.array(mass))
@@ -135,7 +135,7 @@ def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np
     if moments[0] + moments[1] < moments[2] * (1 - 1e-9):  # round-off of a flat body
         listed = ", ".join(f"{m:.3g}" for m in moments)
         raise UserError(f"{name}: expected no moment above the sum of the others, got {listed} kg m^2")
-    if moments[2] > (largest := most[0] * (3.0 * most[1]) ** 2 / 12.0):
+    if moments[2] > (largest := 4.0 * most[0] * most[1] ** 2):
         raise UserError(f"{name}: expected moments of at most {largest:.3g} kg m^2, got {moments[2]:.3g}")
     return tensor
 

@@ -1,6 +1,7 @@
 """Scores of groups of trainings by their last evaluation; a group has all seeds of one setting."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,7 +101,7 @@ def at_edges(grouped: Grouped) -> list[str]:
         settings = [g for g in grouped.values() if g[0].algo == algo]
         best = max(settings, key=lambda g: by.sign * float(interquartile_mean(scores(g, by.key))))[0].settings
         for key, value in ((k, v) for k, v in best.items() if k.startswith(("algo.", "reward."))):
-            tried = [x for x in {g[0].settings.get(key) for g in settings} if x is not None and is_number(x)]
+            tried: set[Any] = {g[0].settings.get(key) for g in settings if is_number(g[0].settings.get(key))}
             if len(tried) > 2 and value in (min(tried), max(tried)):
                 lines.append(edge(f"best setting of {algo}", key, value, value == max(tried)))
     return lines
