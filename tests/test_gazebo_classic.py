@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import conf
+from test_gazebo import agree
 
 from r2s.engines import gazebo_classic
-from r2s.engines.dart import DartEngine
 from r2s.engines.episodes import EngineArms
 from r2s.engines.gazebo_classic import PHYSICS, ROOT, GazeboClassicEngine, gzserver
 from r2s.engines.installed import installed
@@ -21,17 +21,11 @@ from r2s.learning.evaluate import fixed_episodes, make_evaluation
 from r2s.learning.policy import make_policy
 from r2s.learning.randomization import UniformRandomization
 from r2s.physics.dynamics import nominal_dynamics
-from r2s.physics.robot import load_robot
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import rollout
 
 # rad, rad/s after 0.1 s: DART to round-off; ODE keeps the links together only within its tolerance
 APART = {"dart": (1e-9, 1e-8), "ode": (1e-4, 5e-2)}
-
-
-@pytest.fixture(scope="module")
-def panda():
-    return load_robot(**conf("robot/panda"))
 
 
 @pytest.fixture(scope="module")
@@ -54,17 +48,7 @@ def test_steps_resets_and_commands_are_those_of_dart(server, panda, dynamics, ph
     """Also with rotors, which SDF cannot represent; commands are clipped; the server ends with the engine."""
     dynamics = replace(dynamics, armature=rotors * panda.tau_max)
     gazebo = GazeboClassicEngine(panda, dynamics, physics)
-    dart = DartEngine(panda, gravity=False, inertias=dynamics.inertia, armature=dynamics.armature)
-    rng = np.random.default_rng(0)
-    for _ in range(2):
-        q, dq = panda.q_home + rng.uniform(-0.2, 0.2, 7), rng.uniform(-0.3, 0.3, 7)
-        for engine in (gazebo, dart):
-            engine.reset(q, dq)
-        for tau in rng.uniform(-0.05, 0.05, (100, 7)) * panda.tau_max:
-            now = [engine.step(tau) for engine in (gazebo, dart)]
-        for of_gazebo, of_dart, apart in zip(*now, APART[physics], strict=True):
-            np.testing.assert_allclose(of_gazebo, of_dart, atol=apart)
-        assert np.abs(of_dart - dq).max() > 0.05  # rad/s: it moves
+    agree(gazebo, panda, dynamics, APART[physics])
     states = []
     for share in (1.0, 10.0):
         gazebo.reset(panda.q_home, np.zeros(7))
@@ -72,7 +56,7 @@ def test_steps_resets_and_commands_are_those_of_dart(server, panda, dynamics, ph
     if physics == "dart":  # ODE's solver starts from its last solution
         np.testing.assert_array_equal(*states)
     process = gazebo._server
-    del gazebo, engine
+    del gazebo
     gc.collect()
     assert process.poll() is not None
 

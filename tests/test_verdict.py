@@ -114,6 +114,9 @@ def test_a_late_signal_is_measured(robot, log):
     found = lines(judged(robot, replace(log, dq=late(log.dq))))["lateness of dq"]
     assert found.verdict == WARN
     np.testing.assert_allclose(found.values["dq_late_s"], LATE_S, atol=1e-3)
+    motor = log_of(robot, "motor")
+    found = lines(judged(robot, replace(motor, dq=late(motor.dq))))["lateness of dq"]
+    assert (found.verdict, "r2s corrects it" in found.found) == (PASS, True)
     found = lines(judged(robot, replace(log, tau=late(log.tau))))["lateness of tau"]
     assert found.verdict == WARN
     assert found.values["tau_late_s"] == pytest.approx(LATE_S, abs=1e-3)

@@ -20,11 +20,12 @@ from r2s.identification.settings import Settings
 from r2s.identification.terms import scaled_prior
 from r2s.physics.dynamics import Dynamics, with_family
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 STEPS, FTOL = 6, 1e-2  # Jacobians between two reweightings of the fit, and its relative gain at the end
 Z = 1.96  # standard deviations of half a 95 % interval
-USED_S, PIECE_S = 120.0, 10.0  # s of a longer recording that are used, in evenly spread pieces of this length
+USED_S = 120.0  # s of a longer recording that are used
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     Raises:
         UserError: no trajectory is long enough, or a setting does not fit the arm.
     """
-    used = _some(recording)
+    used = spread(recording, USED_S)
     problem = torque_problem(robot, nominal, used, settings)
     space = problem.space
     u = LeastSquares(STEPS, FTOL, level="torque")(problem, problem.start, lambda row: None)
@@ -93,12 +94,3 @@ def _lateness(problem: Problem, u: np.ndarray) -> tuple[float, float]:
     square = max(float(own @ own), 1e-12)
     late = float(own @ r) / square
     return (-late if data.commanded else late), square**-0.5
-
-
-def _some(recording: Recording) -> Recording:
-    """Return evenly spread pieces of a long recording, USED_S in total."""
-    if recording.duration <= USED_S:
-        return recording
-    t = np.arange(len(recording.t)) / len(recording.t) * recording.duration  # trajectories may share a clock
-    pieces = round(USED_S / PIECE_S)
-    return recording.select((t % (recording.duration / pieces)) < PIECE_S)

@@ -11,6 +11,7 @@ from r2s.errors import UserError, nearest
 from r2s.excitation.information import COARSE_HZ, NOISE
 from r2s.identification.expected_width import Z
 from r2s.identification.identify import STANDSTILL
+from r2s.identification.posterior import FLAT
 from r2s.identification.problem import Problem
 from r2s.identification.residuals.planned_motion import PlannedMotion
 from r2s.identification.residuals.torque_residual import STEP, TorqueResidual
@@ -21,7 +22,6 @@ from r2s.physics.dynamics import Dynamics, with_family
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
 
-FLAT = 12.0  # information of the bounds of a flat prior (posterior.py)
 MOST_ROWS = 200  # samples of a motion in a search: with more of them, the order of two motions hardly changes
 
 

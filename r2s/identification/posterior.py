@@ -8,6 +8,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 DRAWS = 512  # of the joint distribution
+FLAT = 12.0  # information of a flat prior on the unit cube: its bounds leave a variance of 1/12
 LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
 
 
@@ -79,8 +80,7 @@ def _sums(problem: Linearized, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
             score[block] += j[some].T @ r[some]
         counts = j.any(1)  # padding rows have neither a residual nor a slope
         square, seen = square + float((r[counts] ** 2).sum()), seen + int(counts.sum())
-    # a flat prior has no row; the bounds alone leave a variance of 1/12
-    prior += np.diag(np.where(prior.any(0), 0.0, 12.0))
+    prior += np.diag(np.where(prior.any(0), 0.0, FLAT))  # a flat prior has no row
     return gram, score, prior, float(np.sqrt(max(1.0, square / max(seen, 1))))
 
 

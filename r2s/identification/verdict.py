@@ -188,8 +188,9 @@ def _late_speed(r: Recording, judged: Judged | None) -> Line:
     values = {"dq_late_s": late}
     if np.nanmax(np.abs(late)) < max(LATE_S, 0.5 / r.rate_hz):
         return Line(check, PASS, found, values=values)
-    if r.torque == "commanded":
-        return Line(check, PASS, f"{found}; with commanded torque r2s takes the slope of q", values=values)
+    handled = {"commanded": "r2s takes the slope of q", "motor": "r2s corrects it"}  # dq_lateness
+    if r.torque in handled:
+        return Line(check, PASS, f"{found}; with {r.torque} torque {handled[r.torque]}", values=values)
     return Line(check, WARN, found, "a filter? leave dq out of the file, and r2s derives it from q", values)
 
 

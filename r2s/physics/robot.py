@@ -189,15 +189,7 @@ def load_robot(
         UserError: missing or broken file, not a serial arm of hinge joints, no limits or no end effector.
     """
     path = located(mjcf or PANDA)
-    if not path.is_file():
-        others = [p.name for p in path.parent.glob("*.*")]
-        raise UserError(f"robot.mjcf: no such file: {path}{nearest(path.name, others)}")
-    spec, fastest = read_spec(path, lock)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise UserError(f"robot.mjcf: {path} is not a valid model: {' '.join(str(error).split())}") from None
-    check_arm(model, path)
+    spec, model, fastest = _read(path, lock)
     down = gravity_of(model, path) if gravity is None else per_joint("robot.gravity", gravity, 3, "x, y and z")
     n, site = model.njnt, _end_effector(model, ee, path)
 
@@ -214,6 +206,7 @@ def load_robot(
     unset = [joint.name for joint in spec.joints if joint.info == NO_RANGE and (q_min is None or q_max is None)]
     check_limits(model, path, low, high, home, torque, unset)
     check_masses(model, path, down, home, torque)
+    own_armature, damping = rotors(model)
     return Robot(
         name=spec.modelname or path.stem,
         mjcf=path.resolve(),
@@ -229,13 +222,27 @@ def load_robot(
         mass=model.body_mass[model.jnt_bodyid].copy(),
         com=model.body_ipos[model.jnt_bodyid].copy(),
         inertia=_tensors(model),
-        armature=each("armature", armature, rotors(model)[0]),
-        damping=rotors(model)[1],
+        armature=each("armature", armature, own_armature),
+        damping=damping,
         frictionloss=model.dof_frictionloss.copy(),
         tool=None if tool is None else load_tool(tool),
         lock=dict(lock or {}),
         payload_max=_payload_max(model, site, torque, payload_max, payload_far),
     )
+
+
+def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel, np.ndarray]:
+    """Return the file's spec, its checked model, and velocity limits, infinite where it has none."""
+    if not path.is_file():
+        others = [p.name for p in path.parent.glob("*.*")]
+        raise UserError(f"robot.mjcf: no such file: {path}{nearest(path.name, others)}")
+    spec, fastest = read_spec(path, lock)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise UserError(f"robot.mjcf: {path} is not a valid model: {' '.join(str(error).split())}") from None
+    check_arm(model, path)
+    return spec, model, fastest
 
 
 def _payload_max(

@@ -19,7 +19,7 @@ from r2s.tasks.rewards import Reward
 from r2s.tasks.task import State
 
 MARGIN_RAD = 0.1  # rad, from a position limit: where the safety filter starts to fade the torque
-PATIENCE = 50_000  # env steps in which a multiplier grows by 1 at twice its limit; a tenth of a minute of training
+PATIENCE = 50_000  # env steps in which a multiplier grows by 1 at twice its limit, as in rewards.py
 MOST = 50.0  # largest multiplier: a cost that no policy holds may not silence the reward for the rest of the training
 
 

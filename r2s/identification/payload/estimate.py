@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from r2s.errors import UserError
 from r2s.identification.arm_uncertainty import Arm
-from r2s.identification.payload.body import BodySpace
+from r2s.identification.payload.body import HEAVIEST, BodySpace
 from r2s.identification.payload.problem import REACH, LoadedTorque, Rows
 from r2s.identification.posterior import posterior
 from r2s.identification.result import EDGE, SHARPER
@@ -157,7 +157,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     u = fit.u
     if u[0] > 1 - EDGE:
         raise UserError(
-            f"data.loaded: the torque wants a payload above {high[0]:g} kg, HEAVIEST times robot.payload_max="
+            f"data.loaded: the torque wants a payload above {high[0]:g} kg, {HEAVIEST:g} times robot.payload_max="
             f"{fit.space.heaviest:g}; is it of {loaded.arm.robot.name}, and the calibration of the unloaded arm?"
         )
     drawn = np.clip(u + posterior(fit, u, seed).steps, 0.0, 1.0)[:, :10] * (high - low) + low

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from r2s.identification.arm_uncertainty import Arm, arm_directions, sliding_sign
+from r2s.identification.identify import STANDSTILL
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.physics.dynamics import Dynamics
@@ -18,7 +19,6 @@ from r2s.recordings.recording import Recording
 # offset, of the joint's friction; one of link-side sensors, of the largest torque (the prior of conf/identify)
 FRICTION_DRIFT, OFFSET_DRIFT, SENSOR_DRIFT = 0.07, 0.02, 7e-4
 LOAD_FRICTION = 0.015  # Nm of friction per Nm of load, of gears (adaptation/tuning.py: PAYLOAD_FRICTION)
-STANDSTILL = 0.02  # rad/s, of commanded torque, as in identify.py
 RATE_HZ, LONG_S = 100.0, 240.0  # rows per second; of longer recordings fewer
 REACH = 10.0  # standard deviations of an arm direction within the unit cube
 
