@@ -16,9 +16,9 @@ ROOMS = [
     *("errors", "files", "progress", "provenance", "runs", "compiled"),
     *("physics", "control", "recordings", "excitation", "identification", "adaptation"),
     *("tasks", "learning", "engines", "arm", "reporting", "export"),
-    *("stages", "override_checks", "commands", "cli", "notebook", "__main__"),
+    *("stages", "override_checks", "commands", "cli", "envs", "notebook", "__main__"),
 ]
-SEES_A_CONFIG = ("stages", "override_checks", "commands", "cli", "__main__")
+SEES_A_CONFIG = ("stages", "override_checks", "commands", "cli", "envs", "__main__")
 MODULES = sorted((ROOT / "r2s").rglob("*.py"))
 MOST_LINES = 400
 FRONT_DOOR_LINES = 120

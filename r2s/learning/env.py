@@ -40,6 +40,7 @@ class TaskEnv(EnvBase):
     """
 
     batch_locked = True
+    arms_type: type[VectorArms] = VectorArms
 
     def __init__(
         self,
@@ -58,7 +59,7 @@ class TaskEnv(EnvBase):
         own, of_goals, of_noise = np.random.SeedSequence(seed).spawn(3)
         self.rng = np.random.default_rng(own)
         first = self._drawn(nsim)
-        self.arms = VectorArms(robot, task, first, nsim, nthread, seed=of_noise)
+        self.arms = self.arms_type(robot, task, first, nsim, nthread, seed=of_noise)
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises for a task with other terms
         self.weights = self.reward.weights(task, 0.0)
@@ -172,7 +173,7 @@ class TaskEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].numpy().astype(np.float64)
         if isinstance(self.draw, Pushes):
-            self.arms.push(self.draw.forces(self.rng, self.nsim))
+            self.arms.push(self._forces(self.draw))
         state = self.arms.step(self.control.command(action, self.task, self._now.t, self.goal))
         self._now = state
         self._count += 1
@@ -185,6 +186,10 @@ class TaskEnv(EnvBase):
         after = self._tensors(observation, terms, distance, self._count >= self.task.steps)
         after["reward"] = torch.from_numpy((terms @ self.weights)[:, None].astype(np.float32))
         return after
+
+    def _forces(self, draw: Pushes) -> np.ndarray:
+        """Return (nsim, n) Nm, the torques of the next control step."""
+        return draw.forces(self.rng, self.nsim)
 
     def _set_seed(self, seed: int | None) -> None:
         self.rng = np.random.default_rng(seed)

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+CLIP = 10.0  # largest normalised observation, in standard deviations
+
 
 class Normalizer(nn.Module):
     """(x - mean) / std with fixed mean and std (d,)."""
@@ -20,8 +22,8 @@ class Normalizer(nn.Module):
         self.register_buffer("std", std.float())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return normalized x, clipped to 10 standard deviations."""
-        return ((x - self.mean) / self.std).clamp(-10.0, 10.0)
+        """Return normalized x, clipped to CLIP."""
+        return ((x - self.mean) / self.std).clamp(-CLIP, CLIP)
 
 
 class Actor(nn.Module):

@@ -1,0 +1,195 @@
+"""A task as Gymnasium environments: `ArmVectorEnv`, a batch of simulated arms, and `ArmEnv`, one of them.
+
+Each arm of a batch has its own random generator, so that arm i goes through the episodes of a single arm with its
+seed. Observations are normalised with the scales of the task, as in the policies of r2s.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+from tensordict import TensorDict
+
+from r2s.errors import UserError, choices
+from r2s.learning.env import TaskEnv
+from r2s.learning.networks import CLIP
+from r2s.learning.randomization import Draw, Pushes
+from r2s.learning.vector_arms import ALL, VectorArms
+from r2s.physics.robot import Robot
+from r2s.tasks.rewards import Reward
+from r2s.tasks.task import State, Task, observation_scale
+
+SEEDS = 2**63  # of the episodes of an arm
+
+
+class SeparateArms(VectorArms):
+    """`VectorArms` with a generator of sensor noise per arm, `streams`, which also gives the torques of `Pushes`."""
+
+    def seed(self, seed: int | np.random.SeedSequence) -> None:
+        """Restart the sensor noise of all arms."""
+        super().seed(seed)
+        self.streams = self._rng.spawn(self.width)
+
+    def _sense(self, at: np.ndarray | slice = ALL) -> None:
+        if self._sigma.any():
+            for i in np.arange(self.width)[at]:
+                self._noise[i] = self._sigma[i] * self.streams[i].standard_normal(self.robot.n)
+
+
+class SeparateEnv(TaskEnv):
+    """`TaskEnv` whose arm i takes the seeds of its episodes from `rngs[i]`."""
+
+    arms_type = SeparateArms
+    arms: SeparateArms
+    rngs: list[np.random.Generator]
+
+    def _restart(self, ids: np.ndarray) -> State:
+        for i in ids:
+            self.rng = self.arms.streams[i] = np.random.default_rng(self.rngs[i].integers(SEEDS))
+            super()._restart(np.array([i]))
+        return self.arms.read()
+
+    def _forces(self, draw: Pushes) -> np.ndarray:
+        return np.concatenate([draw.forces(stream, 1) for stream in self.arms.streams])
+
+
+class ArmVectorEnv(gym.vector.VectorEnv):
+    """`num_envs` simulated arms at a task, stepped together.
+
+    Observations (num_envs, d) float32 are in standard deviations of the task, clipped to 10; actions (num_envs, a)
+    are clipped to [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m. Episodes are truncated
+    after `task.steps` steps.
+
+    Args:
+        robot, task: the arm and its task. draw: domain randomization, called at every reset.
+        num_envs: number of arms. nthread: threads, 0: all cores.
+        reward: terms and weights, those of the beginning of a training until `set_progress`; None: as in `TaskEnv`.
+        autoreset_mode: NextStep, SameStep or Disabled, as in `gymnasium.vector.SyncVectorEnv`.
+
+    Raises:
+        UserError: another autoreset_mode.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: Task,
+        draw: Draw,
+        num_envs: int = 1,
+        *,
+        nthread: int = 0,
+        reward: Reward | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ):
+        try:
+            self.mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            modes = choices(mode.value for mode in AutoresetMode)
+            raise UserError(f"autoreset_mode: expected one of {modes}, got {autoreset_mode!r}") from None
+        self.env = SeparateEnv(robot, task, draw, num_envs, nthread=nthread, reward=reward)
+        self.env.rngs = [np_random()[0] for _ in range(num_envs)]
+        self.num_envs, self.ended = num_envs, np.zeros(num_envs, dtype=bool)
+        self.metadata = {"autoreset_mode": self.mode, "render_modes": [], "render_fps": task.ctrl_hz}
+        self.mean, self.std = observation_scale(task, robot)
+        one = (len(self.mean),), (self.env.control.action_dim,)
+        spaces = [gym.spaces.Box(-x, x, shape, np.float32) for x, shape in zip((CLIP, 1.0), one, strict=True)]
+        self.single_observation_space, self.single_action_space = spaces
+        self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
+
+    def set_progress(self, progress: float) -> None:
+        """Set the weights of the reward to those at this share, 0 to 1, of a training."""
+        self.env.weights = self.env.reward.weights(self.env.task, progress)
+
+    def normalized(self, observation: np.ndarray) -> np.ndarray:
+        """Return observations (m, d) of r2s as this environment gives them."""
+        return ((observation - self.mean) / self.std).clip(-CLIP, CLIP).astype(np.float32)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes of all arms, or of the arms of `options["reset_mask"]` (num_envs,) bool.
+
+        seed: of arm 0, with seed + i for arm i, or a list, one for each arm; None: the arms' generators go on.
+        """
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise UserError(f"reset_mask: expected {self.num_envs} booleans, got {mask.dtype} of shape {mask.shape}")
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+        if seeds is not None and len(seeds) != self.num_envs:
+            raise UserError(f"seed: expected a number or {self.num_envs} of them, got {len(seeds)}")
+        for i, one in enumerate(seeds or ()):
+            if one is not None and mask[i]:
+                self.env.rngs[i] = np_random(one)[0]
+        return self._restarted(mask)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Run one control period.
+
+        Raises:
+            UserError: actions of another shape, or in the mode Disabled of an arm whose episode has ended.
+            FloatingPointError: an action is not finite.
+        """
+        waiting = self.ended.copy()  # arms that the mode NextStep resets in this step; their physics runs unseen
+        if waiting.any() and self.mode == AutoresetMode.DISABLED:
+            raise UserError(f"step: the episode of arm {waiting.argmax()} has ended; reset it first")
+        action = np.asarray(actions, dtype=np.float32)
+        if action.shape != self.action_space.shape:
+            raise UserError(f"step: expected actions of shape {self.action_space.shape}, got {action.shape}")
+        action = np.where(waiting[:, None], np.float32(0.0), action.clip(-1.0, 1.0))
+        after = self.env._step(TensorDict({"action": torch.from_numpy(action)}, [self.num_envs]))
+        reward, terminated, truncated = (after[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
+        reward, terminated, truncated = reward * ~waiting, terminated & ~waiting, truncated & ~waiting
+        observation, info = self._presented(after)
+        over = terminated | truncated
+        if self.mode == AutoresetMode.SAME_STEP and over.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(over):
+                final[i] = observation[i]
+            last = {"distance": np.where(over, info["distance"], 0.0), "_distance": over}
+            observation, info = self._restarted(over)
+            info |= {"final_obs": final, "_final_obs": over, "final_info": last, "_final_info": over}
+        elif waiting.any():
+            observation, info = self._restarted(waiting)
+        if self.mode != AutoresetMode.SAME_STEP:
+            self.ended = over
+        return observation, reward.astype(np.float64), terminated, truncated, info
+
+    def _restarted(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes of the arms of `mask`; return observations and info of all arms."""
+        self.env._restart(np.flatnonzero(mask))
+        self.ended[mask] = False
+        return self._presented(self.env.read())
+
+    def _presented(self, present: TensorDict) -> tuple[np.ndarray, dict[str, Any]]:
+        distance = present["distance"][:, 0].numpy().astype(np.float64)
+        info = {"distance": distance, "_distance": np.ones(self.num_envs, dtype=bool)}
+        return self.normalized(present["observation"].numpy()), info
+
+
+class ArmEnv(gym.Env):
+    """One simulated arm: `ArmVectorEnv` with a single arm and without automatic resets; arguments as there."""
+
+    def __init__(self, robot: Robot, task: Task, draw: Draw, *, reward: Reward | None = None):
+        self.batch = ArmVectorEnv(robot, task, draw, nthread=1, reward=reward, autoreset_mode=AutoresetMode.DISABLED)
+        self.metadata = {"render_modes": [], "render_fps": task.ctrl_hz}
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+        self.set_progress = self.batch.set_progress
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start a new episode; seed: of it and of those that follow."""
+        super().reset(seed=seed)
+        self.batch.env.rngs = [self.np_random]
+        observation, info = self.batch.reset()
+        return observation[0], {"distance": float(info["distance"][0])}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Run one control period, see `ArmVectorEnv.step`."""
+        observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
+        ends = bool(terminated[0]), bool(truncated[0])
+        return observation[0], float(reward[0]), *ends, {"distance": float(info["distance"][0])}
