@@ -7,6 +7,7 @@ Parts, each doing only what is missing:
     python benchmarks/tracking.py ablation VARIANT SEED ...   previews, randomizations and pure torque, seed 0
     python benchmarks/tracking.py policy FOLDER VARIANT SEED  any training's policy on a twin
     python benchmarks/tracking.py                             the table of all rows
+    python benchmarks/tracking.py page                        the same in benchmarks/results/tracking.md
 VARIANT is rigid or elastic. Identifications and trainings go through run.py into run folders named track_*; each row
 is a file of runs/bench/tracking/, so that parts can run at the same time. Seeds 0-3 are for development; seeds from
 100 (rigid) and from 200 (elastic) for judging.
@@ -22,7 +23,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import NEW, OLD, ROBOT, ROOT, default_task, load_training, markdown_rows
+from common import (
+    NEW,
+    OLD,
+    RESULTS,
+    ROBOT,
+    ROOT,
+    default_task,
+    load_training,
+    markdown_rows,
+    put_section,
+    stamp,
+)
 
 from r2s.arm.interface import Arm
 from r2s.arm.policy_runner import PolicyRunner
@@ -177,8 +189,8 @@ def interval(rows: pd.DataFrame) -> str:
     return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
 
 
-def report() -> None:
-    """Print the table: a row per group of arms and controller."""
+def report() -> str:
+    """Return the table: a row per group of arms and controller."""
     table = pd.DataFrame([json.loads(path.read_text()) for path in sorted(ROWS.glob("*.json"))])
     table["what"] = table["what"].str.replace(r", seed \d+$", "", regex=True)
     rows = {}
@@ -192,7 +204,7 @@ def report() -> None:
         cells |= {f"< {k} mm, %": f"{100 * part[f'within_{k}mm'].mean():.1f}" for k in (2, 5, 10)}
         cells |= {"torque, Nm": f"{part['torque_rms_Nm'].mean():.2f}", "jerk, m/s^3": f"{part['jerk'].mean():.0f}"}
         rows[f"{group}: {what}"] = cells | {"stops": f"{part['stops'].sum():.0f}"}
-    print(markdown_rows(rows))
+    return markdown_rows(rows)
 
 
 if __name__ == "__main__":
@@ -208,6 +220,9 @@ if __name__ == "__main__":
         case ["policy", folder, variant, seed]:
             policy(folder, variant, int(seed))
         case []:
-            report()
+            print(report())
+        case ["page"]:
+            words = [stamp("python benchmarks/tracking.py learned VARIANT SEED ..."), report()]
+            put_section(RESULTS / "tracking.md", "Policies on judging twins", words)
         case _:
             raise SystemExit(__doc__)

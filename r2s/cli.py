@@ -20,7 +20,7 @@ from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replaye
 
 STOPPED = 3  # exit status of a run that a stopped arm ended
 INTERRUPTED = 130
-RESUMABLE = ("identify", "train", "tune")
+RESUMABLE = ("identify", "train", "tune", "results")
 PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
 ABSENT = "not there"

@@ -97,6 +97,8 @@ def _key_figures(folder: Path, stage: str, summary: Mapping[str, Any]) -> str:
     if stage == "excite":
         known = [x["identifiable"] for x in summary["expected_width95"].values()]
         return f"{summary['seconds']:.1f} s of motion for {sum(known)} of {len(known)} values"
+    if stage == "results":
+        return f"{summary['equal']} of {summary['cells']} cells equal, {summary['beyond intervals']} beyond intervals"
     if stage == "train":
         return _in_words(folder, summary["best"])
     if stage == "compare":

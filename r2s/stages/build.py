@@ -15,7 +15,7 @@ from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
 DRIVE_KEYS = ("soft_start_s", "live")  # of conf/arm; the policy runner reads them, not the arm
-STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate", "excite")
+STAGES = ("train", "identify", "transfer", "compare", "pipeline", "tune", "estimate", "excite", "results")
 COMMON = (
     *("stage", "root", "name", "skip_completed", "resume", "experiment", "grid", "seed", "threads", "tracker"),
     "trust",

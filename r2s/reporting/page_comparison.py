@@ -1,0 +1,97 @@
+"""Two versions of a page of benchmarks/results: which cells of its tables differ, and whether by more than intervals.
+
+A cell is found by section, row and column, so that added rows and changed paragraphs do not matter.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+import pandas as pd
+
+NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
+INTERVAL = re.compile(rf"\[({NUMBER}),\s*({NUMBER})\]")
+MISSING = "not made again"
+VERDICTS = ("equal", "within intervals", "beyond intervals", "without interval", MISSING, "new")
+Cell = tuple[str, str, str]  # section, row, column
+
+
+def table_cells(page: str) -> dict[Cell, str]:
+    """Return {(section, row, column): cell} of the tables of a markdown page; equal names get a number."""
+    cells: dict[Cell, str] = {}
+    for section, head, rows in _tables(page):
+        columns, names = _numbered(head), _numbered([row[0] for row in rows])
+        for name, row in zip(names, rows, strict=True):
+            cells |= {(section, name, c): x for c, x in zip(columns[1:], row[1:], strict=False)}
+    return cells
+
+
+def without_rows(page: str) -> str:
+    """Return a page whose tables have their heads only; a table that nobody writes again then shows it."""
+    kept, in_table = [], False
+    for line in page.splitlines():
+        rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
+        if rule or not (in_table and line.startswith("|")):
+            kept.append(line)
+        in_table = rule or (in_table and line.startswith("|"))
+    return "\n".join(kept) + "\n"
+
+
+def compare_pages(before: str, now: str) -> pd.DataFrame:
+    """Return a row (section, row, column, committed, now, verdict, change) per cell of either page.
+
+    verdict is one of VERDICTS. A cell with intervals differs if one of them does not overlap with its successor.
+    change is the largest relative change of a number of the cell; NaN where the numbers cannot be paired.
+    """
+    old, new = table_cells(before), table_cells(now)
+    rows = []
+    for key in [*old, *(key for key in new if key not in old)]:
+        a, b = old.get(key), new.get(key)
+        verdict = "new" if a is None else MISSING if b is None else _verdict(a, b)
+        rows.append((*key, a or "", b or "", verdict, _change(a or "", b or "")))
+    return pd.DataFrame(rows, columns=["section", "row", "column", "committed", "now", "verdict", "change"])
+
+
+def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Yield section, head and rows of each table."""
+    section, block = "", []
+    for line in [*page.splitlines(), ""]:
+        if line.startswith("|"):
+            block.append([cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]])
+            continue
+        if len(block) > 1:
+            yield section, block[0], block[2:]
+        block = []
+        if line.startswith("#"):
+            section = line.lstrip("# ")
+
+
+def _numbered(names: list[str]) -> list[str]:
+    """Return names of which the second of equal ones ends with (2)."""
+    seen: Counter[str] = Counter()
+    numbered = []
+    for name in names:
+        seen[name] += 1
+        numbered.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return numbered
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(x.replace(",", "")) for x in re.findall(NUMBER, text)]
+
+
+def _verdict(before: str, now: str) -> str:
+    if before == now:
+        return "equal"
+    pairs = [[(_numbers(m[0])) for m in INTERVAL.finditer(text)] for text in (before, now)]
+    if not pairs[0] or len(pairs[0]) != len(pairs[1]):
+        return "without interval"
+    overlap = all(a[0] <= b[1] and b[0] <= a[1] for a, b in zip(*pairs, strict=True))
+    return "within intervals" if overlap else "beyond intervals"
+
+
+def _change(before: str, now: str) -> float:
+    a, b = _numbers(before), _numbers(now)
+    if not a or len(a) != len(b):
+        return float("nan")
+    return max(abs(y - x) / max(abs(x), abs(y), 1e-300) for x, y in zip(a, b, strict=True))

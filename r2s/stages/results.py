@@ -1,0 +1,110 @@
+"""stage=results: a page of benchmarks/results made again in a clean clone of this commit, beside the committed page.
+
+`python run.py -m +experiment=results` makes all pages that docs/results.md cites.
+"""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from r2s.errors import UserError, choices, nearest
+from r2s.stages.build import console, open_run
+from r2s.stages.parts import plain
+
+WHY: dict[str, str] = {}
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = Path("benchmarks/results")
+CLONE = "checkout"  # in the run folder
+
+
+def reads(cfg):
+    """Return the keys of the config that this stage reads."""
+    return {"results"}
+
+
+def commands_of(settings):
+    """Return the commands (lists of words) of `results.page`, with `results.data` put in.
+
+    Raises:
+        UserError: no such page; a page that needs data and none given; no checkout of r2s.
+    """
+    page, pages, data = (settings[k] for k in ("page", "pages", "data"))
+    if page not in pages:
+        near = nearest(str(page), pages)
+        raise UserError(f"results.page: expected one of {choices(pages)}, got {page!r}{near}")
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        raise UserError("stage=results: needs git and a checkout of r2s; an installed package has no benchmarks")
+    lines = pages[page]
+    if any("{data}" in line for line in lines):
+        if data is None:
+            raise UserError(f"results.data: {page} needs recordings that do not ship with r2s; give their folder")
+        if not Path(data).is_dir():
+            raise UserError(f"results.data: no folder {data}")
+        lines = [line.replace("{data}", shlex.quote(str(Path(data).resolve()))) for line in lines]
+    return [shlex.split(line) for line in lines]
+
+
+def results(cfg, overrides):
+    """Page -> the same page of this commit, differences.csv, report.md."""
+    from r2s.progress import Progress
+    from r2s.provenance import git
+    from r2s.reporting.page_comparison import compare_pages
+    from r2s.reporting.results import page_report
+
+    settings = plain(cfg.results)
+    commands = commands_of(settings)
+    with open_run(cfg, overrides) as run:
+        clone = run.folder / CLONE
+        path = PAGES / f"{settings['page']}.md"
+        before = cloned(clone, path)
+        if git()["dirty"]:
+            print("uncommitted changes are not part of the clone")
+        progress = Progress(settings["page"])
+        for k, words in enumerate(commands):
+            progress(k / len(commands), shlex.join(words)[:70])
+            run.memo(f"command_{k}", lambda words=words: execute(words, clone, run.folder / "log.txt"))
+        progress.close()
+        now = (clone / path).read_text()
+        (run.folder / path.name).write_text(now)
+        run.summary(page_report(console(), run, settings["page"], compare_pages(before, now)))
+    print(f"written: {run.folder}")
+
+
+def cloned(clone, path):
+    """Clone this commit unless an earlier part of the run did; return the committed page, "" for none.
+
+    The tables of the clone's page lose their rows, so that one that is not made again shows it.
+    """
+    from r2s.files import atomic_write
+    from r2s.reporting.page_comparison import without_rows
+
+    if not clone.is_dir():
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
+        page = clone / path
+        if page.is_file():
+            with atomic_write(page) as part:
+                part.write_text(without_rows(page.read_text()))
+    shown = subprocess.run(["git", "show", f"HEAD:{path}"], cwd=clone, capture_output=True, text=True, check=False)
+    return shown.stdout if shown.returncode == 0 else ""
+
+
+def execute(words, clone, log):
+    """Run `python WORDS` in the clone, whose r2s it imports; output goes to log.
+
+    Raises:
+        UserError: the command fails; its last line is in the message.
+    """
+    with open(log, "a+") as file:
+        file.write(f"$ python {shlex.join(words)}\n")
+        file.flush()
+        env = os.environ | {"PYTHONPATH": str(clone.resolve())}
+        done = subprocess.run(
+            [sys.executable, *words], cwd=clone, env=env, stdout=file, stderr=subprocess.STDOUT, check=False
+        )
+    if done.returncode:
+        *_, last = log.read_text(errors="replace").splitlines()
+        raise UserError(f"{words[0]} failed ({log}): {last.removeprefix('error: ')}")
+    return {"returncode": 0}
