@@ -46,6 +46,7 @@ def files_of(*titles: str) -> dict[str, str]:
     return {text.splitlines()[0].removeprefix("# "): text for kind, text in blocks if kind != "bash"}
 
 
+@pytest.mark.slow  # the fast tests train with that task
 def test_a_task_with_its_own_action_space_goes_through_every_stage(tmp_path):
     """Eight values per action, a law and a measure of its own, a reward and a tracker from outside r2s.
 

@@ -121,7 +121,7 @@ def run(tmp_path, what, how, **env):
     return done.stdout.splitlines()[-1]
 
 
-@pytest.mark.parametrize("what", ["panda", pytest.param("fr3", marks=pytest.mark.slow), "jump"])
+@pytest.mark.parametrize("what", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("panda", "fr3")), "jump"])
 def test_a_cycle_loads_nothing(what, tmp_path):
     """In a fresh process, recordings, ramps, approaches, episodes and jumps; without `warm_up` they load."""
     assert run(tmp_path, what, "warm") == "0 []"

@@ -1,7 +1,7 @@
 """Bounded least squares on the unit cube: Levenberg-Marquardt that tries several damping factors in one batch.
 
 scipy's trust region factors the whole Jacobian by SVD at every step, which costs more than the physics (14,000 rows,
-110 columns), and tries one step at a time. benchmarks/least_squares.py compares it with MuJoCo's solver.
+110 columns), and tries one step at a time.
 """
 
 import time
