@@ -42,14 +42,15 @@ def test_a_page_equals_itself_and_paragraphs_do_not_count():
 
 
 def test_a_cell_differs_where_its_interval_does():
-    """Overlap, no overlap, no interval, a row that is gone, a row that is new; a number's relative change."""
+    """With an interval, without, by a last digit; a row that is gone, a row that is new; the relative change."""
     now = BEFORE.replace("1.0 [0.8, 1.2]", "1.1 [1.0, 1.3]").replace("2.0 [1.8, 2.2]", "4.0 [3.9, 4.1]")
-    now = now.replace("| one | 1,024 |", "| three | 7 |").replace("97", "96")
+    now = now.replace("| one | 1,024 |", "| three | 7 |").replace("97", "95").replace("99", "98")
     found = compare_pages(BEFORE, now).set_index(["section", "row", "column"])
     assert found.loc["Arms", "one", "error, mm"]["verdict"] == "within intervals"
     assert found.loc["Arms", "two", "error, mm"]["verdict"] == "beyond intervals"
     assert found.loc["Arms", "two", "error, mm"]["change"] == pytest.approx(2.1 / 3.9)  # 1.8 -> 3.9
     assert found.loc["Arms", "one", "share, %"]["verdict"] == "without interval"
+    assert found.loc["Arms", "two (2)", "share, %"]["verdict"] == "last digit"
     assert found.loc["Others", "one", "stops"]["verdict"] == MISSING
     assert found.loc["Others", "three", "stops"]["verdict"] == "new"
 

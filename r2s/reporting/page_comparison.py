@@ -12,7 +12,7 @@ import pandas as pd
 NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 INTERVAL = re.compile(rf"\[({NUMBER}),\s*({NUMBER})\]")
 MISSING = "not made again"
-VERDICTS = ("equal", "within intervals", "beyond intervals", "without interval", MISSING, "new")
+VERDICTS = ("equal", "last digit", "within intervals", "beyond intervals", "without interval", MISSING, "new")
 Cell = tuple[str, str, str]  # section, row, column
 
 
@@ -40,7 +40,8 @@ def without_rows(page: str) -> str:
 def compare_pages(before: str, now: str) -> pd.DataFrame:
     """Return a row (section, row, column, committed, now, verdict, change) per cell of either page.
 
-    verdict is one of VERDICTS. A cell with intervals differs if one of them does not overlap with its successor.
+    verdict is one of VERDICTS; "last digit": each number by at most one unit of its last digit. A cell with intervals
+    differs if one of them does not overlap with its successor.
     change is the largest relative change of a number of the cell; NaN where the numbers cannot be paired.
     """
     old, new = table_cells(before), table_cells(now)
@@ -80,9 +81,19 @@ def _numbers(text: str) -> list[float]:
     return [float(x.replace(",", "")) for x in re.findall(NUMBER, text)]
 
 
+def _last_digits(text: str) -> list[float]:
+    """Return the value of one unit of the last digit of each number."""
+    parts = [x.lower().partition("e") for x in re.findall(NUMBER, text)]
+    return [10.0 ** (int(power or 0) - len(number.partition(".")[2])) for number, _, power in parts]
+
+
 def _verdict(before: str, now: str) -> str:
     if before == now:
         return "equal"
+    (a, b), units = (_numbers(before), _numbers(now)), _last_digits(before)
+    words = [re.sub(NUMBER, "", text) for text in (before, now)]
+    if words[0] == words[1] and all(abs(x - y) <= 1.001 * u for x, y, u in zip(a, b, units, strict=True)):
+        return "last digit"
     pairs = [[(_numbers(m[0])) for m in INTERVAL.finditer(text)] for text in (before, now)]
     if not pairs[0] or len(pairs[0]) != len(pairs[1]):
         return "without interval"

@@ -51,7 +51,8 @@ def _shown(cells: pd.DataFrame) -> pd.DataFrame:
     order = cells.assign(rank=cells["verdict"].map({"beyond intervals": 0, "without interval": 1}).fillna(2))
     order = order.sort_values(["rank", "change"], ascending=[True, False])
     change = order["change"].map(lambda x: "" if pd.isna(x) else f"{100 * x:.0f} %")
-    names = [": ".join(filter(None, key)) for key in zip(order["section"], order["row"], strict=True)]
+    several = cells["section"].nunique() > 1
+    names = [f"{s}: {row}" if several else row for s, row in zip(order["section"], order["row"], strict=True)]
     table = order[["column", "committed", "now", "verdict"]].assign(change=change)
-    table.index = pd.Index(names, name="section: row")
+    table.index = pd.Index(names, name="section: row" if several else "row")
     return table
