@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import Stopped, UserError, check_number, choices, nearest
-from r2s.override_checks import COMMANDS, check_overrides
+from r2s.override_checks import COMMANDS, check_overrides, extended
 from r2s.stages.build import GROUP, STAGES
 from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replayed, run_config
 
@@ -42,6 +42,7 @@ def main():
 
             return run_command(sys.argv[1:])
         sys.path.append(os.getcwd())  # a user's parts are modules of the working folder
+        sys.argv[1:] = extended(sys.argv[1:])
         parser = get_args_parser()
         parser.error = lambda message: sys.exit(fail(f"{message}; see {PROGRAM} --help"))  # type: ignore[method-assign]
         run_hydra(parser.parse_args())

@@ -156,12 +156,12 @@ def composed(command: str, words: Sequence[str], groups: Sequence[str]) -> Any:
     """
     from hydra import compose, initialize_config_dir
 
-    from r2s.override_checks import check_overrides
+    from r2s.override_checks import check_overrides, extended
     from r2s.stages.build import CONF
 
     if other := [w for w in words if w.split("=")[0].split(".")[0] not in groups]:
         raise UserError(f"{command}: expected {choices(f'{g}=' for g in groups)} and their keys, got '{other[0]}'")
-    check_overrides(words := ["stage=identify", *words], None)
+    check_overrides(words := ["stage=identify", *extended(words)], None)
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         return compose("config", words)
 

@@ -13,6 +13,7 @@ from r2s.stages.run_config import PROGRAM
 COMMANDS = ("look", "list", "export", "check", "convert", "engines")
 OPTIONAL = ("tracker", "experiment")  # groups that may have no option
 EXTENSIBLE = ("tune.space",)  # keys that + may add to
+STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*\.\w+=")
 NO_OPTION = "base"  # a file that the options of a group share
 SEARCHPATH = "hydra.searchpath"
 # old names of keys and values, with the new ones
@@ -41,6 +42,11 @@ RENAMED = {
 PLACES = ("hydra.sweep", "hydra.run", "hydra.output_subdir", "hydra.job.chdir")
 PLAIN = re.compile(r"[A-Za-z0-9_/\-\\+.$%*@?|: ]")  # what Hydra's grammar takes in a value without quotes
 SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweeps`
+
+
+def extended(words: Sequence[str]) -> list[str]:
+    """Return the words, with ++ before what is stated of a parameter, a key that no file of conf/ has."""
+    return [f"++{w}" if STATED.match(w) else w for w in words]
 
 
 def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool = False) -> None:

@@ -6,7 +6,7 @@ search=ga on the residual of eq. (8).
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -21,6 +21,7 @@ from r2s.identification.friction.presliding import NAME as PRESLIDING
 from r2s.identification.friction.presliding import Presliding, estimate_presliding
 from r2s.identification.friction.static_friction import StaticFriction
 from r2s.identification.friction.stiction import choose_stiction
+from r2s.identification.known import Known
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.posterior import posterior
 from r2s.identification.prediction import REPLAYED_S
@@ -30,6 +31,7 @@ from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.residuals.windows import cut_windows
 from r2s.identification.result import IdentificationResult, conclude
 from r2s.identification.settings import Settings
+from r2s.identification.stated import check_stated, stated_prior
 from r2s.identification.structure.backward_elimination import eliminate_terms
 from r2s.identification.structure.cross_validation import CrossValidation
 from r2s.identification.structure.family_selection import compare_families
@@ -120,7 +122,7 @@ class State:
     def cross_validation(self) -> CrossValidation:
         """Data and settings of the selection steps."""
         s, data = self.settings, (self.robot, self.nominal, spread(self.recording, SELECTED_S))
-        return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add)
+        return CrossValidation(*data, s.bounds, self.prior, s.folds, s.cutoff_hz, self.history.add, s.stated)
 
     def fitted(self) -> Dynamics:
         """Return the dynamics of u."""
@@ -159,6 +161,7 @@ def identify(
         UserError: the recording does not fit the arm or hardly moves.
     """
     check_motion(robot, recording)
+    check_stated(settings.stated, robot.n)
     prior, history = scaled_prior(settings.prior, robot, recording, nominal), History(report, memo)
     s = State(robot, nominal, recording, searches, settings, ramps, prior, history, settings.terms)
     for step in STEPS:
@@ -203,7 +206,7 @@ def prune_terms(s: State) -> State:
 def formulate(s: State) -> State:
     """Set up the parameter space, the residuals and the problem."""
     how, memory = s.settings, s.nominal.family.has_memory
-    space = search_space(s.robot, s.nominal, how.bounds, s.terms, s.recording)
+    space = search_space(s.robot, s.nominal, how.bounds, s.terms, s.recording, how.stated)
     s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # repetitions are one block
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
@@ -219,8 +222,19 @@ def formulate(s: State) -> State:
     static = None
     if s.ramps is not None and edges is not None and "rise" in space.blocks:
         static = StaticFriction(s.robot, s.ramps, edges)
-    problem = Problem.of(data, torque_data, s.prior, () if static is None else (static,))
+    known = known_values(space, how, s.prior)
+    problem = Problem.of(data, torque_data, s.prior, [x for x in (static, known) if x is not None])
+    problem = problem if known is None else problem.without_prior(known.names)
     return replace(s, space=space, problem=problem, u=problem.start, edges=edges, static_friction=static)
+
+
+def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
+    """Return what the user states of a space's values and what an earlier identification knows of the others."""
+    stated = stated_prior(space, how.stated, prior)
+    if how.known is None:
+        return stated
+    known = how.known.where(lambda name: name in space.names and name not in space.fixed).beside(stated)
+    return known if known.names else None
 
 
 def fit(s: State) -> State:
@@ -246,7 +260,8 @@ def reread_ramps(s: State) -> State:
         return s
     edges = estimate_breakaway(s.ramps, delay=float(arm.delay), lag=float(arm.lag), slide=slide)
     static = StaticFriction(s.robot, s.ramps, edges)
-    return replace(s, problem=replace(s.problem, extra=(static,)), edges=edges, static_friction=static)
+    extra = (static, *(x for x in s.problem.extra if not isinstance(x, StaticFriction)))
+    return replace(s, problem=replace(s.problem, extra=extra), edges=edges, static_friction=static)
 
 
 def fit_presliding(s: State) -> State:
@@ -260,7 +275,7 @@ def fit_presliding(s: State) -> State:
     rest = {"cutoff_hz": how.cutoff_hz, "slowest": s.slowest, "presliding_rad": found["presliding"]}
     data = TorqueResidual(s.space, s.recording, **rest).with_lead(torque_data.lead_s)
     extra = (*s.problem.extra, Presliding(found["presliding"], found["sigma"]))
-    return replace(s, problem=Problem.of(data, data, s.prior, extra))
+    return replace(s, problem=replace(s.problem, data=data, torque_data=data, extra=extra))
 
 
 def reweight(s: State) -> State:

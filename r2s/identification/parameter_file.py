@@ -74,10 +74,13 @@ def save_parameters(
         part.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110))
 
 
-def load_parameters(folder: str | Path, robot: Robot, trust: Sequence[str] = ()) -> tuple[ParameterSpace, np.ndarray]:
+def load_parameters(
+    folder: str | Path, robot: Robot, trust: Sequence[str] = (), option: str = "calibration"
+) -> tuple[ParameterSpace, np.ndarray]:
     """Return space and values x of `calibration=RUN_FOLDER` (or of a parameters.yaml); see `ParameterSpace.dynamics`.
 
-    trust: modules from which a friction family may be imported, beside those that were imported before.
+    trust: modules from which a friction family may be imported, beside those that were imported before. option: that
+    names the folder, for errors.
 
     Raises:
         UserError: no such run or file, parameters of another robot, a foreign friction family, or a damaged file.
@@ -85,10 +88,10 @@ def load_parameters(folder: str | Path, robot: Robot, trust: Sequence[str] = ())
     path = Path(folder)
     path = path / "parameters.yaml" if path.is_dir() else path
     if Path(folder).is_dir() and not path.is_file():
-        raise UserError(f"calibration: {folder} has no parameters.yaml; is it a finished identification?")
+        raise UserError(f"{option}: {folder} has no parameters.yaml; is it a finished identification?")
     if not path.is_file():
         siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
-        raise UserError(f"calibration: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")
+        raise UserError(f"{option}: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")
     try:
         document = yaml.safe_load(path.read_text())
         named, joints = document["robot"], document["joints"]
@@ -97,9 +100,9 @@ def load_parameters(folder: str | Path, robot: Robot, trust: Sequence[str] = ())
             return _parse(document, robot)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError, yaml.YAMLError) as error:
         seen = " ".join(str(error).split())
-        raise UserError(f"calibration: {path} is not a parameters.yaml of r2s ({seen})") from None
+        raise UserError(f"{option}: {path} is not a parameters.yaml of r2s ({seen})") from None
     raise UserError(
-        f"calibration: {path} is of '{named}' with {joints} joints; this arm is '{robot.name}' with {robot.n}"
+        f"{option}: {path} is of '{named}' with {joints} joints; this arm is '{robot.name}' with {robot.n}"
     )
 
 
@@ -145,7 +148,7 @@ def _check_physical(d: Dynamics) -> None:
             raise ValueError(f"joint {int(joints.argmax()) + 1} has {reason}")
 
 
-def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
+def load_posterior(folder: str | Path, space: ParameterSpace, option: str = "dr=identified") -> np.ndarray:
     """Return the posterior draws (S, P) that `save_parameters` wrote beside the values of `space`.
 
     Raises:
@@ -154,9 +157,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
     path = Path(folder)
     path = (path if path.is_dir() else path.parent) / "posterior.npz"
     if not path.is_file():
-        raise UserError(
-            f"dr=identified: no posterior.npz at {path.parent}; calibration= must be a run of stage=identify"
-        )
+        raise UserError(f"{option}: no posterior.npz at {path.parent}; it must be a run of stage=identify")
     try:
         with np.load(path, allow_pickle=False) as file:
             names, samples = file["names"].tolist(), file["samples"]
@@ -164,7 +165,7 @@ def load_posterior(folder: str | Path, space: ParameterSpace) -> np.ndarray:
             raise ValueError(f"samples of shape {samples.shape} for {len(names)} names")
     except DAMAGED as error:
         seen = " ".join(str(error).split())
-        raise UserError(f"dr=identified: {path} is not a posterior.npz of r2s ({seen})") from None
+        raise UserError(f"{option}: {path} is not a posterior.npz of r2s ({seen})") from None
     if names != space.names:
-        raise UserError(f"dr=identified: {path} has other parameters than the parameters.yaml beside it")
+        raise UserError(f"{option}: {path} has other parameters than the parameters.yaml beside it")
     return samples

@@ -66,6 +66,7 @@ class ParameterSpace:
         robot: the arm; inertia blocks are relative to its links.
         breakaway_command: (n, 2) Nm, commands at which resting joints broke away, from ramps. The breakaway torques
             then follow the offset (torque = command + offset). NaN or None: the nominal torque.
+        fixed: names of values that the user fixed, in bounds that leave nothing to search (stated.py).
     """
 
     blocks: tuple[str, ...]
@@ -75,6 +76,7 @@ class ParameterSpace:
     nominal: Dynamics
     robot: Robot
     breakaway_command: np.ndarray | None = None
+    fixed: frozenset[str] = frozenset()
 
     def size(self, name: str) -> int:
         """Return the number of values of a block."""

@@ -55,7 +55,7 @@ class PlannedWidths:
         rest = np.zeros((10, robot.n))
         recording = Recording(np.arange(10.0), rest + robot.q_home, rest, rest, torque)
         self.robot, self.nominal, self.torque, self._noise = robot, nominal, torque, noise * robot.tau_max
-        self.space = search_space(robot, nominal, settings.bounds, settings.terms, recording)
+        self.space = search_space(robot, nominal, settings.bounds, settings.terms, recording, settings.stated)
         self._slowest = STANDSTILL if torque == "commanded" else 0.0
         still = (recording.q[None], rest[None], rest[None])
         data = self._residual(recording.t, still)

@@ -102,6 +102,10 @@ class Problem:
         sigma[at] = FIXED * self.space.width[at]
         return replace(self, sigma=sigma)
 
+    def without_prior(self, names: Sequence[str]) -> "Problem":
+        """Return the problem with a flat prior of these values, of which an extra residual knows more."""
+        return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
+
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":
         """Return the problem with another torque residual, also as data unless those are replays."""
         return replace(self, data=self.data if self.uses_replays else torque_data, torque_data=torque_data)
@@ -140,9 +144,13 @@ class Problem:
         yield from self.torque_data.linearize(u)
         yield _differences(self._prior, u)
 
+    def prior_rows(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the prior and extra rows (B,) and their Jacobian (B, P) at u (P,)."""
+        return _differences(self._prior, u)
+
     def prior_information(self, u: np.ndarray) -> np.ndarray:
         """Return (P, P), half the Hessian at u (P,) of the prior and extra rows."""
-        j = _differences(self._prior, u)[1]
+        j = self.prior_rows(u)[1]
         return j.T @ j
 
     def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ class IdentificationResult:
         unseen: names that keep their nominal value, because the data hardly determine them.
         edges: breakaway commands from ramps, if there were any.
         refused: whether replays disagreed with the torque fit and were discarded.
+        prior_rows: (B,) rows of prior, ramps and what was known, and their Jacobian (B, P) on the unit cube.
     """
 
     space: ParameterSpace
@@ -45,6 +46,7 @@ class IdentificationResult:
     unseen: list[str]
     edges: Breakaway | None = None
     refused: bool = False
+    prior_rows: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros((0, 0)))
 
     @property
     def x(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class IdentificationResult:
         for block in s.blocks:
             for k, at in enumerate(s.where(block)):
                 side, edge = ("upper", s.upper[at]) if u[at] > 0.5 else ("lower", s.lower[at])
-                if EDGE < u[at] < 1.0 - EDGE or edge == 0.0 or s.names[at] in self.unseen:
+                if EDGE < u[at] < 1.0 - EDGE or edge == 0.0 or s.names[at] in (*self.unseen, *s.fixed):
                     continue
                 joint = "" if block in WHOLE_ARM else f" of {'link' if block in OF_LINKS else 'joint'} {k + 1}"
                 lines.append(
@@ -79,6 +81,7 @@ class IdentificationResult:
         out = {"unseen_and_left_nominal": self.unseen, "decided_by_the_prior": null}
         out |= {"families_compared": self.families, "replays_refused": self.refused}
         out |= {"at_bounds": self.at_bounds} if self.at_bounds else {}
+        out |= {"fixed_by_the_user": sorted(self.space.fixed)} if self.space.fixed else {}
         unknown = self.edges.unknown if self.edges is not None else {}
         return out | ({"breakaway_unknown": unknown} if unknown else {})
 
@@ -143,15 +146,18 @@ def conclude(problem: Problem, space: ParameterSpace, sure: Mapping[str, Any], *
     found = ParameterEstimate(space.from_unit(u), *ends, seen, space.from_unit(u + steps))
     # in units of the prior: a direction without further information has an eigenvalue of 1
     h = h + np.diag(np.where(np.isinf(problem.sigma), prior**-2.0, 0.0))
-    gained, directions = np.linalg.eigh(prior[:, None] * h * prior)
+    free = [k for k, name in enumerate(space.names) if name not in space.fixed]
+    searched = [space.names[k] for k in free]
+    gained, directions = np.linalg.eigh((prior[:, None] * h * prior)[np.ix_(free, free)])
     null = []
     for g, v in zip(gained, directions.T, strict=True):
         if g < NULL_SHARE**-2:
-            parts = sorted(zip(space.names, v.tolist(), strict=True), key=lambda p: -abs(p[1]))[:LISTED_PARTS]
+            parts = sorted(zip(searched, v.tolist(), strict=True), key=lambda p: -abs(p[1]))[:LISTED_PARTS]
             shown = {name: round(part, 2) for name, part in parts if abs(part) > LEAST_PART}
             null.append((min(float(g**-0.5), 1.0), shown))
-    names = [name for name, gone in zip(space.names, unseen, strict=True) if gone]
-    return IdentificationResult(space, found, null_directions=null, unseen=names, **story)
+    names = [name for name, gone in zip(space.names, unseen, strict=True) if gone and name not in space.fixed]
+    story |= {"unseen": names, "prior_rows": problem.prior_rows(u)}
+    return IdentificationResult(space, found, null_directions=null, **story)
 
 
 def _settle(u: np.ndarray, start: np.ndarray, h: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,14 @@
 """Settings of an identification: parameters, bounds, prior, and how residuals are computed."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from numpy.typing import ArrayLike
 
 from r2s.errors import UserError, check_number, choices
+from r2s.identification.known import Known
 from r2s.identification.parameters import check_bounds
+from r2s.identification.stated import Stated, check_family, check_stated
 from r2s.identification.terms import blocks_of, check_prior, check_terms, optional_friction
 from r2s.physics.friction import family as friction_family
 
@@ -29,6 +31,8 @@ class Settings:
         folds: of the cross-validation within the recording.
         candidate_terms: terms that enter if they improve held-out prediction; `link` replaces `inertia_scale`.
         prunable_terms: terms that are removed if held-out prediction stays as good.
+        stated: mean, width or fixed value per parameter, by the user (stated.py).
+        known: from an earlier identification, or from another kind of torque (known.py).
         seed: of the posterior's draws.
         nthread: of the physics; 0 uses all cores.
 
@@ -47,6 +51,8 @@ class Settings:
     folds: int = 4
     candidate_terms: Sequence[str] = ()
     prunable_terms: Sequence[str] = ()
+    stated: Stated = field(default_factory=dict)
+    known: Known | None = None
     seed: int = 0
     nthread: int = 0
 
@@ -57,6 +63,8 @@ class Settings:
             check_terms(f"identify.{name}", getattr(self, name))
         check_bounds("bounds", self.bounds)
         check_prior(self.prior)
+        check_stated(self.stated)
+        check_family(self.stated, self.family)
         names = [name for term in (*self.terms, *self.candidate_terms) for name in blocks_of(term)]
         if missing := [name for name in names if name not in {*self.bounds, *optional_friction()}]:
             raise UserError(f"identify.bounds: none for {choices(missing)}")

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from r2s.errors import UserError, choices, nearest
 from r2s.identification.link_inertia import LINK, PAYLOAD
 from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, parameter_space, sizes
+from r2s.identification.stated import Stated, fixed_in
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import VISCOUS, known_families
 from r2s.physics.robot import Robot
@@ -25,6 +26,9 @@ NO_EFFECT = {
     "measured": ("delay", "lag", "armature"),
     "motor": ("delay", "lag"),
 }
+
+
+NOTHING: Stated = {}
 
 
 def optional_friction() -> list[str]:
@@ -64,10 +68,12 @@ def search_space(
     bounds: Mapping[str, Sequence[ArrayLike]],
     terms: Sequence[str],
     recording: Recording,
+    stated: Stated = NOTHING,
 ) -> ParameterSpace:
     """Return the space of the friction family's parameters and of the terms that act on the recorded torque.
 
-    bounds: as in `scaled_bounds`; the family's own bounds, in SI units, fill in for parameters without.
+    bounds: as in `scaled_bounds`; the family's own bounds, in SI units, fill in for parameters without. stated: by
+    the user, of which fixed values count here (stated.py).
 
     Raises:
         UserError: a term without bounds.
@@ -84,7 +90,7 @@ def search_space(
             names += blocks_of(term)
     if missing := [name for name in names if name not in given]:
         raise UserError(f"identify.bounds: none for {choices(missing)}")
-    return parameter_space(robot, nominal, {name: given[name] for name in names})
+    return fixed_in(parameter_space(robot, nominal, {name: given[name] for name in names}), stated)
 
 
 def scaled_bounds(

@@ -68,10 +68,10 @@ class Verdict:
         """The verdict on the whole."""
         return FAIL if self.fails else WARN if self.warnings else PASS
 
-    def refuse(self) -> None:
-        """Raise UserError with the first fail."""
+    def refuse(self, name: str = "") -> None:
+        """Raise UserError with the first fail; `name` of the recording begins it."""
         for line in self.fails:
-            raise UserError(line.found)
+            raise UserError(f"{name}{line.found}")
 
     def document(self) -> dict[str, Any]:
         """Return the verdict for a JSON file."""
@@ -256,7 +256,8 @@ def _span(x: np.ndarray, form: str = "{:.3g}") -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def with_validation(verdict: Verdict, error: UserError | None) -> Verdict:
-    """Return the verdict with a line about the validation file, which `error` refuses."""
-    line = Line("validation", FAIL, str(error)) if error else Line("validation", PASS, "holds other motion")
+def with_validation(verdict: Verdict, error: UserError | None, name: str = "") -> Verdict:
+    """Return the verdict with a line about a validation file, which `error` refuses; name: if there are several."""
+    check = f"validation {name}".strip()
+    line = Line(check, FAIL, str(error)) if error else Line(check, PASS, "holds other motion")
     return replace(verdict, lines=(*verdict.lines, line))

@@ -36,7 +36,8 @@ def free_recordings(calibration):
     paths = [folder / name for name in RECORDINGS]
     if not all(path.is_file() for path in paths):
         data = loaded(folder / "config.yaml").get("data") or {} if (folder / "config.yaml").is_file() else {}
-        paths = [Path(data[key]) for key in ("path", "validation") if data.get(key) and data.get("torque") == TORQUE]
+        given = [data.get(key) for key in ("path", "validation")] if data.get("torque") == TORQUE else []
+        paths = [Path(p) for p in given if isinstance(p, str)]
     return [read(path, torque=TORQUE) for path in paths if path.is_file()]
 
 

@@ -1,6 +1,5 @@
 """Training motion, validation motion and breakaway ramps of stage=identify, from files or recorded on an arm."""
 
-import os
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -127,7 +126,10 @@ def file_data(cfg, path=None):
     own = {f.name for f in fields(FileData)}
     node = cfg.data if path is None else OmegaConf.merge(cfg.data, {"path": path})
     given = {k: v for k, v in plain(node).items() if k in own}
-    given |= {k: str(located(given[k])) for k in ("path", "validation", "ramps") if given[k]}
+    for key in ("path", "validation"):
+        if isinstance(given[key], list | dict):
+            raise UserError(f"data.{key}: expected one file here, got {len(given[key])}; give it as data.{key}=FILE")
+    given |= {k: str(located(str(given[k]))) for k in ("path", "validation", "ramps") if given[k]}
     if given.get("contact") and given["torque"] is None:
         given["torque"] = "commanded"
     return called(FileData, "data", given)
@@ -193,30 +195,6 @@ def read_reference(path, n):
     if missing := [c for names in columns.values() for c in names if c not in table]:
         raise UserError(f"{motion}: no column '{missing[0]}'; columns: {choices(table)}")
     return {"t": table["t"], **{x: np.stack([table[c] for c in names], axis=1) for x, names in columns.items()}}
-
-
-def read_motion(robot, file, share):
-    """Return training and validation motion of a `FileData`; they must not have motion in common.
-
-    Args:
-        share: part of the recording that is held out if there is no validation file.
-    """
-    from r2s.identification.checks import check_recording
-
-    recording = read_file(robot, file, file.path)
-    check_recording(robot, recording)
-    if file.period is None and (periodic := recording.in_phase()) is not recording:
-        recording = periodic
-        if not file.validation:
-            print(f"the motion repeats after {recording.period:.2f} s: validation holds out a phase of every period")
-    if not file.validation:
-        return recording.split(share)
-    if os.path.realpath(file.validation) == os.path.realpath(file.path):
-        raise UserError("data.validation is the training file itself: it must hold other motion")
-    validation = read_file(robot, file, file.validation)
-    check_recording(robot, validation)
-    check_other_motion(recording, validation)
-    return recording, validation
 
 
 def check_other_motion(recording, validation):

@@ -65,7 +65,7 @@ class Excite:
 def make_design(cfg, robot, how):
     """Return the `PlannedWidths` that the motion is chosen for."""
     from r2s.identification.planned_width import PlannedWidths
-    from r2s.stages.identify import make_settings
+    from r2s.stages.prior import make_settings
 
     nominal = make_dynamics(cfg, robot)
     try:

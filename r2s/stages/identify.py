@@ -5,11 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError, check_number
+from r2s.files import located
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
 from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration
-from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_motion, read_user_ramps, record_arm
-from r2s.stages.parts import called, part, plain
+from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
+from r2s.stages.parts import part
 from r2s.stages.payload import identify_load, loaded_data, torque_of_calibration
+from r2s.stages.prior import Earlier, earlier_run, make_settings, start_of
+from r2s.stages.recordings import Group, read_groups, recording_files, whole
 
 WHY = {
     "arm": "only data=arm moves an arm",
@@ -25,23 +28,11 @@ def reads(cfg):
     return keys | ({"arm"} if cfg.data.kind == "arm" else set())
 
 
-def make_settings(cfg, torque):
-    """Return the `Settings` of an identification with this kind of torque."""
-    from r2s.identification.settings import Settings
-
-    settings: dict[str, Any] = plain(cfg.identify)
-    del settings["validation_fraction"]
-    for key in ("terms", "prior", "candidate_terms", "prunable_terms"):
-        settings[key] = settings[key][torque]
-    own = {"family": cfg.friction.family, "seed": cfg.seed, "nthread": cfg.threads}
-    return called(Settings, "identify", settings | own)
-
-
 @dataclass(frozen=True)
 class Parts:
     """Inputs of an identification, made and checked before there is a run folder.
 
-    With an arm, `train`, `validation` and `ramps` are recorded later, along `motion`.
+    With an arm, `groups` and `ramps` are recorded later, along `motion`. earlier: of identify.from=, or None.
     """
 
     robot: Any
@@ -49,11 +40,11 @@ class Parts:
     searches: list[Any]
     inputs: list[Path | str]
     motion: Any = None
-    train: Any = None
-    validation: Any = None
+    groups: tuple[Group, ...] = ()
     ramps: Any = None
     contact: Any = None
     loaded: Any = None
+    earlier: Any = None
 
 
 def make_parts(cfg):
@@ -63,28 +54,36 @@ def make_parts(cfg):
         UserError: the config contradicts itself, or a file is missing or wrong.
     """
     from r2s.excitation.motion import load
+    from r2s.identification.stated import check_stated
 
     robot = make_robot(cfg)
+    earlier = earlier_run(cfg, robot)
     nominal = make_dynamics(cfg, robot)
     searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
     check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
+    check_number("identify.drift", cfg.identify.drift, "[0, inf)")
     if cfg.data.torque in cfg.identify.terms:
-        make_settings(cfg, cfg.data.torque)
+        check_stated(make_settings(cfg, cfg.data.torque, [earlier] if earlier else []).stated, robot.n)
     if cfg.data.kind == "recording":
-        file = file_data(cfg)
+        files, validation = recording_files(cfg), recording_files(cfg, "validation")
+        file = replace(files[0], ramps=cfg.data.ramps and str(located(cfg.data.ramps)))
         contact, loaded = contact_data(cfg, robot, file), loaded_data(cfg, robot, file)
-        train, validation = read_motion(robot, file, cfg.identify.validation_fraction)
-        check_cutoff(cfg.identify.cutoff_hz, (train, validation))
+        groups = read_groups(robot, files, validation, cfg.identify.validation_fraction)
+        for group in groups:
+            check_cutoff(cfg.identify.cutoff_hz, (*group.train.values(), *group.validation.values()))
+            check_stated(make_settings(cfg, group.torque, [earlier] if earlier else []).stated, robot.n)
         ramps = read_user_ramps(robot, file)
-        files = [*file.files, *(f for more in (contact, loaded) if more for f in more.files)]
-        return Parts(robot, nominal, searches, files, None, train, validation, ramps, contact, loaded)
+        paths = [path for f in (*files, *validation) for path in f.files] + ([file.ramps] if file.ramps else [])
+        paths += [f for more in (contact, loaded) if more for f in more.files]
+        return Parts(robot, nominal, searches, paths, None, tuple(groups), ramps, contact, loaded, earlier)
     check_data(cfg)
     check_cutoff(cfg.identify.cutoff_hz, ())
     ramp_poses(cfg, robot)
     check_source(cfg, robot)
     if not cfg.data.excitation:
-        return Parts(robot, nominal, searches, [])
-    return Parts(robot, nominal, searches, [cfg.data.excitation], load(cfg.data.excitation, robot))
+        return Parts(robot, nominal, searches, [], earlier=earlier)
+    motion = load(cfg.data.excitation, robot)
+    return Parts(robot, nominal, searches, [cfg.data.excitation], motion, earlier=earlier)
 
 
 def with_known_arm(cfg):
@@ -121,68 +120,145 @@ def identify_with_known_arm(cfg, overrides, key):
 
 
 def identify(cfg, overrides):
-    """Recording -> parameters.yaml, errors on training and validation motion, figures."""
+    """Recordings -> parameters.yaml, errors on training and validation motion, figures."""
     if key := with_known_arm(cfg):
         identify_with_known_arm(cfg, overrides, key)
         return
     from r2s.identification.arm_uncertainty import Arm
-    from r2s.identification.identify import identify as run_identify
-    from r2s.identification.parameter_file import save_parameters
-    from r2s.identification.prediction import prediction_errors
-    from r2s.identification.verdict import judge
-    from r2s.physics.crisp import write_crisp
-    from r2s.physics.description import write_description
-    from r2s.progress import Progress
-    from r2s.recordings.speed_noise import speed_noise
     from r2s.reporting.identification.page import identification_page
     from r2s.reporting.identification.tables import identification_table
-    from r2s.runs import write_json
 
     made = make_parts(cfg)
-    robot, nominal = made.robot, made.nominal
-    train, validation, ramps = made.train, made.validation, made.ramps
     with open_run(cfg, overrides, made.inputs) as run:
         if cfg.data.kind != "recording":
-            train, validation, ramps = record_arm(cfg, robot, run, made.motion)
-        settings = make_settings(cfg, train.torque)
-        verdict = judge(robot, nominal, train, settings)
-        write_json(run.folder / "verdict.json", verdict.document())
-        verdict.refuse()
-        for warning in verdict.warnings:
-            print(f"warning: {warning}")
-        nominal = replace(nominal, speed_noise=speed_noise([train, validation]))
-        progress = Progress("identify")
-
-        def report(row):
-            cost = f"cost {row.get('cost', float('nan')):.4g}"
-            progress(row["done"] / row["total"], f"{row['search']}, {row['evaluations']} candidates, {cost}")
-
-        found = run_identify(
-            robot, nominal, train, made.searches, settings, ramps=ramps, report=report, memo=run.memo
-        )
-        progress.close()
-        for line in found.at_bounds:
-            print(f"warning: {line}")
-        how = {"window_s": settings.window_s, "cutoff_hz": settings.cutoff_hz}
-        summary = {
-            side: prediction_errors(robot, nominal, found.dynamics, data, **how, nthread=cfg.threads)
-            for side, data in (("train", train), ("validation", validation))
-        }
-        source = {"recording": train.name, "torque": train.torque, "run": str(run.folder)}
-        save_parameters(run.folder / "parameters.yaml", *found.saved, source, found.note)
+            train, validation, ramps = record_arm(cfg, made.robot, run, made.motion)
+            group = Group(train.torque, {"train": train}, {"validation": validation})
+            made = replace(made, groups=(group,), ramps=ramps)
+        judge_recordings(cfg, run, made)
+        earlier, kinds = [made.earlier] if made.earlier else [], dict[str, Any]()
+        for group in made.groups[:-1]:  # what all kinds of torque share is known better to the next
+            fit = fit_group(cfg, run, made, group, earlier, run.folder / group.torque)
+            space, found = fit.found.saved
+            earlier.append(Earlier(str(run.folder / group.torque), group.torque, space, found.x, found.samples))
+            kinds |= {group.torque: fit.summary}
+        fit = fit_group(cfg, run, made, made.groups[-1], earlier, run.folder)
+        summary, found, nominal = fit.summary | kinds, fit.found, fit.nominal
         found.history.to_csv(run.folder / "metrics.csv", index=False)
         for row in found.history.to_dict("records"):
             run.track("metrics", row)
-        for line in write_description(run.folder / "model", robot, found.dynamics):
-            print(line)
-        if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
-            write_crisp(run.folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
         run.summary(summary)
-        identification_page(run, robot, nominal, found, validation, summary, **how)
-        identification_table(console(), robot, found, summary)
+        how = {"window_s": cfg.identify.window_s, "cutoff_hz": cfg.identify.cutoff_hz}
+        identification_page(run, made.robot, nominal, found, fit.validation, summary, **how, more=fit.tables)
+        identification_table(console(), made.robot, found, summary)
         arm = Arm(found.space, found.x, found.found.samples)
         if made.contact:
             run.summary(summary | {"contact": identify_surface(cfg, run, arm, made.contact)})
         if made.loaded:
             run.summary(summary | {"payload": identify_load(cfg, run, arm, made.loaded)})
     print(f"written: {run.folder}")
+
+
+def judge_recordings(cfg, run, made):
+    """Write verdict.json, of one recording or by recording; print the warnings, and refuse a fail."""
+    from r2s.identification.verdict import judge
+    from r2s.runs import write_json
+
+    verdicts = {}
+    for group in made.groups:
+        settings = make_settings(cfg, group.torque, [made.earlier] if made.earlier else [])
+        for label, recording in group.train.items():
+            verdicts[label] = judge(made.robot, made.nominal, recording, settings)
+    several = len(verdicts) > 1
+    documents = {label: verdict.document() for label, verdict in verdicts.items()}
+    write_json(run.folder / "verdict.json", {"recordings": documents} if several else next(iter(documents.values())))
+    for label, verdict in verdicts.items():
+        verdict.refuse(f"{label}: " if several else "")
+        for warning in verdict.warnings:
+            print(f"warning: {f'{label}: ' if several else ''}{warning}")
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An identification from one kind of torque, with its errors and tables."""
+
+    found: Any
+    nominal: Any
+    validation: Any
+    summary: dict[str, Any]
+    tables: dict[str, Any]
+
+
+def fit_group(cfg, run, made, group, earlier, folder):
+    """Identify from the recordings of one kind of torque, and write parameters.yaml and model/ to `folder`."""
+    from r2s.identification.identify import identify as run_identify
+    from r2s.identification.parameter_file import save_parameters
+    from r2s.identification.prediction import prediction_errors
+    from r2s.physics.crisp import write_crisp
+    from r2s.physics.description import write_description
+    from r2s.progress import Progress
+    from r2s.recordings.speed_noise import speed_noise
+
+    robot, several = made.robot, len(made.groups) > 1
+    train, validation = whole(group.train), whole(group.validation)
+    settings = make_settings(cfg, group.torque, earlier, last=group is made.groups[-1])
+    nominal = made.nominal
+    for known in earlier:
+        nominal = start_of(nominal, known, group.torque)
+    nominal = replace(nominal, speed_noise=speed_noise([*group.train.values(), *group.validation.values()]))
+    progress = Progress(f"identify, {group.torque} torque" if several else "identify")
+
+    def report(row):
+        cost = f"cost {row.get('cost', float('nan')):.4g}"
+        progress(row["done"] / row["total"], f"{row['search']}, {row['evaluations']} candidates, {cost}")
+
+    def memo(name, make):
+        return run.memo(f"{group.torque} {name}" if several else name, make)
+
+    found = run_identify(robot, nominal, train, made.searches, settings, ramps=made.ramps, report=report, memo=memo)
+    progress.close()
+    for line in found.at_bounds:
+        print(f"warning: {line}")
+    how = {"window_s": settings.window_s, "cutoff_hz": settings.cutoff_hz, "nthread": cfg.threads}
+    summary = {
+        side: prediction_errors(robot, nominal, found.dynamics, data, **how)
+        for side, data in (("train", train), ("validation", validation))
+    }
+    source = {"recording": train.name, "torque": train.torque, "run": str(run.folder)}
+    folder.mkdir(exist_ok=True)
+    save_parameters(folder / "parameters.yaml", *found.saved, source, found.note)
+    for line in write_description(folder / "model", robot, found.dynamics):
+        print(line)
+    if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
+        write_crisp(folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
+    tables, entries = compared(cfg, made, group, found, settings)
+    return Fit(found, nominal, validation, summary | entries, tables)
+
+
+def compared(cfg, made, group, found, settings):
+    """Return tables and entries of summary.json: what each recording adds, and the drift since identify.from."""
+    from r2s.identification.contributions import contradictions, contributions, validated
+    from r2s.identification.known import block_of, drift_table
+    from r2s.reporting.identification.several import contribution_entry, contribution_table, drift_entry, drift_items
+    from r2s.reporting.tables import print_table
+
+    tables: dict[str, list[Any]] = {}
+    entries: dict[str, Any] = {}
+    if len(group.train) + len(group.validation) > 2 or len(made.groups) > 1:
+        parts = contributions(found, group.train, settings.cutoff_hz)
+        lines, names = contradictions(parts), found.space.names
+        for line in lines:
+            print(f"warning: {line}")
+        parts += validated(found, group.validation, settings.cutoff_hz)
+        table = contribution_table(parts, names)
+        tables["Recordings"] = [table, *(f"{line[0].upper()}{line[1:]}." for line in lines)]
+        print_table(console(), table, f"recordings of {group.torque} torque")
+        entries["recordings"] = contribution_entry(parts, names)
+    if made.earlier is not None and made.earlier.torque == group.torque:
+        since = made.earlier.run
+        known = settings.known.where(lambda name: block_of(name) not in settings.stated)
+        drift = drift_table(known, found.space, found.x, found.found.samples)
+        words, table = drift_items(drift, since)
+        tables[f"Drift since {since}"] = [words, table]
+        print_table(console(), table, f"drift since {since}, 95 % intervals")
+        entries["drift"] = drift_entry(drift, since)
+    return tables, entries

@@ -5,7 +5,13 @@ from pathlib import Path
 
 from r2s.files import OWN
 
-PARENTS = ("calibration", "policy", "adapt.calibration", "estimate.surface")  # config keys that name a run folder
+PARENTS = (
+    "calibration",
+    "identify.from",
+    "policy",
+    "adapt.calibration",
+    "estimate.surface",
+)  # config keys that name a run folder
 FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; those of the package belong to its commit
 # of a run folder, what another job may read
 READ = (

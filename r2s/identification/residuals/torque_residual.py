@@ -229,6 +229,11 @@ class TorqueResidual:
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
         return self._with(_weights=self._weights_at(r, fitted), **own)
 
+    def rigid_body_of_last_link(self) -> np.ndarray:
+        """Return (T, n, 10): torque per standard parameter of a body on the last link that nothing declares."""
+        y, weight = self._rigid.y[..., -10:], self._rigid.compensation[..., -10:]
+        return y + weight if self.commanded else y
+
     def weighted_like(self, other: "TorqueResidual") -> "TorqueResidual":
         """Return this residual with the standard deviations of another one."""
         return self._with(_weights=other._weights)

@@ -1,7 +1,7 @@
 """Cross-validation within a recording: whole blocks of time, or of phase for periodic motion, are held out."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.problem import Problem, Report, fit_torque
 from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.stated import Stated
 from r2s.identification.terms import search_space
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -63,7 +64,7 @@ class CrossValidation:
         bounds, prior: see `search_space` and `Problem.of`.
         folds: number of folds.
         cutoff_hz: cutoff of the zero-phase filter.
-        report: called with a row of progress.
+        report: called with a row of progress. stated: fixed values.
     """
 
     robot: Robot
@@ -74,10 +75,11 @@ class CrossValidation:
     folds: int
     cutoff_hz: float
     report: Report
+    stated: Stated = field(default_factory=dict)
 
     def space(self, terms: Sequence[str], nominal: Dynamics | None = None) -> ParameterSpace:
         """Return the parameter space of `terms`."""
-        return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording)
+        return search_space(self.robot, nominal or self.nominal, self.bounds, terms, self.recording, self.stated)
 
     def split(self, space: ParameterSpace, *, blocks: int = 1, slowest: float = 0.0) -> Iterator[Fold]:
         """Yield the folds; see `held_out` and `TorqueResidual`."""

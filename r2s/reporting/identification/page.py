@@ -79,12 +79,14 @@ def identification_page(
     *,
     window_s: float,
     cutoff_hz: float,
+    more: Mapping[str, Sequence[Item]] | None = None,
 ) -> None:
     """Write figures, report.md, report.html, base_parameters.csv and recording.rrd, on the validation motion.
 
     Args:
         run, robot: of the identification. nominal: model before. found: result. validation: held-out motion.
         summary: summary.json. window_s: of replays. cutoff_hz: of the low-pass.
+        more: further sections {heading: items}, after the prediction errors.
     """
     torque = TorqueResidual(parameter_space(robot, nominal, {"offset": [-1.0, 1.0]}), validation, cutoff_hz=cutoff_hz)
     motion, both = torque.motion, {"nominal": nominal, "identified": found.dynamics}
@@ -116,7 +118,8 @@ def identification_page(
     base = base_table(found.space, found.found, rotors=validation.torque != "measured")
     base.to_csv(run.folder / "base_parameters.csv", index=False, float_format="%.6g")
     evidence = Evidence(pictures, fastest, whiteness, base, window_s, cutoff_hz)
-    sections = identification_sections(robot, nominal, found, validation, summary, evidence)
+    own = list(identification_sections(robot, nominal, found, validation, summary, evidence).items())
+    sections = dict([*own[:2], *(more or {}).items(), *own[2:]])
     report_markdown(run.folder / "report.md", sections)
     report_html(run.folder / "report.html", sections)
 

@@ -1,0 +1,165 @@
+"""What each of several recordings adds to an identification, and whether one contradicts the others.
+
+Each is left out in turn, and fitted alone, by a few steps on torque that start at the fit to all. Rows are weighted
+by what a recording's own fit leaves: the residual of a fit to contradicting recordings is no noise.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.identification.identify import STANDSTILL
+from r2s.identification.parameters import ParameterSpace
+from r2s.identification.posterior import FLAT
+from r2s.identification.residuals.torque_residual import TorqueResidual
+from r2s.identification.result import IdentificationResult
+from r2s.identification.search.levenberg_marquardt import minimize, normal_equations
+from r2s.recordings.parts import spread
+from r2s.recordings.recording import Recording
+
+CONTRADICTS = 2.0  # the sum of squares of all recordings, over that if one of them has parameters of its own
+WORSE = 4.0  # RMSE of a recording alone over the others', from which the model does not fit it
+CARRIED = 0.5  # share of a contradiction's square that a body on the last link must explain to be named
+LEAST_MASS = 0.01  # of the arm's, of such a body
+ROUNDS = 3  # reweighted fits of each recording alone
+STEPS, FTOL = 10, 1e-3  # Jacobians of a fit, and its relative gain at the end
+USED_S, RATE_HZ = 120.0, 50.0  # s of a longer recording, and rows per second, that are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Contribution:
+    """One recording beside a fit.
+
+    Attributes:
+        label, torque, seconds, use: of the recording; training or validation.
+        rmse: (n,) Nm of the fit to all recordings.
+        left_out: (n,) Nm of a fit to the others. narrower: (P,) width of each 95 % interval without this recording,
+            over that with it. None: of validation.
+        alone: (n,) Nm of a fit to this recording alone. contradiction: see CONTRADICTS; 1 for the only recording.
+        body_kg: mass that it carries more on the last link than the others, if that explains it; nan: it does not.
+    """
+
+    label: str
+    torque: str
+    seconds: float
+    rmse: np.ndarray
+    use: str = "validation"
+    left_out: np.ndarray | None = None
+    narrower: np.ndarray | None = None
+    alone: np.ndarray | None = None
+    contradiction: float = 1.0
+    body_kg: float = np.nan
+
+
+def contributions(
+    found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
+) -> list[Contribution]:
+    """Return what each of the recordings {label: recording}, all of one kind of torque, adds to the fit `found`."""
+    space, u = found.space, found.space.to_unit(found.x)
+    r0, slope = found.prior_rows
+    flat = np.diag(np.sqrt(FLAT) * ~slope.any(0))  # a flat prior has no row
+    prior = np.concatenate([r0, np.zeros(len(u))]), np.concatenate([slope, flat])
+    parts = [_torque(space, spread(r, USED_S), cutoff_hz) for r in recordings.values()]
+    parts = [p.reweighted(found.x, fitted=True) for p in parts]
+    alone = [u] * len(parts)
+    for _ in range(ROUNDS):
+        alone = [_fitted([p], u, prior) for p in parts]
+        parts = [p.reweighted(space.from_unit(v), fitted=True) for p, v in zip(parts, alone, strict=True)]
+    more = [max(1.0, r.duration / USED_S) for r in recordings.values()]  # the rest has as much information
+    information = [k * normal_equations(p.linearize(u))[1] for k, p in zip(more, parts, strict=True)]
+    total = sum(information) + prior[1].T @ prior[1]
+    width, square = np.sqrt(np.diag(np.linalg.inv(total))), _square(parts, _fitted(parts, u, prior))
+    out = []
+    for (label, r), p, own, v in zip(recordings.items(), parts, information, alone, strict=True):
+        others = [q for q in parts if q is not p]
+        without = _fitted(others, u, prior)
+        error, left_out, alone_error = (p.errors(space.from_unit(w)[None])[0] for w in (u, without, v))
+        ratio = square / (_square(others, without) + _square([p], v) + len(u)) if others else 1.0
+        more_of_it = {
+            "left_out": _rmse(left_out, p.seen),
+            "alone": _rmse(alone_error, p.seen),
+            "narrower": np.sqrt(np.diag(np.linalg.inv(total - own))) / width,
+            "contradiction": ratio,
+            "body_kg": _carried(p, left_out, space.robot.mass.sum()) if others else np.nan,
+        }
+        out.append(Contribution(label, r.torque, r.duration, _rmse(error, p.seen), "training", **more_of_it))
+    return out
+
+
+def validated(
+    found: IdentificationResult, recordings: Mapping[str, Recording], cutoff_hz: float
+) -> list[Contribution]:
+    """Return the errors of recordings {label: recording} that the fit did not use."""
+    out = []
+    for label, r in recordings.items():
+        data = _torque(found.space, r, cutoff_hz)
+        out.append(Contribution(label, r.torque, r.duration, _rmse(data.errors(found.x[None])[0], data.seen)))
+    return out
+
+
+def _torque(space: ParameterSpace, recording: Recording, cutoff_hz: float) -> TorqueResidual:
+    slowest = STANDSTILL if recording.torque == "commanded" else 0.0
+    return TorqueResidual(space, recording, cutoff_hz=cutoff_hz, rate_hz=RATE_HZ, slowest=slowest)
+
+
+def _square(parts: Sequence[TorqueResidual], u: np.ndarray) -> float:
+    """Return the sum of squares at u (P,)."""
+    return sum(float((p(p.space.from_unit(u)[None]) ** 2).sum()) for p in parts)
+
+
+def _fitted(parts: Sequence[TorqueResidual], u: np.ndarray, prior: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return (P,), the fit to some recordings from u (P,), where `prior` are rows (B,) and their Jacobian (B, P)."""
+    offset, root = prior
+
+    def residual(v: np.ndarray) -> np.ndarray:
+        data = [p(p.space.from_unit(v)) for p in parts]
+        return np.concatenate([*data, (v - u) @ root.T + offset], axis=1)
+
+    def linearize(v: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for p in parts:
+            yield from p.linearize(v)
+        yield root @ (v - u) + offset, root
+
+    return minimize(residual, linearize, u, STEPS, FTOL)
+
+
+def _rmse(error: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return (n,) Nm over the rows that count; nan for a joint without one."""
+    square = np.where(seen, error**2, 0.0).sum(0)
+    return np.sqrt(square / np.where(seen.any(0), seen.sum(0), np.nan))
+
+
+def _carried(data: TorqueResidual, error: np.ndarray, arm_kg: float) -> float:
+    """Return the mass, kg, on the last link that explains an error (T, n) Nm, or nan."""
+    some = data.seen.ravel()
+    y = data.rigid_body_of_last_link()
+    rows, tau = y.reshape(-1, y.shape[-1])[some], -error.ravel()[some]
+    body = np.linalg.lstsq(rows, tau, rcond=1e-6)[0]
+    explained = 1.0 - ((tau - rows @ body) ** 2).sum() / max((tau**2).sum(), 1e-12)
+    return float(body[0]) if explained > CARRIED and abs(body[0]) > LEAST_MASS * arm_kg else np.nan
+
+
+def contradictions(parts: Sequence[Contribution]) -> list[str]:
+    """Return a line about the recording that contradicts the others most, or that the model fits far worse."""
+    trained = [p for p in parts if p.left_out is not None and p.alone is not None]
+    if len(trained) < 2:
+        return []
+    odd = max(trained, key=lambda p: p.contradiction)
+    level = np.array([np.nanmean(p.alone) for p in trained])  # type: ignore[arg-type]
+    worse = [float(x / np.median(np.delete(level, k))) for k, x in enumerate(level)]
+    if odd.contradiction < CONTRADICTS:
+        if max(worse) < WORSE:
+            return []
+        odd = trained[int(np.argmax(worse))]
+    others = next(p.label for p in trained if p is not odd) if len(trained) == 2 else "the other recordings"
+    far = np.nan_to_num(odd.left_out)  # type: ignore[call-overload]
+    worst = int(far.argmax())
+    why = "another tool, load or mounting, or has friction changed?"
+    if np.isfinite(odd.body_kg):
+        more = "more" if odd.body_kg > 0 else "less"
+        why = f"{abs(odd.body_kg):.2g} kg {more} on the last link would explain it: another tool?"
+    return [
+        f"{odd.label} contradicts {others}: a fit without it misses its torque in joint {worst + 1} by "
+        f"{far[worst]:.3g} Nm; {why}"
+    ]

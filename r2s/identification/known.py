@@ -1,0 +1,130 @@
+"""What is known of an arm's parameters before its data: a normal distribution of named values.
+
+It comes from an earlier identification, from recordings of another kind of torque, or from the user (stated.py).
+Between two dates friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2), so the earlier posterior is
+widened by the drift before it is a prior (the prediction of a Kalman filter; Kalman 1960), and the drift itself is
+what the data leave of w.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from r2s.identification.link_inertia import PAYLOAD
+from r2s.identification.parameters import OF_LINKS, ParameterSpace, logarithmic, units
+
+BODY = (*OF_LINKS, *PAYLOAD)  # what every kind of torque shares; friction, offsets and gains are of each kind
+DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # beside the friction law
+FLOOR = 1e-4  # of the usual deviation among arms: least deviation of a value, if draws are clipped at a bound
+Z = 1.96  # standard deviations of half a 95 % interval
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A normal distribution of named values; an `ExtraResidual` of a problem.
+
+    Attributes:
+        names: K names such as coulomb[2]. mean: (K,) SI units, logarithms of logarithmic parameters.
+        covariance: (K, K), drift included. drift: (K,) standard deviations of what changed since; 0: nothing.
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    drift: np.ndarray
+
+    @staticmethod
+    def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
+        """Return what an identification knows: values x (P,) and draws (S, P) of its posterior.
+
+        drift: standard deviation of the change since of friction, relative; of offsets and of what may be 0, relative
+            to the deviation among arms, if the value is smaller.
+        """
+        names, usual = space.names, space.usual
+        mean, least = coordinates(names, x), np.where(np.isfinite(usual), usual, 0.0)
+        covariance = np.atleast_2d(np.cov(coordinates(names, samples).T)) + np.diag((FLOOR * least) ** 2)
+        moves = np.array([block_of(n) in (*space.nominal.family.names, *DRIFTING) for n in names])
+        size = np.where(
+            is_logarithmic(names), 1.0, np.maximum(np.abs(mean), np.where(np.isfinite(usual), usual, 0.0))
+        )
+        change = drift * size * moves
+        return Known(tuple(names), mean, covariance + np.diag(change**2), change)
+
+    def where(self, kept: Callable[[str], bool]) -> "Known":
+        """Return the marginal distribution of the names that are `kept`."""
+        at = [k for k, name in enumerate(self.names) if kept(name)]
+        covariance = self.covariance[np.ix_(at, at)]
+        return Known(tuple(self.names[k] for k in at), self.mean[at], covariance, self.drift[at])
+
+    def beside(self, other: "Known | None") -> "Known":
+        """Return this and another, independent distribution, which replaces values that both have."""
+        if other is None:
+            return self
+        own, k = self.where(lambda name: name not in other.names), len(other.names)
+        covariance = np.zeros((len(own.names) + k,) * 2)
+        covariance[: len(own.names), : len(own.names)], covariance[-k:, -k:] = own.covariance, other.covariance
+        arrays = (np.concatenate(pair) for pair in ((own.mean, other.mean), (own.drift, other.drift)))
+        mean, drift = arrays
+        return Known((*own.names, *other.names), mean, covariance, drift)
+
+    def residual(self, space: ParameterSpace, x: np.ndarray) -> np.ndarray:
+        """Return (C, K), in standard deviations, for x (C, P)."""
+        at = [space.names.index(name) for name in self.names]
+        off = coordinates(self.names, x[:, at]) - self.mean
+        return np.linalg.solve(np.linalg.cholesky(self.covariance), off.T).T
+
+
+def block_of(name: str) -> str:
+    """Return the parameter of a name, coulomb of coulomb[2]."""
+    return name.split("[")[0]
+
+
+def is_logarithmic(names: Iterable[str]) -> np.ndarray:
+    """Return (K,) whether each name has a logarithmic coordinate."""
+    log = logarithmic()
+    return np.array([block_of(name) in log for name in names], dtype=bool)
+
+
+def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
+    """Return x (..., K) with logarithms of logarithmic parameters."""
+    log = is_logarithmic(names)
+    return np.where(log, np.log(np.where(log, x, 1.0)), x)
+
+
+def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
+    """Return a row per value that may drift: then, now, and the difference with its 95 % interval, SI units.
+
+    The difference is w of x_now = x_then + w given both dates' data. With then ~ N(m, P), Q = diag(drift^2),
+    S = P + Q, and now ~ N(x, V) after the data: w ~ N(G (x - m), G V G^T + P - P S^-1 P), G = Q S^-1 (the
+    Rauch-Tung-Striebel smoother, AIAA Journal 3(8), 1965).
+
+    Args:
+        known: prior of the new identification. space, x, samples: its parameters, values (P,), draws (S, P).
+    """
+    known = known.where(lambda name: name in space.names and name not in space.fixed)
+    at = [space.names.index(name) for name in known.names]
+    log, now = is_logarithmic(known.names), coordinates(known.names, x[at])
+    v = np.atleast_2d(np.cov(coordinates(known.names, samples[:, at]).T))
+    q, s = np.diag(known.drift**2), known.covariance
+    gain, p = np.linalg.solve(s, q).T, s - q
+    change = gain @ (now - known.mean)
+    left = np.diag(gain @ v @ gain.T + p - p @ np.linalg.solve(s, p))
+    half = Z * np.sqrt(np.maximum(left, 0.0))
+    then, unit = np.where(log, np.exp(np.where(log, known.mean, 0.0)), known.mean), units()
+
+    def si(w: np.ndarray) -> np.ndarray:
+        return np.where(log, then * np.expm1(np.where(log, w, 0.0)), w)
+
+    table = pd.DataFrame({
+        "parameter": known.names,
+        "unit": [unit[block_of(name)] for name in known.names],
+        "then": then,
+        "now": x[at],
+        "difference": si(change),
+        "low": si(change - half),
+        "high": si(change + half),
+    })  # fmt: skip
+    table["changed"] = (table["low"] > 0) | (table["high"] < 0)
+    return table[known.drift > 0].reset_index(drop=True)

@@ -1,0 +1,106 @@
+"""What stage=identify knows beforehand: identify.prior.PARAMETER.mean= and an earlier run, identify.from=RUN."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError
+from r2s.stages.build import modules
+from r2s.stages.parts import called, plain
+from r2s.stages.run_config import loaded
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """An identification before this one: folder, kind of torque, space, values (P,) and draws (S, P).
+
+    drift: of identify.drift since then; 0: of the same session.
+    """
+
+    run: str
+    torque: str
+    space: Any
+    x: Any
+    samples: Any
+    drift: float = 0.0
+
+    @property
+    def arm(self):
+        """The identified dynamics without a payload that was estimated with them, which is estimated again."""
+        x = self.x.copy()
+        if "payload_mass" in self.space.blocks:
+            x[self.space.where("payload_mass")] = 0.0
+        return self.space.dynamics(x)
+
+
+def earlier_run(cfg, robot):
+    """Return the `Earlier` of identify.from=, or None.
+
+    Raises:
+        UserError: no identification of this robot is there, or calibration= names an arm, too.
+    """
+    from r2s.identification.parameter_file import load_parameters, load_posterior
+
+    run, option = cfg.identify["from"], "identify.from"
+    if run is None:
+        return None
+    run = str(run)
+    if cfg.calibration:
+        raise UserError(f"{option}: {run} is the arm to start from; leave calibration={cfg.calibration} out")
+    space, x = load_parameters(run, robot, modules(cfg.get("trust")), option)
+    path = Path(run) if Path(run).is_file() else Path(run) / "parameters.yaml"
+    torque = (loaded(path).get("source") or {}).get("torque", "commanded")
+    return Earlier(run, torque, space, x, load_posterior(run, space, option), cfg.identify.drift)
+
+
+def make_settings(cfg, torque, earlier=(), last=True):
+    """Return the `Settings` of an identification with this kind of torque.
+
+    Args:
+        earlier: each an `Earlier`. Of another kind of torque it gives the links; of the same kind all values, and
+            friction family and terms, because then and now are values of one model.
+        last: whether it is the last of several kinds, which what is stated of friction and sensors is about.
+    """
+    from r2s.identification.known import BODY, Known, block_of
+    from r2s.identification.settings import Settings
+    from r2s.identification.stated import with_terms_of
+    from r2s.identification.terms import TERMS, add_terms, blocks_of, optional_friction
+    from r2s.physics.friction import family_path
+    from r2s.recordings.recording import TORQUES
+
+    settings: dict[str, Any] = plain(cfg.identify)
+    for key in ("validation_fraction", "from", "drift"):
+        del settings[key]
+    every = [*optional_friction(), *TERMS]
+    stated = {k: v for k, v in settings["prior"].items() if k not in TORQUES and (last or k in BODY)}
+    for key in ("terms", "prior", "candidate_terms", "prunable_terms"):
+        settings[key] = settings[key][torque]
+    terms, kept, family = settings["terms"], [t for t in every if {*blocks_of(t)} & {*stated}], cfg.friction.family
+    known: Known | None = None
+    for before in earlier:
+        own, blocks = Known.of(before.space, before.x, before.samples, before.drift), {*before.space.blocks}
+        if before.torque == torque:
+            family = family_path(before.space.nominal.family)
+            terms = kept = [t for t in every if blocks_of(t)[0] in blocks]
+            settings |= {"candidate_terms": [], "prunable_terms": []}
+        else:
+            own = own.where(lambda name: block_of(name) in BODY)
+            shared = [t for t in ("link", "payload") if {*blocks_of(t)} & blocks]
+            kept, terms = [*kept, *shared], add_terms(terms, [t for t in shared if t not in terms])
+        known = own if known is None else known.beside(own)
+    settings["known"] = known
+    terms = with_terms_of(stated, terms, blocks_of, every)
+    settings |= {"terms": terms, "prunable_terms": [t for t in settings["prunable_terms"] if t not in kept]}
+    settings["candidate_terms"] = [t for t in settings["candidate_terms"] if t not in terms]
+    if "inertia_scale" in stated:
+        settings["candidate_terms"] = [t for t in settings["candidate_terms"] if t != "link"]
+    own = {"family": family, "stated": stated, "seed": cfg.seed, "nthread": cfg.threads}
+    return called(Settings, "identify", settings | own)
+
+
+def start_of(nominal, earlier, torque):
+    """Return the dynamics from which an identification starts: those of an earlier run, or only its links."""
+    arm = earlier.arm
+    if earlier.torque == torque:
+        return arm
+    return replace(nominal, mass=arm.mass, com=arm.com, inertia=arm.inertia)

@@ -1,0 +1,152 @@
+"""The recordings of stage=identify and `r2s check`: one file or several, each with its own kind of torque.
+
+`data.path` and `data.validation` are a file, a pattern such as "logs/*.csv", {path: FILE, torque: motor, ...} with
+what differs from data., or a list of these.
+"""
+
+import glob
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from r2s.errors import UserError, choices, nearest
+from r2s.files import located
+from r2s.stages.data import check_other_motion, file_data, read_file
+from r2s.stages.parts import plain
+
+OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints")
+ORDER = ("measured", "motor", "commanded")  # of the fits: the last one gives the friction that a command overcomes
+
+
+@dataclass(frozen=True)
+class Group:
+    """Recordings of one kind of torque: {label: recording} of training and of validation motion."""
+
+    torque: str
+    train: dict[str, Any]
+    validation: dict[str, Any]
+
+
+def recording_files(cfg, key="path"):
+    """Return a `FileData` for each recording of data.path or data.validation.
+
+    Raises:
+        UserError: a pattern without a file, an unknown key of an entry, or a file twice.
+    """
+    from omegaconf import OmegaConf
+
+    value = plain(cfg.data[key])
+    files = []
+    for entry in value if isinstance(value, list) else [] if value is None else [value]:
+        own = dict(entry) if isinstance(entry, dict) else {"path": entry}
+        where = f"data.{key}"
+        for name in own:
+            if name not in ("path", *OWN):
+                raise UserError(f"{where}: expected the keys path, {choices(OWN)}, got '{name}'{nearest(name, OWN)}")
+        if not isinstance(own.get("path"), str | int | float) or isinstance(own["path"], bool):
+            raise UserError(f"{where}: expected FILE, a pattern, or {{path: FILE, torque: ...}}, got {entry!r}")
+        for path in _matching(where, str(own["path"])):
+            node = OmegaConf.merge(cfg, {"data": {**own, "validation": None}})
+            files.append(file_data(node, path))
+    paths = [os.path.realpath(f.path) for f in files]
+    if twice := [f.path for f, path in zip(files, paths, strict=True) if paths.count(path) > 1]:
+        raise UserError(f"data.{key}: {twice[0]} is named twice")
+    return files
+
+
+def _matching(where: str, path: str) -> Iterator[str]:
+    """Yield a path, or the files of a pattern in the order of their names."""
+    if not glob.has_magic(path) or located(path).exists():
+        yield path
+        return
+    if not (found := sorted(glob.glob(os.path.expanduser(path)))):
+        folder = Path(path).parent
+        there = [p.name for p in folder.glob("*")] if folder.is_dir() else []
+        raise UserError(f"{where}: no file matches '{path}'{nearest(Path(path).name, there)}")
+    yield from found
+
+
+def of_one_reader(files):
+    """Return the `FileData`; topic and joints of a bag, the first file, do not count for other formats."""
+    from r2s.recordings.readers import is_bag
+
+    if not is_bag(Path(files[0].path)):
+        return files
+    return [f if is_bag(Path(f.path)) else replace(f, topic=None, joints=None) for f in files]
+
+
+def labels_of(files):
+    """Return a short label of each file: its stem, or its path where stems repeat."""
+    stems = [Path(f.path).stem for f in files]
+    return [stem if stems.count(stem) == 1 else f.path for f, stem in zip(files, stems, strict=True)]
+
+
+def read_groups(robot, files, validation, share):
+    """Return the recordings as `Group`s in the order of their fits.
+
+    Args:
+        files, validation: `FileData` of each; without `validation`, each recording holds out the `share` at its end,
+            or of every period.
+    """
+    made: dict[str, Group] = {}
+
+    def group(torque):
+        return made.setdefault(torque, Group(torque, {}, {}))
+
+    validation = of_one_reader([files[0], *validation])[1:]
+    for label, file in zip(labels_of(files), of_one_reader(files), strict=True):
+        r = _read(robot, file, len(files) + len(validation) > 1)
+        if file.period is None and (periodic := r.in_phase()) is not r:
+            r = periodic
+            if not validation:
+                print(f"the motion repeats after {r.period:.2f} s: validation holds out a phase of every period")
+        train, held = (r, None) if validation else _split(r, share, label if len(files) > 1 else "")
+        own = group(train.torque)
+        own.train[label] = train
+        if held is not None:
+            own.validation[label] = held
+    for label, file in zip(labels_of(validation), validation, strict=True):
+        if os.path.realpath(file.path) in {os.path.realpath(f.path) for f in files}:
+            raise UserError("data.validation is the training file itself: it must hold other motion")
+        r = _read(robot, file, len(files) + len(validation) > 1)
+        if not (own := group(r.torque)).train:
+            raise UserError(
+                f"data.validation: {file.path} holds {r.torque} torque, and no recording of data.path does"
+            )
+        for other in own.train.values():
+            check_other_motion(other, r)
+        own.validation[label] = r
+    if missing := [torque for torque, own in made.items() if not own.validation]:
+        raise UserError(f"data.validation: no recording of {missing[0]} torque; name one, or leave validation=null")
+    return [made[torque] for torque in ORDER if torque in made]
+
+
+def _read(robot, file, several):
+    """Return the checked recording of a file; with `several`, errors name it."""
+    from r2s.identification.checks import check_recording
+
+    try:
+        recording = read_file(robot, file, file.path)
+        check_recording(robot, recording)
+    except UserError as error:
+        if not several or str(error).startswith(file.path):
+            raise
+        raise UserError(f"{file.path}: {error}") from None
+    return recording
+
+
+def _split(recording, share, label):
+    try:
+        return recording.split(share)
+    except UserError as error:
+        raise UserError(f"{label}: {error}" if label else str(error)) from None
+
+
+def whole(recordings, label=""):
+    """Return {label: recording} as one recording."""
+    from r2s.recordings.joined import joined
+
+    own = [replace(r, name=r.name or label) for label, r in recordings.items()]
+    return joined(own) if len(own) > 1 else next(iter(recordings.values()))
