@@ -1,4 +1,4 @@
-"""Several recordings make one posterior, what is known beforehand counts as much as it is worth, and drift is found."""
+"""Several recordings make one posterior, what is known beforehand counts as it is worth, and drift is found."""
 
 from dataclasses import replace
 
@@ -151,7 +151,9 @@ def drift(robot, found, recording, share=0.3):
 def test_drift_is_found_within_its_interval_and_none_where_none_is(robot, truth, found, warm):
     """12 intervals of 95 %: three or more misses have a probability of 2 %; a drift of ten widths is always seen."""
     now = (
-        replace(truth, phi=PHI * [[1, 1, 1], [1.2, 1, 1], [1, 1, 1]], offset=OFFSET + [0, 0, 0.3]) if warm else truth
+        replace(truth, phi=PHI * [[1, 1, 1], [1.2, 1, 1], [1, 1, 1]], offset=OFFSET + np.array([0, 0, 0.3]))
+        if warm
+        else truth
     )
     table = drift(robot, found, log(robot, now, 3))
     true = np.concatenate([*(now.phi - truth.phi).T, now.offset - truth.offset])

@@ -19,6 +19,7 @@ BODY = (*OF_LINKS, *PAYLOAD)  # what every kind of torque shares; friction, offs
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # beside the friction law
 FLOOR = 1e-4  # of the usual deviation among arms: least deviation of a value, if draws are clipped at a bound
 Z = 1.96  # standard deviations of half a 95 % interval
+FAR = 5.0  # standard deviations of the largest of some thirty directions, beyond which knowledge and data disagree
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,22 @@ class Known:
         at = [space.names.index(name) for name in self.names]
         off = coordinates(self.names, x[:, at]) - self.mean
         return np.linalg.solve(np.linalg.cholesky(self.covariance), off.T).T
+
+
+def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
+    """Return by how many standard deviations values x (P,) are off what was known, and the value that is off most.
+
+    The largest of the independent directions of its covariance, in units of the deviation of each value.
+    """
+    known = known.where(lambda name: name in space.names and name not in space.fixed)
+    if not known.names:
+        return 0.0, ""
+    off = coordinates(known.names, x[[space.names.index(name) for name in known.names]]) - known.mean
+    sigma = np.sqrt(np.diag(known.covariance))
+    size, axes = np.linalg.eigh(known.covariance / np.outer(sigma, sigma))
+    z = axes.T @ (off / sigma) / np.sqrt(np.maximum(size, 1e-12))
+    k = int(np.abs(z).argmax())
+    return float(np.abs(z[k])), known.names[int(np.abs(axes[:, k]).argmax())]
 
 
 def block_of(name: str) -> str:

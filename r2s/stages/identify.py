@@ -230,15 +230,24 @@ def fit_group(cfg, run, made, group, earlier, folder):
         print(line)
     if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
         write_crisp(folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
-    tables, entries = compared(cfg, made, group, found, settings)
+    tables, entries = compared(made, group, found, settings, " and ".join(str(e) for e in earlier))
     return Fit(found, nominal, validation, summary | entries, tables)
 
 
-def compared(cfg, made, group, found, settings):
-    """Return tables and entries of summary.json: what each recording adds, and the drift since identify.from."""
+def compared(made, group, found, settings, known_from):
+    """Return tables and entries of summary.json: what each recording adds, and the drift since identify.from.
+
+    known_from: words for where `settings.known` comes from.
+    """
     from r2s.identification.contributions import contradictions, contributions, validated
-    from r2s.identification.known import block_of, drift_table
-    from r2s.reporting.identification.several import contribution_entry, contribution_table, drift_entry, drift_items
+    from r2s.identification.known import FAR, block_of, disagreement, drift_table
+    from r2s.reporting.identification.several import (
+        CONTRIBUTIONS,
+        contribution_entry,
+        contribution_table,
+        drift_entry,
+        drift_items,
+    )
     from r2s.reporting.tables import print_table
 
     tables: dict[str, list[Any]] = {}
@@ -248,11 +257,20 @@ def compared(cfg, made, group, found, settings):
         lines, names = contradictions(parts), found.space.names
         for line in lines:
             print(f"warning: {line}")
-        parts += validated(found, group.validation, settings.cutoff_hz)
+        held = {f"{k}, held out" if k in group.train else k: r for k, r in group.validation.items()}
+        parts += validated(found, held, settings.cutoff_hz)
         table = contribution_table(parts, names)
-        tables["Recordings"] = [table, *(f"{line[0].upper()}{line[1:]}." for line in lines)]
+        tables["Recordings"] = [CONTRIBUTIONS, table, *(f"{line[0].upper()}{line[1:]}." for line in lines)]
         print_table(console(), table, f"recordings of {group.torque} torque")
         entries["recordings"] = contribution_entry(parts, names)
+    if settings.known is not None:
+        off, name = disagreement(settings.known, found.space, found.x)
+        if off > FAR:
+            line = (
+                f"{group.torque} torque disagrees with {known_from} by {off:.2g} standard deviations, most in {name}"
+            )
+            print(f"warning: {line}: another tool or payload, or a model that does not fit one of them?")
+            tables.setdefault("Recordings", []).append(f"{line[0].upper()}{line[1:]}.")
     if made.earlier is not None and made.earlier.torque == group.torque:
         since = made.earlier.run
         known = settings.known.where(lambda name: block_of(name) not in settings.stated)

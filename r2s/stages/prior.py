@@ -14,7 +14,7 @@ from r2s.stages.run_config import loaded
 class Earlier:
     """An identification before this one: folder, kind of torque, space, values (P,) and draws (S, P).
 
-    drift: of identify.drift since then; 0: of the same session.
+    drift: of identify.drift since then. given: by identify.from=; otherwise it is of the same session.
     """
 
     run: str
@@ -23,6 +23,11 @@ class Earlier:
     x: Any
     samples: Any
     drift: float = 0.0
+    given: bool = False
+
+    def __str__(self):
+        """Return words for a message."""
+        return self.run if self.given else f"{self.torque} torque"
 
     @property
     def arm(self):
@@ -50,7 +55,7 @@ def earlier_run(cfg, robot):
     space, x = load_parameters(run, robot, modules(cfg.get("trust")), option)
     path = Path(run) if Path(run).is_file() else Path(run) / "parameters.yaml"
     torque = (loaded(path).get("source") or {}).get("torque", "commanded")
-    return Earlier(run, torque, space, x, load_posterior(run, space, option), cfg.identify.drift)
+    return Earlier(run, torque, space, x, load_posterior(run, space, option), cfg.identify.drift, True)
 
 
 def make_settings(cfg, torque, earlier=(), last=True):

@@ -9,6 +9,10 @@ import pandas as pd
 from r2s.identification.contributions import Contribution
 from r2s.reporting.tables import number
 
+CONTRIBUTIONS = (
+    "RMSE: torque of the fit to all training recordings, mean over joints; left out: of a fit to the others. The "
+    "last column tells what a recording's information adds: how much wider intervals would be without it."
+)
 NARROWER = 1.02  # ratio of two widths from which an interval counts as narrower
 
 
@@ -18,7 +22,7 @@ def contribution_table(parts: Sequence[Contribution], names: Sequence[str]) -> p
     for p in parts:
         cells = {"": p.use, "torque": p.torque, "s": number(p.seconds), "RMSE, Nm": number(np.nanmean(p.rmse))}
         cells["left out, Nm"] = "" if p.left_out is None else number(np.nanmean(p.left_out))
-        rows[p.label] = cells | {"intervals without it, over those with it": _narrower(p, names)}
+        rows[p.label] = cells | {"intervals without it / with it": _narrower(p, names)}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("recording")
 
 
