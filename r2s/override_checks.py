@@ -13,7 +13,7 @@ from r2s.stages.run_config import PROGRAM
 COMMANDS = ("look", "list", "export", "check", "convert", "engines")
 OPTIONAL = ("tracker", "experiment")  # groups that may have no option
 EXTENSIBLE = ("tune.space",)  # keys that + may add to
-STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*\.\w+=")
+STATED = re.compile(r"identify\.prior\.(?!(?:commanded|measured|motor)\b)[A-Za-z_]\w*(?:\.\w+)?=")
 NO_OPTION = "base"  # a file that the options of a group share
 SEARCHPATH = "hydra.searchpath"
 # old names of keys and values, with the new ones

@@ -91,6 +91,7 @@ class FileData:
     contact_validation: str | None = None
     loaded: str | None = None
     declared_payload: Any = None
+    payload: Any = None
 
     def __post_init__(self):
         check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")

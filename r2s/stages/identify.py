@@ -10,7 +10,7 @@ from r2s.stages.build import check_source, console, make_dynamics, make_robot, o
 from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration
 from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
 from r2s.stages.parts import part
-from r2s.stages.payload import identify_load, loaded_data, torque_of_calibration
+from r2s.stages.payload import LoadedData, identify_load, loaded_data, torque_of_calibration
 from r2s.stages.prior import Earlier, earlier_run, make_settings, start_of
 from r2s.stages.recordings import Group, read_groups, recording_files, whole
 
@@ -68,7 +68,8 @@ def make_parts(cfg):
         files, validation = recording_files(cfg), recording_files(cfg, "validation")
         file = replace(files[0], ramps=cfg.data.ramps and str(located(cfg.data.ramps)))
         contact, loaded = contact_data(cfg, robot, file), loaded_data(cfg, robot, file)
-        groups = read_groups(robot, files, validation, cfg.identify.validation_fraction)
+        how = cfg.identify.validation_fraction, cfg.identify.cutoff_hz
+        groups = read_groups(robot, files, validation, *how)
         for group in groups:
             check_cutoff(cfg.identify.cutoff_hz, (*group.train.values(), *group.validation.values()))
             check_stated(make_settings(cfg, group.torque, [earlier] if earlier else []).stated, robot.n)
@@ -190,6 +191,7 @@ class Fit:
 
 def fit_group(cfg, run, made, group, earlier, folder):
     """Identify from the recordings of one kind of torque, and write parameters.yaml and model/ to `folder`."""
+    from r2s.identification.arm_uncertainty import Arm
     from r2s.identification.identify import identify as run_identify
     from r2s.identification.parameter_file import save_parameters
     from r2s.identification.prediction import prediction_errors
@@ -231,6 +233,10 @@ def fit_group(cfg, run, made, group, earlier, folder):
     if train.torque != "measured":  # a link-side sensor does not see the friction that a command must overcome
         write_crisp(folder / "model" / "crisp_friction.yaml", robot, found.dynamics)
     tables, entries = compared(made, group, found, settings, " and ".join(str(e) for e in earlier))
+    arm = Arm(found.space, found.x, found.found.samples)
+    for label, recording in group.loaded.items():
+        data = LoadedData(recording, None, [])
+        entries.setdefault("payloads", {})[label] = identify_load(cfg, run, arm, data, label)
     return Fit(found, nominal, validation, summary | entries, tables)
 
 

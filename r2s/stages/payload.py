@@ -73,8 +73,11 @@ def torque_of_calibration(cfg, given):
     return torque
 
 
-def identify_load(cfg, run, arm, data):
-    """Write payload.yaml and figure; return the entry of summary.json and print the tables."""
+def identify_load(cfg, run, arm, data, label=""):
+    """Write payload.yaml and figure; return the entry of summary.json and print the tables.
+
+    label: of one of several loaded recordings; its payload.yaml is in the folder payload_LABEL.
+    """
     from r2s.identification.payload.estimate import identify_payload
     from r2s.identification.payload.payload_file import save_payload
     from r2s.progress import Progress
@@ -87,10 +90,14 @@ def identify_load(cfg, run, arm, data):
     progress.close()
     source = {"recording": data.recording.name, "torque": data.recording.torque}
     source |= {"calibration": cfg.calibration or str(run.folder), "run": str(run.folder)}
-    save_payload(run.folder / "payload.yaml", arm.robot, found, source)
-    payload_figure(run.figure("payload"), found)
-    print_table(console(), payload_table(found), f"payload at {arm.robot.ee_site}, 95 % intervals")
-    print_table(console(), load_error_table(found), "loaded recording")
+    name = f"payload_{label.replace('/', '_')}" if label else "payload"
+    folder = run.folder / name if label else run.folder
+    folder.mkdir(exist_ok=True)
+    save_payload(folder / "payload.yaml", arm.robot, found, source)
+    payload_figure(run.figure(name), found)
+    of = f" of {label}" if label else ""
+    print_table(console(), payload_table(found), f"payload{of} at {arm.robot.ee_site}, 95 % intervals")
+    print_table(console(), load_error_table(found), label or "loaded recording")
     entry = {"seconds": data.recording.duration}
     for name, unit in (("mass", "kg"), ("centre", "m"), ("inertia", "kg_m2")):
         entry |= {f"{name}_{unit}": found.values[name].tolist()}

@@ -7,7 +7,7 @@ what differs from data., or a list of these.
 import glob
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,22 @@ from r2s.files import located
 from r2s.stages.data import check_other_motion, file_data, read_file
 from r2s.stages.parts import plain
 
-OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints")
+OWN = ("torque", "torque_constant", "command_hz", "period", "max_gap_s", "columns", "topic", "joints", "payload")
+FIND = "find"  # payload of a recording that is to be found
 ORDER = ("measured", "motor", "commanded")  # of the fits: the last one gives the friction that a command overcomes
 
 
 @dataclass(frozen=True)
 class Group:
-    """Recordings of one kind of torque: {label: recording} of training and of validation motion."""
+    """Recordings of one kind of torque: {label: recording} of training and of validation motion.
+
+    loaded: with a payload that is to be found.
+    """
 
     torque: str
     train: dict[str, Any]
     validation: dict[str, Any]
+    loaded: dict[str, Any] = field(default_factory=dict)
 
 
 def recording_files(cfg, key="path"):
@@ -83,12 +88,12 @@ def labels_of(files):
     return [stem if stems.count(stem) == 1 else f.path for f, stem in zip(files, stems, strict=True)]
 
 
-def read_groups(robot, files, validation, share):
+def read_groups(robot, files, validation, share, cutoff_hz):
     """Return the recordings as `Group`s in the order of their fits.
 
     Args:
         files, validation: `FileData` of each; without `validation`, each recording holds out the `share` at its end,
-            or of every period.
+            or of every period. cutoff_hz: see `without_payload`.
     """
     made: dict[str, Group] = {}
 
@@ -97,7 +102,10 @@ def read_groups(robot, files, validation, share):
 
     validation = of_one_reader([files[0], *validation])[1:]
     for label, file in zip(labels_of(files), of_one_reader(files), strict=True):
-        r = _read(robot, file, len(files) + len(validation) > 1)
+        r = _read(robot, file, len(files) + len(validation) > 1, cutoff_hz)
+        if file.payload == FIND:
+            group(r.torque).loaded[label] = r
+            continue
         if file.period is None and (periodic := r.in_phase()) is not r:
             r = periodic
             if not validation:
@@ -110,7 +118,7 @@ def read_groups(robot, files, validation, share):
     for label, file in zip(labels_of(validation), validation, strict=True):
         if os.path.realpath(file.path) in {os.path.realpath(f.path) for f in files}:
             raise UserError("data.validation is the training file itself: it must hold other motion")
-        r = _read(robot, file, len(files) + len(validation) > 1)
+        r = _read(robot, file, len(files) + len(validation) > 1, cutoff_hz)
         if not (own := group(r.torque)).train:
             raise UserError(
                 f"data.validation: {file.path} holds {r.torque} torque, and no recording of data.path does"
@@ -118,17 +126,24 @@ def read_groups(robot, files, validation, share):
         for other in own.train.values():
             check_other_motion(other, r)
         own.validation[label] = r
+    if missing := [torque for torque, own in made.items() if not own.train]:
+        raise UserError(f"data.path: a payload is found on top of the arm: name a {missing[0]} recording without one")
     if missing := [torque for torque, own in made.items() if not own.validation]:
         raise UserError(f"data.validation: no recording of {missing[0]} torque; name one, or leave validation=null")
     return [made[torque] for torque in ORDER if torque in made]
 
 
-def _read(robot, file, several):
-    """Return the checked recording of a file; with `several`, errors name it."""
+def _read(robot, file, several, cutoff_hz):
+    """Return the checked recording of a file, without its declared payload; with `several`, errors name it."""
     from r2s.identification.checks import check_recording
+    from r2s.identification.payload.unloaded import without_payload
+    from r2s.physics.payload import payload_of
 
     try:
         recording = read_file(robot, file, file.path)
+        carried = None if file.payload == FIND else payload_of(file.payload, robot.payload_max, "payload")
+        if carried is not None:
+            recording = without_payload(robot, recording, carried, cutoff_hz)
         check_recording(robot, recording)
     except UserError as error:
         if not several or str(error).startswith(file.path):

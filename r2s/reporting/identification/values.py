@@ -12,13 +12,14 @@ from r2s.physics.robot import Robot
 from r2s.reporting.document import KEPT
 from r2s.reporting.tables import number
 
+FIXED = "fixed"  # by identify.prior.PARAMETER.fixed=
 WIDE = f"?: the interval is wider than {2 / SHARPER:g} standard deviations of the prior"
 LEGEND = f"[ ]: 95 % interval; {WIDE}; {KEPT}: the data hardly constrain the value"
 SHORT = f"±: half of the 95 % interval; {WIDE}; kept: nominal, as the data hardly constrain it"
 
 
 class Value(NamedTuple):
-    """Nominal and identified value of a parameter, its 95 % interval, and whether it is `kept` nominal."""
+    """Nominal and identified value of a parameter, its 95 % interval, and whether it is `kept` nominal or `fixed`."""
 
     old: float
     new: float
@@ -26,42 +27,44 @@ class Value(NamedTuple):
     high: float
     identifiable: bool = True
     kept: bool = False
+    fixed: bool = False
 
     def times(self, factor: float) -> "Value":
         """Return the value in another unit."""
         old, new, low, high = (factor * x for x in self[:4])
-        return Value(old, new, low, high, self.identifiable, self.kept)
+        return Value(old, new, low, high, self.identifiable, self.kept, self.fixed)
 
     @property
     def cell(self) -> str:
         """Cell "old → new" over "[low, high]"."""
-        if self.kept:
-            return f"{number(self.old)}\n{KEPT}"
+        if self.kept or self.fixed:
+            return f"{number(self.old)}\n{KEPT if self.kept else FIXED}"
         return f"{number(self.old)} → {self.found}\n{self.interval}"
 
     @property
     def found(self) -> str:
         """The new value, with "?" if it is not identifiable."""
-        return number(self.new) + ("" if self.identifiable else " ?")
+        return number(self.new) + ("" if self.identifiable or self.fixed else " ?")
 
     @property
     def short(self) -> str:
         """Cell "new" over "± half of the interval"."""
         half = 0.5 * (self.high - self.low)
-        if self.kept:
-            return f"{number(self.old)}\nkept"
+        if self.kept or self.fixed:
+            return f"{number(self.old)}\n{'kept' if self.kept else FIXED}"
         new = number(self.new, "{:.3g}" if abs(self.new) >= 1e-3 else "{:.2g}")
         return f"{new}{'' if self.identifiable else '?'}\n±{number(half, '{:.0f}' if half >= 100 else '{:.2g}')}"
 
     @property
     def interval(self) -> str:
         """Cell "[low, high]"."""
-        return KEPT if self.kept else f"[{number(self.low)}, {number(self.high)}]"
+        return KEPT if self.kept else FIXED if self.fixed else f"[{number(self.low)}, {number(self.high)}]"
 
 
 def values(space: ParameterSpace, found: ParameterEstimate, block: str, kept: Sequence[str] = ()) -> list[Value]:
     """Return the values of a block: one per joint or link, or one of the whole arm; `kept` are names kept nominal."""
-    parts = (space.start, found.x, found.low, found.high, found.identifiable, np.isin(space.names, list(kept)))
+    marks = (np.isin(space.names, list(names)) for names in (kept, space.fixed))
+    parts = (space.start, found.x, found.low, found.high, found.identifiable, *marks)
     return [Value(*row) for row in zip(*(space.block(part, block).tolist() for part in parts), strict=True)]
 
 
