@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from conftest import conf
 from test_identify import ARM
-from test_motor import recorded
 
 from r2s.errors import UserError
 from r2s.identification.contributions import contradictions, contributions, validated
@@ -14,15 +13,19 @@ from r2s.identification.identify import identify
 from r2s.identification.known import BODY, Known, block_of, drift_table
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
-from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import COULOMB
+from r2s.physics.payload import Payload, with_payload
+from r2s.physics.rigid_body import mujoco_inverse_dynamics, set_links
 from r2s.physics.robot import load_robot
 from r2s.recordings.joined import joined
+from r2s.recordings.recording import Recording
 
 IDENTIFY = conf("identify/default")
 PHI = np.array([[3.0, 0.0, 0.8], [2.5, 0.0, 0.6], [1.2, 0.0, 0.3]])  # Nm, 1, Nm s/rad
 OFFSET = np.array([0.4, -0.3, 0.2])
 NOISE = 0.3  # Nm
+TOOL = Payload(np.array(0.8), np.array([0.03, 0.0, 0.05]), np.zeros((3, 3)))
 SEARCH = LeastSquares(level="torque", max_evaluations=12, ftol=1e-4)
 
 
@@ -43,8 +46,20 @@ def truth(nominal):
     return replace(nominal, family=COULOMB, phi=PHI, offset=OFFSET)
 
 
-def log(robot, truth, seed, torque="motor", seconds=4.0, **more):
-    return replace(recorded(robot, truth, seconds, torque, seed=seed, noise=NOISE, **more), name=f"log{seed}")
+def log(robot, truth, seed, torque="motor", seconds=4.0, payload=None):
+    """Return a recording by MuJoCo's own inverse dynamics along six sines per joint, not through r2s."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1e-3)
+    w, phase, size = (
+        2 * np.pi * rng.uniform(0.1, 0.9, (6, 3)),
+        *(rng.uniform(0.5, 1, (2, 6, 3)) * [[[2 * np.pi]], [[0.25]]]),
+    )
+    angle = t[:, None, None] * w + phase
+    q, dq, ddq = (x.sum(1) for x in (size * np.sin(angle), size * w * np.cos(angle), -size * w**2 * np.sin(angle)))
+    model = robot.model(gravity=True)
+    set_links(model, *with_payload(robot, payload, (truth.mass, truth.com, truth.inertia)), np.zeros(3))
+    tau = mujoco_inverse_dynamics(model, q, dq, ddq) + truth.friction(dq) - truth.offset
+    tau += NOISE * rng.standard_normal(tau.shape)
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque=torque, name=f"log{seed}")
 
 
 def found_in(robot, nominal, recording, **change):
@@ -178,7 +193,7 @@ def test_what_is_known_to_be_constant_does_not_drift(robot, found, motion):
 
 def test_links_from_one_kind_of_torque_are_known_to_the_other(robot, nominal, truth):
     """Link-side torque gives the links, motor torque the friction: its links are then narrower, and as right."""
-    stiff = replace(truth, phi=0.01 * PHI)  # a link-side sensor sees little friction
+    stiff = replace(truth, phi=with_family(nominal, "coulomb").phi)  # a link-side sensor sees little friction
     links = found_in(robot, nominal, log(robot, stiff, 0, "measured"), terms=["offset", "link"])
     known = Known.of(links.space, links.x, links.found.samples).where(lambda name: block_of(name) in BODY)
     motor = log(robot, truth, 1)
@@ -194,7 +209,7 @@ def test_links_from_one_kind_of_torque_are_known_to_the_other(robot, nominal, tr
 @pytest.fixture(scope="module")
 def tools(robot, nominal, truth):
     """Three recordings, the last with 0.8 kg on the last link."""
-    logs = [log(robot, truth, s, payload=0.8 * (s == 2)) for s in range(3)]
+    logs = [log(robot, truth, s, payload=TOOL if s == 2 else None) for s in range(3)]
     return {r.name: r for r in logs}
 
 

@@ -11,7 +11,7 @@ from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, k
 from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
 from r2s.stages.parts import part
 from r2s.stages.payload import LoadedData, identify_load, loaded_data, torque_of_calibration
-from r2s.stages.prior import Earlier, earlier_run, make_settings, start_of
+from r2s.stages.prior import Earlier, check_known, earlier_run, make_settings, start_of
 from r2s.stages.recordings import Group, read_groups, recording_files, whole
 
 WHY = {
@@ -72,7 +72,8 @@ def make_parts(cfg):
         groups = read_groups(robot, files, validation, *how)
         for group in groups:
             check_cutoff(cfg.identify.cutoff_hz, (*group.train.values(), *group.validation.values()))
-            check_stated(make_settings(cfg, group.torque, [earlier] if earlier else []).stated, robot.n)
+            settings = make_settings(cfg, group.torque, [earlier] if earlier else [], group is groups[-1])
+            check_known(robot, nominal, whole(group.train), settings)
         ramps = read_user_ramps(robot, file)
         paths = [path for f in (*files, *validation) for path in f.files] + ([file.ramps] if file.ramps else [])
         paths += [f for more in (contact, loaded) if more for f in more.files]
@@ -166,7 +167,7 @@ def judge_recordings(cfg, run, made):
 
     verdicts = {}
     for group in made.groups:
-        settings = make_settings(cfg, group.torque, [made.earlier] if made.earlier else [])
+        settings = make_settings(cfg, group.torque, [made.earlier] if made.earlier else [], group is made.groups[-1])
         for label, recording in group.train.items():
             verdicts[label] = judge(made.robot, made.nominal, recording, settings)
     several = len(verdicts) > 1

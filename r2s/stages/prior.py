@@ -103,6 +103,19 @@ def make_settings(cfg, torque, earlier=(), last=True):
     return called(Settings, "identify", settings | own)
 
 
+def check_known(robot, nominal, recording, settings):
+    """Raise UserError if what is stated does not fit the arm, or is of no value that a recording shows."""
+    from r2s.identification.stated import check_stated, stated_prior
+    from r2s.identification.terms import scaled_prior, search_space
+    from r2s.physics.dynamics import with_family
+
+    check_stated(settings.stated, robot.n)
+    if settings.stated:
+        own = nominal if settings.family == "auto" else with_family(nominal, settings.family)
+        space = search_space(robot, own, settings.bounds, settings.terms, recording, settings.stated)
+        stated_prior(space, settings.stated, scaled_prior(settings.prior, robot, recording, own))
+
+
 def start_of(nominal, earlier, torque):
     """Return the dynamics from which an identification starts: those of an earlier run, or only its links."""
     arm = earlier.arm
