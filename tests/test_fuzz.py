@@ -47,7 +47,8 @@ from r2s.physics.robot import SIM_DT, load_robot
 from r2s.reporting.comparison.trainings import read_trainings
 from r2s.runs import is_done, load_arrays, read_summary
 from r2s.stages import build
-from r2s.stages.data import FileData, read_motion
+from r2s.stages.data import FileData
+from r2s.stages.recordings import read_groups
 from r2s.stages.transfer import trained_config
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import rollout
@@ -195,9 +196,9 @@ def test_a_mutated_recording_is_refused_or_physical(formats, data):
             path.write_bytes(b"")
     seen = []
     file = FileData(**conf("data/recording") | {"path": str(path), "torque": "measured"})
-    if refusal(lambda: seen.extend(read_motion(PANDA, file, 0.25))) is None:
+    if refusal(lambda: seen.extend(read_groups(PANDA, [file], [], 0.25, 10.0))) is None:
         assert possible
-        for side in seen:
+        for side in (*seen[0].train.values(), *seen[0].validation.values()):
             assert side.n_joints == 7
             assert all(np.isfinite(a).all() for a in (side.t, side.q, side.dq, side.tau))
             assert np.abs(side.dq).max() <= MAX_SPEED

@@ -605,7 +605,7 @@ def test_the_page_of_an_identification_is_complete(tmp_path, panda, identified, 
 
     run = SimpleNamespace(folder=tmp_path, figure=figure)
     summary = {"train": errors, "validation": errors}
-    identification_page(run, panda, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
+    identification_page(run, nominal, identified, recording, summary, **how)  # type: ignore[arg-type]
     with np.load(tmp_path / "torque.npz") as saved:
         for name, key in (("identified", "torque_rmse_Nm"), ("nominal", "nominal_torque_rmse_Nm")):
             assert np.sqrt(((saved[name] - saved["measured"]) ** 2).mean(0)) == pytest.approx(errors[key])

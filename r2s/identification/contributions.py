@@ -153,7 +153,7 @@ def contradictions(parts: Sequence[Contribution]) -> list[str]:
             return []
         odd = trained[int(np.argmax(worse))]
     others = next(p.label for p in trained if p is not odd) if len(trained) == 2 else "the other recordings"
-    far = np.nan_to_num(odd.left_out)  # type: ignore[call-overload]
+    far = np.nan_to_num(odd.left_out)  # type: ignore[arg-type]
     worst = int(far.argmax())
     why = "another tool, load or mounting, or has friction changed?"
     if np.isfinite(odd.body_kg):

@@ -110,19 +110,19 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
             )
         at, count, log = space.where(block), space.size(block), block in logarithmic()
         mean, width = (_values(entry, key, count) for key in KEYS[:2])
-        said = np.isfinite(mean) | np.isfinite(width)
+        given = np.isfinite(mean) | np.isfinite(width)
         mean = np.where(np.isnan(mean), space.start[at], mean)
-        if (bad := said & ((mean < space.lower[at]) | (mean > space.upper[at]))).any():
+        if (bad := given & ((mean < space.lower[at]) | (mean > space.upper[at]))).any():
             j = int(bad.argmax())
             ends = f"[{space.lower[at][j]:.4g}, {space.upper[at][j]:.4g}]"
             raise UserError(f"{where}.mean: {mean[j]:g} is outside identify.bounds.{block}, {ends}; widen them")
         usual = np.broadcast_to(np.asarray(prior.get(block, np.inf), dtype=float), count)
         width = np.where(np.isnan(width), usual, width / mean if log else width)
-        if np.isinf(width[said]).any():
+        if np.isinf(width[given]).any():
             raise UserError(f"{where}.width: expected a number, because identify.prior has no width of {block}")
-        names += [space.names[k] for k in at[said]]
-        means += (np.log(mean) if log else mean)[said].tolist()
-        widths += width[said].tolist()
+        names += [space.names[k] for k in at[given]]
+        means += (np.log(mean) if log else mean)[given].tolist()
+        widths += width[given].tolist()
     if not names:
         return None
     return Known(tuple(names), np.array(means), np.diag(np.square(widths)), np.zeros(len(names)))

@@ -61,7 +61,7 @@ def make_parts(cfg):
     nominal = make_dynamics(cfg, robot)
     searches = [part(node, f"search.{k}") for k, node in enumerate(cfg.search)]
     check_number("identify.validation_fraction", cfg.identify.validation_fraction, "(0, 1)")
-    check_number("identify.drift", cfg.identify.drift, "[0, inf)")
+    check_number("identify.drift", cfg.identify.get("drift", 0.0), "[0, inf)")
     if cfg.data.torque in cfg.identify.terms:
         check_stated(make_settings(cfg, cfg.data.torque, [earlier] if earlier else []).stated, robot.n)
     if cfg.data.kind == "recording":
@@ -150,7 +150,7 @@ def identify(cfg, overrides):
             run.track("metrics", row)
         run.summary(summary)
         how = {"window_s": cfg.identify.window_s, "cutoff_hz": cfg.identify.cutoff_hz}
-        identification_page(run, made.robot, nominal, found, fit.validation, summary, **how, more=fit.tables)
+        identification_page(run, nominal, found, fit.validation, summary, **how, more=fit.tables)
         identification_table(console(), made.robot, found, summary)
         arm = Arm(found.space, found.x, found.found.samples)
         if made.contact:

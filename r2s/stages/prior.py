@@ -46,7 +46,7 @@ def earlier_run(cfg, robot):
     """
     from r2s.identification.parameter_file import load_parameters, load_posterior
 
-    run, option = cfg.identify["from"], "identify.from"
+    run, option = cfg.identify.get("from"), "identify.from"  # configs of older runs lack the key
     if run is None:
         return None
     run = str(run)
@@ -75,7 +75,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
     settings: dict[str, Any] = plain(cfg.identify)
     for key in ("validation_fraction", "from", "drift"):
-        del settings[key]
+        settings.pop(key, None)
     every = [*optional_friction(), *TERMS]
     stated = {k: v for k, v in settings["prior"].items() if k not in TORQUES and (last or k in BODY)}
     for key in ("terms", "prior", "candidate_terms", "prunable_terms"):
@@ -99,8 +99,8 @@ def make_settings(cfg, torque, earlier=(), last=True):
     settings["candidate_terms"] = [t for t in settings["candidate_terms"] if t not in terms]
     if "inertia_scale" in stated:
         settings["candidate_terms"] = [t for t in settings["candidate_terms"] if t != "link"]
-    own = {"family": family, "stated": stated, "seed": cfg.seed, "nthread": cfg.threads}
-    return called(Settings, "identify", settings | own)
+    settings |= {"family": family, "stated": stated, "seed": cfg.seed, "nthread": cfg.threads}
+    return called(Settings, "identify", settings)
 
 
 def check_known(robot, nominal, recording, settings):

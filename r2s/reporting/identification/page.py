@@ -71,7 +71,6 @@ class Evidence(NamedTuple):
 
 def identification_page(
     run: Run,
-    robot: Robot,
     nominal: Dynamics,
     found: IdentificationResult,
     validation: Recording,
@@ -84,10 +83,11 @@ def identification_page(
     """Write figures, report.md, report.html, base_parameters.csv and recording.rrd, on the validation motion.
 
     Args:
-        run, robot: of the identification. nominal: model before. found: result. validation: held-out motion.
+        run: of the identification. nominal: model before. found: result. validation: held-out motion.
         summary: summary.json. window_s: of replays. cutoff_hz: of the low-pass.
         more: further sections {heading: items}, after the prediction errors.
     """
+    robot = found.space.robot
     torque = TorqueResidual(parameter_space(robot, nominal, {"offset": [-1.0, 1.0]}), validation, cutoff_hz=cutoff_hz)
     motion, both = torque.motion, {"nominal": nominal, "identified": found.dynamics}
     error = {label: torque.error(d) for label, d in both.items()}
