@@ -16,10 +16,12 @@ from r2s.errors import UserError
 from r2s.identification.torque_fit import MASS_LEFT, Moments, Unexplained, mounting, other_masses, other_orders
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.clock import check_clock
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 CUTOFF_HZ, RATE_HZ, MAX_ROWS, MIN_ROWS = 5.0, 20.0, 400, 15  # of the motion at which torques are compared
 EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
+JUDGED_S, CLOCK_S, CLOCK_EACH_S = 240.0, 600.0, 60.0  # s of a longer recording: of units; of the clock, and each part
 SLOWEST_HZ = 5.0  # sampling rate below which nothing is judged
 MOVING = 0.03  # rad/s RMS, below which the velocity of a joint is not judged
 STILL = 0.02  # rad, range of a joint that stands
@@ -48,13 +50,12 @@ class Judged:
     """What the checks of a recording measured; nan or None: the motion does not show it.
 
     Attributes:
-        clock: (n,) change of q over the integral of dq. scale: (n,) dq over the slope of q. late: (n,) s, of dq.
+        clock: (n,) change of q over the integral of dq. scale: (n,) dq over the slope of q.
         misfit: share of the torque's square that the nominal arm leaves. shares: (S,) of nominal gravity in tau.
     """
 
     clock: np.ndarray
     scale: np.ndarray
-    late: np.ndarray
     misfit: float | None = None
     shares: np.ndarray | None = None
 
@@ -78,7 +79,8 @@ def check_units(robot: Robot, recording: Recording) -> Judged | None:
     if recording.rate_hz < SLOWEST_HZ:
         _check_clock(recording)
         return None
-    smooth, step = recording.resample(SIM_DT).smooth(CUTOFF_HZ), round(1 / (RATE_HZ * SIM_DT))
+    some = spread(recording, JUDGED_S)
+    smooth, step = some.resample(SIM_DT).smooth(CUTOFF_HZ), round(1 / (RATE_HZ * SIM_DT))
     dq = smooth.derivative(smooth.q)
     rows = np.concatenate([np.arange(s.start + EDGE, s.stop - EDGE, step) for s in smooth.stretches])
     if len(rows) < MIN_ROWS:
@@ -95,14 +97,12 @@ def check_units(robot: Robot, recording: Recording) -> Judged | None:
     scale = _check_velocity(dq[rows], smooth.dq[rows])
     clock = _check_clock(recording)
     m = Moments(smooth.q[rows], dq[rows], smooth.derivative(dq)[rows], smooth.tau[rows])
-    lead = smooth.dq[rows] - m.dq
-    late = np.where(np.isnan(scale), np.nan, -(lead * m.ddq).sum(0) / np.maximum((m.ddq**2).sum(0), 1e-12))
-    return Judged(clock, scale, late, *_check_torque(robot, m, recording, moved))
+    return Judged(clock, scale, *_check_torque(robot, m, some, moved))
 
 
 def _check_clock(recording: Recording) -> np.ndarray:
     try:
-        return check_clock(recording)
+        return check_clock(spread(recording, CLOCK_S, CLOCK_EACH_S))
     except UserError as error:
         raise DataError(CLOCK, str(error)) from None
 

@@ -20,6 +20,8 @@ from r2s.identification.settings import Settings
 from r2s.identification.unit_checks import CLOCK, GRAVITY, MOVING, ORDER, SUSPECT, UNITS_OF, Judged
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
+from r2s.recordings.lateness import lateness
+from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 PASS, WARN, FAIL, OPEN = "pass", "warn", "fail", "-"  # OPEN: not judged
@@ -28,6 +30,7 @@ OFF_CLOCK = 0.03  # filters of dq and elastic gears change slow motion by 1 to 2
 LATE_S = 1e-3  # s, or half a row: the resolution of a log
 SURE = 2.0  # standard deviations
 LOADED = 0.7, 1.4  # shares of nominal gravity without an undeclared load: masses of files are known to a third
+SPEEDS_S = 600.0  # s of a longer recording whose speeds are counted
 FAST, SLOW = 0.2, 0.05  # of dq_max: a friction curve reaches from below SLOW to beyond FAST
 LEAST_SLOW, LEAST_WAY = 0.01, 0.1  # shares of the moving rows below SLOW, and in each direction
 
@@ -113,7 +116,7 @@ def judge(robot: Robot, nominal: Dynamics, recording: Recording, settings: Setti
         return Verdict((*lines, Line("the rest", OPEN, "not judged", "mend this first")))
     expected = expected_widths(robot, nominal, recording, settings)
     lines += [_clock(recording, judged), *_signals(robot, recording, judged)]
-    lines += [_late_speed(recording, judged), _late_torque(recording, expected), _repeats(recording)]
+    lines += [_late_speed(recording, settings.cutoff_hz), _late_torque(recording, expected), _repeats(recording)]
     return Verdict((*lines, _speeds(robot, recording), _excitation(expected)), expected)
 
 
@@ -179,19 +182,17 @@ def _gravity(robot: Robot, r: Recording, shares: np.ndarray | None) -> Line:
     return Line(GRAVITY, WARN if far else PASS, found, advice, {"share_of_gravity": shares})
 
 
-def _late_speed(r: Recording, judged: Judged | None) -> Line:
-    check = "lateness of dq"
-    late = np.full(r.n_joints, np.nan) if judged is None else judged.late
-    if not np.isfinite(late).any():
+def _late_speed(r: Recording, cutoff_hz: float) -> Line:
+    check, late = "lateness of dq", lateness(r, cutoff_hz)
+    if not np.isfinite(late.s).any():
         return Line(check, OPEN, "too little motion")
-    found = f"{_span(1e3 * late, '{:z.1f}')} ms behind the slope of q"
-    values = {"dq_late_s": late}
-    if np.nanmax(np.abs(late)) < max(LATE_S, 0.5 / r.rate_hz):
-        return Line(check, PASS, found, values=values)
-    handled = {"commanded": "r2s takes the slope of q", "motor": "r2s corrects it"}  # dq_lateness
-    if r.torque in handled:
-        return Line(check, PASS, f"{found}; with {r.torque} torque {handled[r.torque]}", values=values)
-    return Line(check, WARN, found, "a filter? leave dq out of the file, and r2s derives it from q", values)
+    values = {"dq_late_s": late.s, "sigma_s": late.sigma}
+    found = f"{_span(1e3 * late.s, '{:z.1f}')} ms behind the slope of q"
+    if r.torque == "commanded":
+        found += "; with commanded torque r2s takes the slope of q"
+    elif np.nan_to_num(late.sure).any():
+        found += f"; r2s corrects it as {'a filter' if late.filtered else 'a delay'}"
+    return Line(check, PASS, found, values=values)
 
 
 def _late_torque(r: Recording, expected: ExpectedWidths) -> Line:
@@ -215,6 +216,7 @@ def _repeats(r: Recording) -> Line:
 
 
 def _speeds(robot: Robot, r: Recording) -> Line:
+    r = spread(r, SPEEDS_S)
     speed = np.abs(r.dq) / robot.dq_max
     fastest = np.quantile(speed, 0.98, axis=0)
     moving = np.abs(r.dq) > np.minimum(MOVING, 0.1 * SLOW * robot.dq_max)

@@ -9,10 +9,14 @@ from r2s.recordings.recording import Recording
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:
-    """Yield pieces of about `seconds` in the order of the log; neighbours in one trajectory share `overlap_s`."""
+    """Yield pieces of about `seconds` in the order of the log; neighbours in one trajectory share `overlap_s`.
+
+    The last one is longer by what remains, which may be too short to be filtered alone.
+    """
     if recording.duration <= 1.5 * seconds:
         yield recording
         return
+    groups: list[list[np.ndarray]] = []
     group: list[np.ndarray] = []
     held = 0.0
     for s in recording.stretches:
@@ -23,15 +27,11 @@ def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iter
             group.append(s.start + np.arange(first, last))
             held += high - low
             if held >= 0.5 * seconds:  # several short trajectories make one piece
-                yield _rows(recording, group)
+                groups.append(group)
                 group, held = [], 0.0
-    if group:
-        yield _rows(recording, group)
-
-
-def _rows(recording: Recording, group: list[np.ndarray]) -> Recording:
-    rows = np.concatenate(group)
-    return recording.rows(rows, recording.trajectory[rows])
+    groups[-1] += group
+    for rows in map(np.concatenate, groups):
+        yield recording.rows(rows, recording.trajectory[rows])
 
 
 def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Recording:
@@ -45,4 +45,5 @@ def spread(recording: Recording, seconds: float, each_s: float = 10.0) -> Record
         [np.diff(recording.t[s], prepend=recording.t[s.start]) for s in recording.stretches]
     ).cumsum()
     count = max(1, round(seconds / each_s))
-    return recording.select(clock * count / recording.duration % 1.0 < seconds / recording.duration)
+    phase = clock * (count / recording.duration)
+    return recording.select((phase % 1.0 < seconds / recording.duration) & (phase < count * (1.0 - 1e-9)))

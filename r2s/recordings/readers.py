@@ -137,6 +137,9 @@ def from_table(table: Table, how: Options) -> Recording:
     period = notes.get("period") if saved and how.period is None else how.period
     name = notes["name"] if saved else how.name
     held = notes.get("command_period") if saved else None
+    arrays = {k: x.view() for k, x in arrays.items()}
+    for x in arrays.values():
+        x.flags.writeable = False  # `Recording` need not copy what nobody changes
     recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)  # type: ignore[arg-type]
     recording = replace(recording, notes=tuple(repairs), command_period=held)
     if how.max_gap_s is not None and not saved:

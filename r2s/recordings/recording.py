@@ -93,7 +93,7 @@ class Recording:
             raise UserError(f"expected at least {MIN_ROWS} rows, got {len(t)}")
 
     def _check_trajectories(self):
-        index = self.trajectory.astype(np.int64)
+        index = self.trajectory.astype(np.int64, copy=False)
         if not np.array_equal(index, self.trajectory):
             row = int(np.flatnonzero(index != self.trajectory)[0])
             raise UserError(f"expected whole numbers in trajectory, got {self.trajectory[row]:g} at row {row}")
@@ -334,12 +334,16 @@ class Recording:
         return {**own, **period, **self.signals}
 
     def rows(self, rows: np.ndarray, trajectory: np.ndarray, drop_lone: bool = False) -> "Recording":
-        """Return these rows (K,) with their trajectory index (K,); drop_lone: without trajectories of one row."""
+        """Return these rows (K,) with their trajectory index (K,); drop_lone: without trajectories of one row.
+
+        Consecutive rows share the memory of this recording: an hour of a log is large.
+        """
         if drop_lone:
             together = np.bincount(trajectory)[trajectory] > 1
             rows, trajectory = rows[together], np.unique(trajectory[together], return_inverse=True)[1]
-        arrays = {field: getattr(self, field)[rows] for field in FIELDS[:4]}
-        signals = {name: x[rows] for name, x in self.signals.items()}
+        some = rows if len(rows) == 0 or np.any(np.diff(rows) != 1) else slice(rows[0], rows[-1] + 1)
+        arrays = {field: getattr(self, field)[some] for field in FIELDS[:4]}
+        signals = {name: x[some] for name, x in self.signals.items()}
         return replace(self, trajectory=trajectory, signals=signals, **arrays)
 
     def _without_lone_rows(self) -> "Recording":
@@ -373,8 +377,9 @@ def declared_torque(torque: str | None) -> str:
 
 
 def _floats(field: str, value) -> np.ndarray:
-    if isinstance(value, np.ndarray) and value.dtype == np.float64 and not value.flags.writeable:
-        return np.ascontiguousarray(value)  # of another recording
+    own = np.int64 if field == "trajectory" else np.float64
+    if isinstance(value, np.ndarray) and value.dtype == own and not value.flags.writeable:
+        return np.ascontiguousarray(value)  # of another recording, or of a reader
     try:
         return np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):

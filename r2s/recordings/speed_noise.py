@@ -6,7 +6,6 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from r2s.errors import UserError
-from r2s.physics.robot import SIM_DT
 from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
@@ -14,24 +13,8 @@ HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic: position noise of 1
 PIECE_S = 0.05  # s, length of the pieces among which the calm ones are chosen
 CALM = 0.1  # share of the pieces that counts: those with the smallest acceleration
 LONGEST_S = 600.0  # s of a recording that are used
-COMPARED_S = 60.0  # s of a recording in which dq is compared with q
-LATE_S, OFF = 5e-4, 0.05  # s, half a step, and share of the speed: a dq that is farther off is another signal
 MAX_NOISE = 1.0  # rad/s, more than any velocity sensor adds
 MIN_ROWS = 8  # samples that a cubic needs to give a velocity
-
-
-def lateness(recording: Recording, cutoff_hz: float) -> np.ndarray:
-    """Return (n,) s, by how much the logged dq is later than the derivative of q; nan: it is no such derivative.
-
-    Both are compared below `cutoff_hz`, where a filter acts like a delay. A dq is often smoother than q: it is worth
-    more with its lateness corrected than a derivative.
-    """
-    smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
-    slope = smooth.derivative(smooth.q)
-    ddq, lead = smooth.derivative(smooth.dq), slope - smooth.dq
-    late = (lead * ddq).sum(0) / np.maximum((ddq**2).sum(0), 1e-12)
-    off = ((lead - late * ddq) ** 2).sum(0) > OFF**2 * (slope**2).sum(0)
-    return np.where(off, np.nan, np.where(np.abs(late) < LATE_S, 0.0, late))
 
 
 def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:

@@ -19,9 +19,9 @@ from r2s.identification.residuals.zero_phase import EDGE_S, SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia
+from r2s.recordings.lateness import from_q, lateness
 from r2s.recordings.parts import pieces
 from r2s.recordings.recording import Recording
-from r2s.recordings.speed_noise import lateness
 
 STEP = 1e-4  # of the unit cube: finite differences, far above round-off and far below the residual's curvature
 MAX_CORRELATION = 40  # rows: a slowly drifting residual still counts as more than one row
@@ -62,7 +62,8 @@ class TorqueResidual:
         motions: Sequence[Any] = [recording]
         if isinstance(recording, Recording):
             rate_hz = min(rate_hz, MOST_ROWS / recording.duration)
-            late = dq_lateness(recording, cutoff_hz)
+            # with commands the delay is estimated, and logged velocities lag by a filter or a step
+            late = from_q(recording.n_joints) if self.commanded else lateness(recording, cutoff_hz)
             motions = [
                 SlidingMotion.of(piece, rate_hz, slowest, slid, presliding_rad)
                 if slowest
@@ -251,16 +252,6 @@ class TorqueResidual:
         """(T, n) Nm, standard deviation of an independent row."""
         factor, constant = self._weights
         return factor * np.sqrt(constant**2 + self._noise**2)
-
-
-def dq_lateness(recording: Recording, cutoff_hz: float) -> np.ndarray:
-    """Return `lateness` (n,) s of the logged dq as a torque residual corrects it; nan: dq comes from q."""
-    if recording.torque == "commanded":  # the delay is estimated, and logged velocities lag by a filter or a step
-        return np.full(recording.n_joints, np.nan)
-    late = lateness(recording, cutoff_hz)
-    if recording.torque == "measured":  # no rotors: a correction of dq only adds noise (benchmarks/real_panda.py)
-        late = np.where(np.isnan(late), late, 0.0)
-    return late
 
 
 def _standard(d: Dynamics) -> np.ndarray:

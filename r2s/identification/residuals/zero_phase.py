@@ -10,6 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 from r2s.errors import UserError
 from r2s.physics.friction import PRESLIDING, presliding
 from r2s.physics.robot import SIM_DT
+from r2s.recordings.lateness import Lateness
 from r2s.recordings.recording import Recording
 
 FRICTION_HZ = 500  # rate at which friction is evaluated before filtering
@@ -52,12 +53,11 @@ class SmoothMotion:
         cutoff_hz: float,
         rate_hz: float,
         presliding_rad: np.ndarray | float = PRESLIDING,
-        late: np.ndarray | None = None,
+        late: Lateness | None = None,
     ) -> "SmoothMotion":
         """Resample to 1 kHz, low-pass forward and backward, differentiate, and keep `rate_hz` without the edges.
 
-        late: (n,) s, of the logged dq against q, which is corrected; nan: the derivative of q replaces dq. None: dq
-            as logged.
+        late: of the logged dq against q, which is corrected; None: dq as logged.
 
         Raises:
             UserError: no trajectory is long enough.
@@ -66,7 +66,7 @@ class SmoothMotion:
         smooth, quick = grid.smooth(cutoff_hz), grid.smooth(min(FRICTION_CUTOFF * cutoff_hz, 0.4 / SIM_DT))
         kernel = _impulse_response(cutoff_hz, FRICTION_HZ)
         every, reach = round(1 / (FRICTION_HZ * SIM_DT)), len(kernel) // 2
-        dq, fastest = (_velocity(x, late) for x in (smooth, quick))
+        dq, fastest = (x.dq if late is None else late.corrected(x) for x in (smooth, quick))
         ddq, keep = smooth.derivative(dq), []
         spans: list[range] = []
         friction_dq: list[np.ndarray] = []
@@ -130,13 +130,6 @@ class SmoothMotion:
 def too_short(recording: Recording) -> UserError:
     """Return the error for a recording whose trajectories are shorter than both edges."""
     return UserError(f"no trajectory is longer than {2 * EDGE_S:g} s; the recording lasts {recording.duration:g} s")
-
-
-def _velocity(x: Recording, late: np.ndarray | None) -> np.ndarray:
-    """Return (T, n) rad/s: dq as it was before a filter with a time constant of `late` (n,) s, or from q."""
-    if late is None:
-        return x.dq
-    return np.where(np.isnan(late), x.derivative(x.q), x.dq + np.nan_to_num(late) * x.derivative(x.dq))
 
 
 def cubic(x: float | np.ndarray) -> np.ndarray:
