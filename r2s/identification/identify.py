@@ -41,7 +41,7 @@ from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import STICTION_MODELS, Dynamics, with_family
 from r2s.physics.friction import FAMILIES
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.recordings.parts import spread
+from r2s.recordings.parts import give_back, spread
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.recording import Recording
 
@@ -50,6 +50,7 @@ CLEAR = 1.5  # times dq_min, below which a replayed joint may stick
 MAX_BATCH = 64  # candidates replayed at once
 SELECTED_S = 240.0  # s of a longer recording in which terms are selected
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual before
+DOUBTED = {"commanded": "lag", "measured": "signal_delay"}  # by torque: estimated only if the data clearly need it
 ALIKE = 0.2  # relative error of the number of independent rows
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -165,6 +166,7 @@ def identify(
     prior, history = scaled_prior(settings.prior, robot, recording, nominal), History(report, memo)
     s = State(robot, nominal, recording, searches, settings, ramps, prior, history, settings.terms)
     for step in STEPS:
+        give_back(recording)
         s = step(s)
     sure = history.step("posterior", lambda: posterior(s.problem, s.u, settings.seed)._asdict())
     story = {"families": s.families, "edges": s.edges, "refused": s.refused}
@@ -279,23 +281,23 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat a local search with weights from its residual; the last repetition decides whether a lag is needed."""
+    """Repeat a local search with weights from its residual; the last one decides whether a lateness is needed."""
     search = s.searches[-1]
     if not search.local:
         return s
     problem, u = s.problem, s.u
-    lag = s.space.where("lag") if "lag" in s.space.blocks else None
+    name = DOUBTED.get(s.recording.torque)
+    late = s.space.where(name) if name in s.space.blocks else None
 
     def report(row: dict) -> None:
         s.history.add(row | {"search": f"{row['search']}, reweighted"})
 
     for k in range(REWEIGHTS):
-        last = lag is not None and k == REWEIGHTS - 1
-        local = partial(without_lag, search) if last else search
+        local = search if late is None or k < REWEIGHTS - 1 else partial(without, late, search)
         u, problem = _run(s, f"reweighted {k + 1}", local, problem, u, report)  # type: ignore[arg-type]
         problem = problem.reweighted(u, fitted=True)
-    if lag is not None and np.array_equal(u[lag], problem.start[lag]):
-        problem = problem.fixed(lag)
+    if late is not None and np.array_equal(u[late], problem.start[late]):
+        problem = problem.fixed(late)
     return replace(s, problem=problem, u=u)
 
 
@@ -352,21 +354,20 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     return bool(rise > max(len(u), ALIKE * fitted))
 
 
-def without_lag(search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return u (P,) of a local search without a lag, or with one if the data clearly need it.
+def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
+    """Return u (P,) of a local search without the lateness `at`, or with it if the data clearly need it.
 
-    With slow torques a short lag acts like a delay. The data need a lag if it lowers the cost by more than the
-    logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The half-second block that favours a
-    lag most does not count, because rows of a block are correlated.
+    With slow torques a short lag acts like a delay, and a misfit acts like late torque. The data need it if it lowers
+    the cost by more than the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block
+    that favours it most does not count, because rows of a block are correlated.
     """
-    lag = problem.space.where("lag")
-    having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(lag)
+    having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()
-    u[lag] = problem.start[lag]
+    u[at] = problem.start[at]
     u = search(fixed, u, report)
     if fits_torque(search):
         fixed = fixed.torque_reweighted(u)
-    u[lag] = problem.start[lag]  # exactly: `reweight` recognizes a fixed lag by that
+    u[at] = problem.start[at]  # exactly: `reweight` recognizes a fixed value by that
     without, rows = fixed.residual(u[None])[0] ** 2, len(problem.clusters)
     most = np.bincount(problem.clusters, (without - having)[:rows]).max()
     needed = without.sum() - having.sum() - most > np.log(rows)

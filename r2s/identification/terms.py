@@ -132,4 +132,4 @@ def scaled_prior(
 
 def _sizes(robot: Robot, recording: Recording) -> dict[str, Any]:
     """Return the unit of torque-like bounds and priors: the torque limit, or the recorded torque if it is larger."""
-    return sizes(np.maximum(robot.tau_max, np.abs(recording.tau).max(0)))
+    return sizes(np.maximum(robot.tau_max, np.maximum(recording.tau.max(0), -recording.tau.min(0))))

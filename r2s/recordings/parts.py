@@ -1,11 +1,24 @@
 """Parts of a long recording: all of it piece by piece, or some of it spread over the whole."""
 
+import ctypes
+import sys
 from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 
 from r2s.recordings.recording import Recording
+
+
+LONG_S = 600.0  # s, of a recording whose intermediate results take hundreds of MB
+
+
+def give_back(recording: Recording) -> None:
+    """Give freed memory back to the system after work on a long recording: glibc keeps blocks of up to 32 MB."""
+    if recording.duration > LONG_S and sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # musl has none
+        if trim is not None:
+            trim(0)
 
 
 def pieces(recording: Recording, seconds: float, overlap_s: float = 0.0) -> Iterator[Recording]:

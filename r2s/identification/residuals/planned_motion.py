@@ -1,6 +1,5 @@
 """A planned motion in place of a recording: exact, so that no filter is needed."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +40,6 @@ class PlannedMotion:
         tau = mujoco_inverse_dynamics(model, q, dq, ddq) + nominal.friction(dq, np.sign(dq))
         change = np.gradient(tau.reshape(motions[0].shape), t, axis=1).reshape(tau.shape)
         return PlannedMotion(np.tile(t, len(motions[0])), q, dq, ddq, tau, change, torque)
-
-    @staticmethod
-    def joined(parts: "Sequence[PlannedMotion]") -> "PlannedMotion":
-        """Return the one motion of `parts`."""
-        (motion,) = parts
-        return motion
 
     @property
     def friction_dq(self) -> np.ndarray:

@@ -4,8 +4,9 @@ Link-side and motor torque include gravity and have no command to replay, so thi
 commanded torque it is the fast start of a fit. Rows are in units of their own standard deviation, see `reweighted`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,9 @@ from r2s.identification.residuals.zero_phase import EDGE_S, SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia
+from r2s.physics.robot import Robot
 from r2s.recordings.lateness import from_q, lateness
-from r2s.recordings.parts import pieces
+from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
 
 STEP = 1e-4  # of the unit cube: finite differences, far above round-off and far below the residual's curvature
@@ -29,6 +31,7 @@ MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 60_000  # moments: from ten minutes on they are farther apart, and below the cutoff lose little
 PIECE_S = 60.0  # s of a recording that are filtered at once
 PART = 2048  # moments whose Jacobian is in memory at once
+FRICTION_PART = 32_768  # rows at which friction is evaluated at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 
 
@@ -58,22 +61,20 @@ class TorqueResidual:
     ):
         self.space, self._period = space, None if isinstance(recording, PlannedMotion) else recording.period
         self.commanded, self.at_motor = recording.torque == "commanded", recording.torque == "motor"
-        slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
-        motions: Sequence[Any] = [recording]
-        if isinstance(recording, Recording):
-            rate_hz = min(rate_hz, MOST_ROWS / recording.duration)
-            # with commands the delay is estimated, and logged velocities lag by a filter or a step
-            late = from_q(recording.n_joints) if self.commanded else lateness(recording, cutoff_hz)
-            motions = [
-                SlidingMotion.of(piece, rate_hz, slowest, slid, presliding_rad)
-                if slowest
-                else SmoothMotion.of(piece, cutoff_hz, rate_hz, presliding_rad, late)
-                for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / rate_hz)
-            ]
-        self._rigid = RigidBodyRows.joined([RigidBodyRows.of(space.robot, m, recording.torque) for m in motions])
         robot = space.robot
         self._nominal = LinkInertia(robot.mass, robot.com, robot.inertia).standard().ravel()
-        m = type(motions[0]).joined(motions)
+        if isinstance(recording, Recording):
+            rate_hz = min(rate_hz, MOST_ROWS / recording.duration)
+            slid = FULLY_BENT * PRESLIDING if space.nominal.family.has_memory else 0.0
+            if slowest:
+                of: Any = partial(SlidingMotion.of, slowest=slowest, slid=slid)
+            else:
+                # with commands the delay is estimated, and logged velocities lag by a filter or a step
+                late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
+                of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
+            m, self._rigid = _joined(robot, recording, partial(of, rate_hz=rate_hz, presliding_rad=presliding_rad))
+        else:
+            m, self._rigid = recording, RigidBodyRows.of(robot, recording, recording.torque)  # type: ignore[arg-type]
         self.motion: SmoothMotion | SlidingMotion | PlannedMotion = m
         sliding = isinstance(m, SlidingMotion)
         self.seen: np.ndarray = m.seen if sliding else np.abs(m.dq) >= slowest * isinstance(m, PlannedMotion)
@@ -135,13 +136,18 @@ class TorqueResidual:
         A simulator that integrates friction implicitly uses the velocity of the step before, `lead_s` too old, and
         corrects it where friction rises.
         """
-        m, sign = self.motion, self._sign[d.family.has_memory]
-        if not self.lead_s:
-            return d.friction(m.friction_dq, sign)
-        old, coming = (m.friction_dq + s * self.lead_s * m.ddq for s in (-1.0, 1.0))
-        way = np.sign(m.friction_dq)
-        rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(m.ddq)
-        return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(m.ddq)
+        out = np.empty_like(self.motion.friction_dq)
+        for first in range(0, len(out), FRICTION_PART):
+            rows = slice(first, first + FRICTION_PART)
+            dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
+            if not self.lead_s:
+                out[rows] = d.friction(dq, sign)
+                continue
+            ddq, way = self.motion.ddq[rows], np.sign(dq)
+            old, coming = (dq + s * self.lead_s * ddq for s in (-1.0, 1.0))
+            rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(ddq)
+            out[rows] = d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
+        return out
 
     def error(self, dynamics: Dynamics) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
@@ -252,6 +258,16 @@ class TorqueResidual:
         """(T, n) Nm, standard deviation of an independent row."""
         factor, constant = self._weights
         return factor * np.sqrt(constant**2 + self._noise**2)
+
+
+def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
+    """Return the motion of a recording, `of` each piece in turn, and its rigid-body torque."""
+    motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
+    rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
+    joined = type(motions[0]).joined(motions)
+    del motions
+    give_back(recording)
+    return joined, rigid
 
 
 def _standard(d: Dynamics) -> np.ndarray:

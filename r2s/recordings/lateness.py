@@ -1,0 +1,86 @@
+"""How much later the logged dq of a recording is than its q."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.physics.robot import SIM_DT
+from r2s.recordings.parts import spread
+from r2s.recordings.recording import Recording
+
+COMPARED_S = 60.0  # s of a recording in which dq is compared with q
+EDGE = 100  # ms, dropped at both ends of a trajectory, where the filter has transients
+BLOCK = 500  # ms, whose errors count as independent
+LATE_S, SURE = 5e-4, 3.0  # s, half a step; standard deviations: less is no lateness
+OFF = 0.05  # share of the speed: a dq that is farther off is another signal
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Lateness of dq against the derivative of q.
+
+    Attributes:
+        s: (n,) s; nan: dq is no such derivative, or the joint does not move. sigma: (n,) s, its standard deviation.
+        filtered: whether dq is behind a first-order filter of that time constant; otherwise it is delayed.
+    """
+
+    s: np.ndarray
+    sigma: np.ndarray
+    filtered: bool = False
+
+    @property
+    def sure(self) -> np.ndarray:
+        """(n,) s, 0 where it is too small or uncertain to be corrected."""
+        seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
+        return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
+
+    def corrected(self, smooth: Recording) -> np.ndarray:
+        """Return (T, n) rad/s: the velocity without the lateness, from dq or, where that is nan, from q."""
+        return _corrected(smooth, self.sure, self.filtered)
+
+
+def from_q(joints: int) -> Lateness:
+    """Return the lateness with which the derivative of q replaces dq."""
+    return Lateness(np.full(joints, np.nan), np.zeros(joints))
+
+
+def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
+    """Return the lateness of dq, by least squares below `cutoff_hz`, where a filter acts like a delay.
+
+    A dq is often smoother than q: it is worth more with its lateness corrected than a derivative. Whether a filter
+    or a delay made it late is what leaves less between them.
+    """
+    smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
+    slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints
+    block, rows = np.full(len(smooth.t), -1), 0
+    for s in smooth.stretches:
+        inside = np.arange(s.start + EDGE, s.stop - EDGE)
+        block[inside] = rows + np.arange(len(inside)) // BLOCK
+        rows += -(-len(inside) // BLOCK)
+    inside = block >= 0
+    if not rows:
+        return Lateness(np.zeros(n), np.zeros(n))
+
+    def sums(x: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(block[inside], column) for column in x[inside].T], 1)
+
+    square = np.maximum(sums(ddq**2).sum(0), 1e-12)
+    late = sums((slope - smooth.dq) * ddq).sum(0) / square
+    left = slope - smooth.dq - late * ddq
+    sigma = np.sqrt((sums(left * ddq) ** 2).sum(0)) / square
+    off = (left[inside] ** 2).sum(0) > OFF**2 * (slope[inside] ** 2).sum(0)
+    late = np.where(off, np.nan, late)
+    filtered, delayed = (((slope - _corrected(smooth, late, x))[inside] ** 2).sum() for x in (True, False))
+    return Lateness(late, sigma, bool(filtered < delayed))
+
+
+def _corrected(smooth: Recording, late: np.ndarray, filtered: bool) -> np.ndarray:
+    """Return (T, n) rad/s, dq as it was before a filter or a delay of `late` (n,) s; nan: the derivative of q."""
+    if filtered:
+        out = smooth.dq + np.nan_to_num(late) * smooth.derivative(smooth.dq)
+    else:
+        out = smooth.dq.copy()
+        for s in smooth.stretches:
+            for j in np.flatnonzero(np.nan_to_num(late)):
+                out[s, j] = np.interp(smooth.t[s] + late[j], smooth.t[s], smooth.dq[s, j])
+    return np.where(np.isnan(late), smooth.derivative(smooth.q), out) if np.isnan(late).any() else out
