@@ -31,8 +31,8 @@ def found_in(robot, recording, *terms):
 def test_what_is_late_does_not_go_into_the_links(robot, motion, lateness):
     """With dq behind a filter of 10 ms and torque 8 ms late, links and delay are within their intervals.
 
-    The nominal links are the true ones. Half intervals: of 31 at 95 %, one in 300 is off by 1.5 of them. The inertia of
-    link 1 about its axis, as exp(2 alpha), is 1.5 and 0.65 times the true one if dq or torque is taken as it is.
+    The nominal links are the true ones. Half intervals: of 31 at 95 %, one in 300 is off by 1.5 of them. The inertia
+    of link 1 about its axis, as exp(2 alpha), is 1.5 and 0.65 times the true one if dq or torque is taken as it is.
     """
     found = found_in(robot, late(motion, **lateness), "signal_delay")
     at = np.concatenate([found.space.where(name) for name in ("signal_delay", *LINKS)])

@@ -4,11 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r2s.identification.link_inertia import LINK
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.modulating_functions import SlidingMotion
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.physics.friction import WIDTH_DQ
 from r2s.physics.robot import Robot
+
+GAIN = 0.05  # standard deviation of a sensor's gain, the prior of conf/identify
+MASSES = 0.1  # standard deviation of an error that all masses of a file share
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +27,26 @@ class Arm:
     def robot(self) -> Robot:
         """The arm's kinematics, limits and tool."""
         return self.space.robot
+
+
+def sensor_factor(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Return (n,), the factor of the arm's torque per joint that is more likely its masses' than its gains', and its
+    standard deviation.
+
+    The torque of an unloaded arm shows a gain times the masses. An identification that estimates gains with the
+    masses of the file gives the error of these to the gains, and what the arm carries would be off by as much. The
+    gains of joints are independent, an error of all masses is one: its likely value is that for which both, from
+    N(0, GAIN) and N(0, MASSES), are least in squares.
+    """
+    space, n = arm.space, arm.robot.n
+    if "gain" not in space.blocks or LINK[0] in space.blocks:
+        return np.ones(n), np.zeros(n)
+    at = space.where("gain")
+    gain, sd = arm.x[at], np.zeros(n) if arm.samples is None else arm.samples[:, at].std(0)
+    seen = sd < 0.5 * GAIN  # the gain of another joint is its prior's
+    information = seen.sum() / GAIN**2 + 1.0 / MASSES**2
+    shift = -gain[seen].sum() / GAIN**2 / information
+    return np.where(seen, 1.0 + shift / (1.0 + gain), 1.0), np.where(seen, information**-0.5 / (1.0 + gain), 0.0)
 
 
 def sliding_sign(torque: TorqueResidual) -> np.ndarray:

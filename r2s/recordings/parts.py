@@ -9,7 +9,6 @@ import numpy as np
 
 from r2s.recordings.recording import Recording
 
-
 LONG_S = 600.0  # s, of a recording whose intermediate results take hundreds of MB
 
 

@@ -175,6 +175,7 @@ def _concluded(loaded: LoadedTorque, fit: _Linearized, seed: int) -> PayloadEsti
     own = loaded.torque
     x, motion = loaded.arm.x, own.motion
     bare, carrying = (loaded.with_payload(p).errors(x[None])[0] for p in (None, payload))
+    carrying = bare + loaded.factor[0] * (carrying - bare)
     measured = own.predict(loaded.arm.space.dynamics(x)) - own.error(loaded.arm.space.dynamics(x))
     torques = measured, measured + bare, measured + carrying
     return PayloadEstimate(float(m), c, i, draws, known, motion.t, *torques, own.seen)

@@ -6,7 +6,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from r2s.identification.arm_uncertainty import Arm, arm_directions, sliding_sign
+from r2s.identification.arm_uncertainty import Arm, arm_directions, sensor_factor, sliding_sign
 from r2s.identification.identify import STANDSTILL
 from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
@@ -83,7 +83,7 @@ class LoadedTorque:
     """
 
     def __init__(self, arm: Arm, recording: Recording, declared: Payload | None = None, cutoff_hz: float = 10.0):
-        self.arm, self.kind = arm, recording.torque
+        self.arm, self.kind, self.factor = arm, recording.torque, sensor_factor(arm)
         commanded = recording.torque == "commanded"
         how = {"cutoff_hz": cutoff_hz, "slowest": STANDSTILL if commanded else 0.0}
         rate = RATE_HZ / max(1, round(recording.duration / LONG_S))
@@ -143,9 +143,11 @@ class LoadedTorque:
             error = error + d.load * change
             arm = np.concatenate([arm, LOAD_FRICTION * change[..., None] * np.eye(len(d.load))], -1)
         body = self.body_torque(torque, payload)
-        error = error - body @ phi
+        carried, (factor, sd) = body @ phi, self.factor
+        arm = np.concatenate([arm, (sd * carried)[..., None]], -1)
         if w is not None and len(w) == arm.shape[-1]:
-            torque = self.with_payload(payload, -arm @ w)
+            torque = self.with_payload(payload, -arm @ w - (factor - 1.0) * carried)
+        error, body = error - carried, body * factor[:, None]
         weight = (1.0 / torque.scale)[torque.seen]
         clusters = np.unique(torque.clusters[torque.seen.ravel()], return_inverse=True)[1]
         return Rows(
