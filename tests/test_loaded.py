@@ -107,6 +107,19 @@ def test_from_commands_whatever_was_declared(robot, declared):
     assert estimate.mass == pytest.approx(payload.mass, rel=0.05)
 
 
+def test_a_gain_that_stands_in_for_the_masses_is_not_the_payloads(robot):
+    """All masses are 8 % less than in the file, and gains took that: the payload is right within 2 %, not 8 % off."""
+    payload, truth = carried(robot), truth_of(robot, links=(1.0,))
+    lighter = replace(truth, mass=0.92 * truth.mass, inertia=0.92 * truth.inertia)
+    recording = log(robot, dynamics_with_payload(robot, lighter, payload), "measured", seconds=SECONDS, seed=3)
+    arm = identified(robot, truth, "measured", gain=[-0.3, 0.3])
+    gain = np.where(np.isin(np.arange(len(arm.x)), arm.space.where("gain")), -0.08, 0.0)
+    estimate = identify_payload(replace(arm, x=arm.x + gain, samples=arm.samples + gain), recording)
+    check_found(estimate, payload)
+    assert estimate.mass == pytest.approx(payload.mass, rel=0.02)
+    assert 0.02 < 0.5 * np.ptp(estimate.interval("mass")) / payload.mass < 0.08
+
+
 def test_no_payload_is_no_payload(robot):
     truth, recording = truth_and_recording(robot, "measured", None)
     estimate = identify_payload(identified(robot, truth, "measured", gain=[-0.3, 0.3]), recording)
