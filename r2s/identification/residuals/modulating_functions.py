@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.signal import savgol_filter
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array
 
 from r2s.identification.residuals.zero_phase import EDGE_S, cubic, too_short
 from r2s.physics.friction import PRESLIDING, presliding
@@ -120,7 +120,7 @@ class SlidingMotion:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
         arrays = {name: np.concatenate([getattr(m, name) for m in parts]) for name in names}
-        means = [csr_array(block_diag(own, format="csr")) for own in zip(*(m.means for m in parts), strict=True)]
+        means = [_block_diagonal(own) for own in zip(*(m.means for m in parts), strict=True)]
         return SlidingMotion(means=tuple(means), encoder=np.median([m.encoder for m in parts], axis=0), **arrays)
 
     @property
@@ -161,6 +161,16 @@ def _derivative(recording: Recording, order: int, most: int = 5) -> np.ndarray:
         if rows > 2:
             out[s] = savgol_filter(recording.q[s], rows, min(rows - 1, 4), deriv=order, delta=SIM_DT, axis=0)
     return out
+
+
+def _block_diagonal(parts: Sequence[csr_array]) -> csr_array:
+    """Return matrices as the diagonal blocks of one; scipy's function takes several times the memory."""
+    rows, columns = (np.cumsum([0, *(m.shape[k] for m in parts)]) for k in (0, 1))
+    entries = np.cumsum([0, *(m.nnz for m in parts)])
+    data = np.concatenate([m.data for m in parts])
+    indices = np.concatenate([m.indices + base for m, base in zip(parts, columns.astype(np.int32), strict=False)])
+    ends = np.concatenate([[0], *(m.indptr[1:] + base for m, base in zip(parts, entries, strict=False))])
+    return csr_array((data, indices, ends), shape=(rows[-1], columns[-1]))
 
 
 def _averaged(means: tuple[csr_array, ...], x: np.ndarray) -> np.ndarray:
