@@ -26,12 +26,13 @@ COLUMNS = [
 ]
 
 
-def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=True):
+def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=True, stops=False):
     """Press m arms through the driver; return (m, 4): largest force and its bounds, N, and cycles in contact.
 
     On surfaces of 2e3 to 1e5 N/m, elsewhere than the plane by up to 5 mm and 5 degrees, by full torque, retreats,
     oscillations and noise, `delay` cycles late. An arm that the driver stops, for example at a position limit, counts
-    until its motion has ended. Bounds: `PushLimit.bound` in the posture of the largest force, with the surface's
+    until its motion has ended. stops: each falls silent in the second half of the time, is stopped as `limit.stop` says, and
+    counts to the end. Bounds: `PushLimit.bound` in the posture of the largest force, with the surface's
     friction and without.
     """
     rng, n, up = np.random.default_rng(seed), robot.n, limit.normal
@@ -49,15 +50,16 @@ def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=Tr
     stiff = 10 ** rng.uniform(1, 3, (m, 1)) * robot.tau_max / robot.tau_max.max()
     damps = 0.2 * (rng.random((m, 1)) < 0.7)  # s; the others oscillate
     force, touched, push, late = np.zeros(m), np.zeros(m), np.full(m, PUSHES[0]), [np.zeros((m, n))] * (delay + 1)
-    at_peak = starts.copy()
+    at_peak, silent = starts.copy(), rng.integers(cycles // 2, cycles - 700, m) if stops else np.full(m, cycles)
     for cycle in range(cycles):
         if cycle % 20 == 0:
             push = np.where((rng.random(m) < 0.1) & (cycle > 0), rng.choice(PUSHES, m), push)
             shake = rng.uniform(-0.3, 0.3, (m, n)) * torque * (rng.random((m, 1)) < 0.3)
         command = push[:, None] * inwards + stiff * (starts - sim.q - damps * sim.dq) + shake
+        command[silent <= cycle] = np.nan
         late.append(driver(sim.q.copy(), sim.dq.copy(), late[-1], command))
         sim.rollout(late[-1 - delay][:, None], record=())
-        pressing = (sim.contact_force * normal).sum(1) * ~driver.done
+        pressing = (sim.contact_force * normal).sum(1) * (stops | ~driver.done)
         at_peak[pressing > force] = sim.q[pressing > force]
         force, touched = np.maximum(force, pressing), touched + (pressing > TOUCHING)
     bounds = [

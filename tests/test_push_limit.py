@@ -11,7 +11,7 @@ from test_press import FRICTIONLESS, PANDA, TRUE, N, make_draw, make_task, press
 
 from r2s.arm.driver import DriverBatch
 from r2s.errors import UserError
-from r2s.physics.push_limit import OVERSHOOT, SPEED_NEAR, PushLimit, _tip_motion, push_limit
+from r2s.physics.push_limit import OVERSHOOT, SPEED_NEAR, PushLimit, tip_motion, push_limit
 from r2s.physics.safety_filter import filter_limits
 from r2s.physics.simulator import Simulator
 from r2s.physics.surface import Surface
@@ -42,7 +42,7 @@ def test_the_motion_of_the_tip_is_that_of_its_jacobian():
     columns = replace(LIMIT, place=0.0, tilt=0.0).columns(PANDA)
     for _ in range(20):
         q, dq, row = rng.uniform(PANDA.q_min, PANDA.q_max), rng.normal(size=N), np.empty(N)
-        height, speed, along, convective = _tip_motion(columns, kinematics(q), dq, row)
+        height, speed, along, convective = tip_motion(columns, kinematics(q), dq, row)
         place, J = tip(q)
         after, before = (tip(q + s * h * dq)[1] @ dq for s in (1, -1))
         assert height == pytest.approx(UP @ (place - POINT) - PANDA.tool.radius, abs=1e-12)

@@ -100,6 +100,13 @@ class CommandLoop:
 
     def _cycle(self, command: np.ndarray | None, hold: np.ndarray | None = None) -> ArmState:
         """Run one cycle without asking for requests."""
+        self._step(command, hold)
+        if self.driver.done:
+            self._raise(str(self.driver.stopping), self.driver.held)
+        return self.state
+
+    def _step(self, command: np.ndarray | None, hold: np.ndarray | None) -> None:
+        """Run one cycle, whether or not the driver has brought the arm to rest."""
         if self._ended:
             raise ArmStopped("the motion is over")
         began = time.perf_counter()
@@ -116,9 +123,6 @@ class CommandLoop:
             self._ended = True
             raise
         self.state = self.arm.read()
-        if self.driver.done:
-            self._raise(str(self.driver.stopping), self.driver.held)
-        return self.state
 
     def rest(self, hold: np.ndarray | None = None) -> None:
         """Damp the arm's motion and bring its command to `hold` (n,) Nm, for at most 0.5 s.
@@ -157,13 +161,28 @@ class CommandLoop:
         self._raise(reason, hold=np.zeros(self.arm.robot.n))
 
     def end(self) -> str | None:
-        """Stop the arm; return the reason if the driver was bringing it to rest, else None."""
+        """Stop the arm; return the reason if the driver was bringing it to rest, else None.
+
+        An arm that may press leaves its contact before, as in any other stop (r2s/physics/contact_stop.py).
+        """
         reason = None if self._ended else self.driver.stopping
         if reason is not None:
             self._block(reason)
+        elif not self._ended and self.driver.decides_contact:
+            reason = self._leave()
         self._ended = True
         self._stop_arm(self.driver.held)
         return reason
+
+    def _leave(self) -> str | None:
+        """Let the driver bring an arm to rest whose motion is over; return why the arm stopped itself, or None."""
+        self.driver.stop("the motion is over")
+        try:
+            while not self.driver.done:
+                self._step(None, None)
+        except ArmStopped as reason:
+            return str(reason)
+        return None
 
     def _check_request(self) -> None:
         if (reason := requested()) is not None:

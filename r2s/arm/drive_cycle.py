@@ -9,12 +9,13 @@ import numpy as np
 
 from r2s.compiled import njit
 from r2s.physics.actuation import condition
+from r2s.physics.contact_stop import LEAVES_S, OVER, stop_torque
 from r2s.physics.control_laws import BUILT_IN, chain, control_law
 from r2s.physics.fence import Fence, breached
 from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import WORK as DESK
 from r2s.physics.newton_euler import equations
-from r2s.physics.push_limit import limit_pushes
+from r2s.physics.push_limit import PHASE, limit_pushes
 from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import (
     BRAKE_S,
@@ -183,13 +184,33 @@ def _compensate(i, dq, stopping, given, bounds, memory, target):
 
 
 @njit(cache=True)
-def _push(limit, arm, share, model, last, out):
-    """Limit the push of the torques `out` (n,) Nm; see push_limit.py."""
-    n = len(out)
+def _kinematics(model, q):
+    """Return position and rotation of the last link, and anchors and axes of the joints, at q (n,) rad."""
+    n = len(q)
     frames, axes = np.empty((n, POSE)), np.empty((n, 3))
-    link_frames(model.links, arm.q, frames, axes)
-    kinematics = frames[n - 1, :3], frames[n - 1, 3:], frames, axes
-    return limit_pushes(limit, arm, kinematics, last, share, model.friction, model.limits, out)
+    link_frames(model.links, q, frames, axes)
+    return frames[n - 1, :3], frames[n - 1, 3:], frames, axes
+
+
+@njit(cache=True)
+def _brake(i, seen, arm, bounds, model, memory):
+    """Set target torque and allowed speeds of arm i, which is being brought to rest from its present speed at once.
+
+    A stop for any cause but the arm's own place and state decides what becomes of a contact force.
+    """
+    needs, why = 0.0, memory.why[i]
+    memory.target[i] = 0.0
+    if seen and memory.damped[i] == 1:
+        memory.share[i] = min(1.0, (np.abs(arm.dq) / model.limits[:, DQ_ALLOWED]).max())
+    if seen and len(memory.push[i]) > 0 and (why == SILENT or why == LAW_NOT_FINITE or why == REQUESTED):
+        if memory.damped[i] * SIM_DT > LEAVES_S:
+            memory.push[i, PHASE] = OVER
+        needs = stop_torque(
+            memory.push[i], arm, _kinematics(model, arm.q), model.friction, model.limits, memory.target[i]
+        )
+        memory.target[i] = np.minimum(np.maximum(memory.target[i], -bounds.torque), bounds.torque)
+        memory.rests[i] &= memory.push[i, PHASE] == OVER
+    memory.share[i] = max(needs, memory.share[i] - SIM_DT / BRAKE_S)
 
 
 def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
@@ -203,7 +224,7 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
     number, parameters = control
     limits = model.limits
     work, effort = np.empty((2 * n + WORK, n)), np.empty((1, 1, n))
-    inertia, bias, desk, weightless = np.empty((n, n)), np.empty(n), np.empty((n, DESK)), np.zeros(3)
+    inertia, bias, desk, weightless = np.empty((n, n)), np.zeros(n), np.empty((n, DESK)), np.zeros(3)
     mass, law_torque = np.empty(n * (n + 1) // 2), np.empty(n)  # mass: the lower triangle, row by row
     for i in range(m):
         seen = _watch(i, q[i], dq[i], given, bounds, memory)
@@ -214,11 +235,15 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
         stopping = memory.why[i] != RUNS
         memory.damped[i] += stopping
         memory.rests[i] = seen and (np.abs(dq[i]) < STILL).all()
-        if stopping:  # brake from the present speed, at once
-            memory.target[i] = 0.0
-            if seen and memory.damped[i] == 1:
-                memory.share[i] = min(1.0, (np.abs(dq[i]) / limits[:, DQ_ALLOWED]).max())
-            memory.share[i] = max(0.0, memory.share[i] - SIM_DT / BRAKE_S)
+        arm = JointDynamics(q[i], dq[i], mass, bias)
+        if seen:
+            equations(model.links, weightless, q[i], dq[i], inertia, bias, desk)
+            for j in range(n):
+                inertia[j, j] += model.rotors[j]
+                for k in range(j + 1):
+                    mass[j * (j + 1) // 2 + k] = inertia[j, k]
+        if stopping:
+            _brake(i, seen, arm, bounds, model, memory)
         elif memory.commanded[i]:
             control_law(number, q[i], dq[i], memory.command[i], parameters, memory.law[i], law_torque)
             if np.isfinite(law_torque).all():
@@ -232,19 +257,14 @@ def _drive_cycle(q, dq, applied, given, control, bounds, model, memory):
         condition(memory.target[at], conditioned, settings, 1, effort)
         last = applied[i] if np.isfinite(applied[i]).all() else memory.sent[i]
         if seen:
-            equations(model.links, weightless, q[i], dq[i], inertia, bias, desk)
-            for j in range(n):
-                inertia[j, j] += model.rotors[j]
-                for k in range(j + 1):
-                    mass[j * (j + 1) // 2 + k] = inertia[j, k]
             share, now = memory.share[i], effort[0, 0]
             _compensate(i, dq[i], stopping, given, bounds, memory, now)
-            arm = JointDynamics(q[i], dq[i], mass, bias)
             changed = fade(q[i], dq[i], now, limits, out[i])
             if len(memory.push[i]) == 0:
                 changed |= limit_acceleration(arm, share, model.friction, limits, work, out[i])
             else:
-                changed |= _push(memory.push[i], arm, share, model, last, out[i])
+                own = memory.push[i], arm, _kinematics(model, q[i])
+                changed |= limit_pushes(*own, last, share, model.friction, limits, out[i])
             limit_rate(last, limits, out[i])
             memory.limited[i] += changed
         else:

@@ -34,7 +34,7 @@ from r2s.physics.collision import CollisionCheck, empty_scene
 from r2s.physics.control_laws import BUILT_IN, ControlLaw, law_number, registered, torque_law
 from r2s.physics.fence import Fence
 from r2s.physics.newton_euler import links_of
-from r2s.physics.push_limit import PushLimit
+from r2s.physics.push_limit import HOLD, STOP, PushLimit
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.safety_filter import DQ_ALLOWED, DQ_MAX, filter_limits
@@ -129,8 +129,16 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, the compensation that is kept while an arm is brought to rest."""
-        return self._memory.held
+        """(m, n) Nm, the compensation that is kept while an arm is brought to rest, and the force of a stop that holds."""
+        m = self._memory
+        if not self.decides_contact:
+            return m.held
+        return m.held + m.target * ((m.why != RUNS) & (m.push[:, STOP] == HOLD))[:, None]
+
+    @property
+    def decides_contact(self) -> bool:
+        """Whether a stop holds, releases or retreats from a contact: with a `push_limit`."""
+        return bool(len(self._push))
 
     @property
     def limited(self) -> np.ndarray:
@@ -141,7 +149,7 @@ class DriverBatch:
     def done(self) -> np.ndarray:
         """(m,), whether a motion that is being stopped is at rest, or DAMP_S is over."""
         m = self._memory
-        return (m.why != RUNS) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
+        return (m.why != RUNS) & (m.damped > 0) & (m.rests | (m.damped * SIM_DT >= DAMP_S))
 
     def __call__(
         self,
@@ -225,8 +233,13 @@ class Driver:
 
     @property
     def held(self) -> np.ndarray:
-        """(n,) Nm, the compensation that is kept while the arm is brought to rest; zero after a contact."""
+        """(n,) Nm, see `DriverBatch.held`; without the force of a stop that holds it is zero after a contact."""
         return self._drivers.held[0]
+
+    @property
+    def decides_contact(self) -> bool:
+        """Whether a stop decides what becomes of a contact; see `DriverBatch`."""
+        return self._drivers.decides_contact
 
     @property
     def limited(self) -> int:

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.errors import UserError, check_number
+from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.linear_algebra import factor, solve, unpack
 from r2s.physics.payload import ee_pose
 from r2s.physics.rigid_body import InverseInertia
@@ -40,11 +40,16 @@ from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, limit_accel
 from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
-# Columns of a limit, and what it keeps between cycles: RESISTED N, SPEED m/s, and whether it has begun
+# Columns of a limit, and what it keeps between cycles: RESISTED N, SPEED m/s, whether it has begun; and of a stop
+# (contact_stop.py): its phase, the force N as it began, the height m at which it had released the surface, and its pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
 )
-COLUMNS = BEGUN + 1
+STOP, PHASE, FELT, HEIGHT, PULL = range(BEGUN + 1, BEGUN + 6)
+COLUMNS = PULL + 1
+HOLD, RELEASE, RETREAT = 1, 2, 3  # values of STOP
+STOPS = {"hold": HOLD, "release": RELEASE, "retreat": RETREAT}
+LEAVE = 0.05  # m/s, of a tip that a stop moves outwards: the depth of 20 N on 2e3 N/m in half of LEAVES_S
 WORK = 3  # rows of `work` beside n
 ROUNDS = 16  # most trials of f
 CLOSE = 1e-2  # m/s^2, by which the found torque may push less than is allowed
@@ -59,7 +64,7 @@ class PushLimit:
 
     Attributes:
         force_max: N. speed_near: m/s. point, normal: (3,) of the plane in the base frame, m.
-        place: m and tilt: rad, by which the true plane may differ.
+        place: m and tilt: rad, by which the true plane may differ. stop: what a stop does with a force, of STOPS.
 
     """
 
@@ -69,6 +74,7 @@ class PushLimit:
     normal: np.ndarray
     place: float = 0.0
     tilt: float = 0.0
+    stop: str = "release"
 
     def columns(self, robot: Robot) -> np.ndarray:
         """Return the limit (COLUMNS,) of the robot's tool, before the first cycle."""
@@ -76,7 +82,7 @@ class PushLimit:
         site, axes = ee_pose(robot)
         out = np.zeros(COLUMNS)
         out[FORCE_MAX], out[SPEED_NEAR] = self.force_max, self.speed_near / OVERSHOOT
-        out[SLOPE], out[MARGIN] = np.tan(self.tilt), self.place
+        out[SLOPE], out[MARGIN], out[STOP] = np.tan(self.tilt), self.place, STOPS[self.stop]
         out[POINT : POINT + 3], out[NORMAL : NORMAL + 3] = self.point, self.normal
         out[TIP : TIP + 3], out[RADIUS] = site + axes @ robot.tool.tip, robot.tool.radius  # type: ignore[union-attr]
         return out
@@ -107,6 +113,7 @@ def push_limit(
     speed_near: float | None,
     plane: tuple[np.ndarray, np.ndarray] | None = None,
     asked: float = 0.0,
+    stop: str | None = None,
 ) -> PushLimit | None:
     """Return the limit of `safety.force_max` and `safety.speed_near`; None if both are null.
 
@@ -114,11 +121,14 @@ def push_limit(
         robot: with a tool. friction: (n,) Nm, level of each joint's friction.
         force_max: N. speed_near: m/s; null: what lets a rigid surface of 1e5 N/m add force_max.
         plane: point and normal; None: a table below the tip at home. asked: N, largest force that the task asks for.
+        stop: of STOPS; None: release, whose derivation docs/explanation/safety.md has.
 
     Raises:
         UserError: a value out of range, the robot has no tool, or the force is below what joint friction may hide
             and the task asks.
     """
+    if stop is not None and stop not in STOPS:
+        raise UserError(f"task.stop: {stop!r}; allowed: {choices(STOPS)}{nearest(str(stop), STOPS)}")
     if force_max is None and speed_near is None:
         return None
     if force_max is None:
@@ -134,11 +144,11 @@ def push_limit(
             f"safety.force_max: {force_max:g} N is not allowed; {least:.3g} N or more is: the task asks for "
             f"{asked:g} N, and joint friction may hide {hidden:.2g} N in each direction"
         )
-    return PushLimit(float(force_max), float(speed_near), point, normal)
+    return PushLimit(float(force_max), float(speed_near), point, normal, stop=stop or "release")
 
 
 @njit(cache=True, error_model="numpy")
-def _tip_motion(limit, kinematics, dq, row):
+def tip_motion(limit, kinematics, dq, row):
     """Write how joints move the tip inwards, (n,) m/rad; return its height, speeds m/s, and dJ/dt dq m/s^2.
 
     Height: m, above the highest place of the true plane. Speeds: inwards, and along the plane.
@@ -192,7 +202,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
     """
     n = len(last)
     root, row, lever, none = work[:n], work[n], work[n + 1], work[n + 2]
-    height, speed, along, convective = _tip_motion(limit, kinematics, arm.dq, row)
+    height, speed, along, convective = tip_motion(limit, kinematics, arm.dq, row)
     if height > NEAR_M:
         limit[RESISTED], limit[BEGUN] = 0.0, 0.0
         return np.inf
@@ -212,7 +222,8 @@ def push_bound(limit, arm, kinematics, last, friction, work):
         limit[SPEED], limit[BEGUN] = speed, 1.0
     resisted = limit[RESISTED] + RATE * (SIM_DT * (mass * before - limit[RESISTED]) - mass * (speed - limit[SPEED]))
     allowed = limit[SPEED_NEAR] - limit[SLOPE] * along + APPROACH * max(height, 0.0)
-    if speed > allowed or speed < -limit[SPEED_NEAR]:
+    slowest = limit[SPEED_NEAR] if limit[PHASE] == 0.0 else OVERSHOOT * LEAVE
+    if speed > allowed or speed < -slowest:
         resisted = min(resisted, 0.0)
     limit[RESISTED], limit[SPEED] = min(max(resisted, -most), most), speed
     return min(RATE * (allowed - speed) + mobility * limit[RESISTED], mobility * most - hidden) - own

@@ -92,6 +92,10 @@ def make_task(cfg, robot, dynamics, safety=None):
     given = {k: v for k, v in (plain(safety) or {}).items() if v is not None}
     safety = {**(plain(cfg.get("safety")) or {}), **given}
     if not any(value is not None for value in safety.values()):
+        if getattr(task, "stop", None) is not None:
+            raise UserError(
+                f"task.stop: {task.stop} needs the estimate of the force that safety.force_max makes; set it, in N"
+            )
         return task
     return task.pushing_within(robot, dynamics.level, safety.get("force_max"), safety.get("speed_near"))
 
@@ -107,6 +111,18 @@ def _arm_target(cfg) -> Callable[..., Any]:
         allowed = sorted(p.stem for p in (CONF / "arm").glob("*.yaml") if p.stem != "none")
         raise UserError(f"arm: {cfg.arm.name} cannot be commanded; allowed: {choices(allowed)}")
     return target(cfg.arm, "arm")
+
+
+def _arm_settings(cfg, robot, task=None):
+    """Return the settings of conf/arm, with the thresholds of its reflexes that the task's contacts need."""
+    settings = plain(cfg.arm)
+    if "collision_force" in settings and None in (settings["collision_torque"], settings["collision_force"]):
+        from r2s.arm.clients.collision_thresholds import thresholds_of
+
+        own = thresholds_of(robot, None if task is None else task.push_limit)
+        given = {k: v for k, v in settings.items() if v is not None}
+        settings = {**settings, "collision_torque": own.torque, "collision_force": own.force, **given}
+    return settings
 
 
 @contextmanager
@@ -130,7 +146,7 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
         if not is_twin(cfg):
             stack.enter_context(handled_signals())
         try:
-            arm = part({**plain(cfg.arm), **stream, **more}, "arm", robot, beside=DRIVE_KEYS)
+            arm = part({**_arm_settings(cfg, robot, task), **stream, **more}, "arm", robot, beside=DRIVE_KEYS)
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
@@ -168,7 +184,7 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
                 arm.stop()
         return
     _arm_target(cfg)  # errors appear here, not in the process of the arm
-    make = partial(part, plain(cfg.arm), "arm", robot, beside=list(DRIVE_KEYS))
+    make = partial(part, _arm_settings(cfg, robot, task), "arm", robot, beside=list(DRIVE_KEYS))
     with ExitStack() as stack:
         try:
             arms = stack.enter_context(RealtimeRunner(make, robot, task, dynamics.level, **how))

@@ -55,6 +55,7 @@ class PressTask(BaseTask):
         tool: tool file of the robot if robot.tool is null; the stages read it.
         torque_fraction, cutoff_hz, speed_noise: see `ReachTask`; the torque limit is the controller's, if it has one.
         pool: number of goals that a training draws from.
+        stop: what a stop does with a force, of `r2s.physics.push_limit.STOPS`; None: release.
         model, own, parameters: the identified arm, the task's own controller and its parameters; see `with_model`.
         creep: m/s, along the normal, at which the fastest joint has the first speed of the controller's friction.
     """
@@ -76,6 +77,7 @@ class PressTask(BaseTask):
     cutoff_hz: float = 100.0
     speed_noise: float | None = None
     pool: int = 512
+    stop: str | None = None
     model: InverseDynamics | None = field(default=None, repr=False)
     parameters: np.ndarray | None = field(default=None, repr=False)
     own: Impedance | None = field(default=None, repr=False)
@@ -144,7 +146,7 @@ class PressTask(BaseTask):
         self, robot: Robot, friction: np.ndarray, force_max: float | None, speed_near: float | None
     ) -> "PressTask":
         """Return the task with a limit of force and speed at the nominal plane, which admits its forces."""
-        limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1])
+        limit = push_limit(robot, friction, force_max, speed_near, self.plane(robot), self.force[1], self.stop)
         if limit is not None:
             limit = replace(limit, place=self.place, tilt=float(np.radians(self.tilt)))
         return self._with("push_limit", limit)

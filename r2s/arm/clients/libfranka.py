@@ -2,46 +2,19 @@
 
 import socket
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from r2s.arm.clients import fci
+from r2s.arm.clients.collision_thresholds import CollisionThresholds
 from r2s.arm.interface import ArmStopped
 from r2s.arm.realtime import kept_scheduler
-from r2s.errors import UserError, check_number, optional_import
+from r2s.errors import UserError, optional_import
 
 DESK_PORT = 443  # https, Franka's web interface "Desk"
 CONNECT_TIMEOUT_S = 3.0  # a control box at the other end of a cable answers in ms; libfranka waits about 60 s
-
-
-@dataclass(frozen=True)
-class CollisionThresholds:
-    """External torque and force at which the arm stops itself (libfranka's setCollisionBehavior).
-
-    The contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
-
-    Attributes:
-        torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
-
-    Raises:
-        UserError: a wrong count, or a value that is not above 0.
-    """
-
-    torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
-    force: Sequence[float] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
-
-    def __post_init__(self):
-        for name, values, count in (("torque", self.torque, 7), ("force", self.force, 6)):
-            if len(values) != count:
-                raise UserError(f"collision_{name}: expected {count} numbers, got {len(values)}")
-            for value in values:
-                check_number(f"collision_{name}", value, "(0, inf)")
-
-
-CAUTIOUS = CollisionThresholds()
 
 
 class Client:

@@ -1,0 +1,71 @@
+"""External torque and force at which a Franka arm stops itself (libfranka's setCollisionBehavior)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from r2s.errors import UserError, check_number
+from r2s.physics.push_limit import STIFF, PushLimit
+from r2s.physics.robot import Robot
+from r2s.physics.tip import Tip
+
+OFF = 100.0  # N, Nm: libfranka's impedance examples set all thresholds to it, so that no reflex acts
+ERROR = 0.2  # of the cautious thresholds, that friction and errors of the model take (docs/explanation/safety.md)
+FRICTION = 0.5  # of a surface, the largest of conf/dr/contact.yaml
+
+
+@dataclass(frozen=True)
+class CollisionThresholds:
+    """External torque and force at which the arm stops itself.
+
+    The contact thresholds get the same values. The defaults are the lowest in libfranka's motion examples.
+
+    Attributes:
+        torque: (7,) Nm at the joints. force: (6,) N and Nm at the end effector.
+
+    Raises:
+        UserError: a wrong count, or a value that is not above 0.
+    """
+
+    torque: Sequence[float] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    force: Sequence[float] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+
+    def __post_init__(self):
+        for name, values, count in (("torque", self.torque, 7), ("force", self.force, 6)):
+            if len(values) != count:
+                raise UserError(f"collision_{name}: expected {count} numbers, got {len(values)}")
+            for value in values:
+                check_number(f"collision_{name}", value, "(0, inf)")
+
+
+CAUTIOUS = CollisionThresholds()
+
+
+def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
+    """Return the thresholds for a task: above all that its limit of pushes allows, and at least the cautious ones.
+
+    The largest force that it allows, that of a meeting with a rigid surface, and FRICTION of it across, act at the
+    tip where it touches the plane; the arm's model errs by ERROR.
+
+    Raises:
+        UserError: the limit allows what only an arm without reflexes would.
+    """
+    cautious = np.array(CAUTIOUS.torque), np.array(CAUTIOUS.force)
+    if limit is None:
+        return CAUTIOUS
+    tip, tool = Tip(robot), robot.tool
+    q = tip.posture(limit.point + tool.radius * limit.normal)  # type: ignore[union-attr]
+    q = robot.q_home if q is None else q
+    jacobian, most = tip(q)[1], limit.bound(robot, q, STIFF)
+    lever = np.abs(limit.normal @ jacobian) + FRICTION * np.linalg.norm(jacobian, axis=0)  # m
+    arm = float(np.linalg.norm(tool.tip)) + tool.radius  # type: ignore[union-attr]
+    reached = most * lever, most * np.repeat([1.0, arm], 3)
+    torque, force = (np.maximum(low, ERROR * low + x) for low, x in zip(cautious, reached, strict=True))
+    if max(torque.max(), force.max()) >= OFF:
+        raise UserError(
+            f"safety.force_max: {limit.force_max:g} N and safety.speed_near: {limit.speed_near:.3g} m/s allow {most:.3g} N "
+            f"on a rigid surface, for which the arm's reflexes would need thresholds of {OFF:g} N or Nm, that is none; "
+            "lower one, or set arm.collision_torque and arm.collision_force"
+        )
+    return CollisionThresholds(tuple(torque.round(1).tolist()), tuple(force.round(1).tolist()))

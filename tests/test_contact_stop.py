@@ -1,0 +1,136 @@
+"""Stops in contact: hold, release and retreat do what they say, within the bound of the force, on every arm."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from test_press import PANDA, TRUE, N, TASK_CONF, make_task
+from test_push_limit import LIMIT, POINT, UP
+
+from r2s.arm.driver import DriverBatch
+from r2s.arm.policy_runner import PolicyRunner
+from r2s.arm.twins.make_twin import make_twin
+from r2s.errors import UserError
+from r2s.physics.contact_stop import LEAVES_S, RELEASED, RETREAT_M, SLIDES
+from r2s.physics.push_limit import LEAVE, STOPS
+from r2s.physics.simulator import Simulator
+from r2s.physics.surface import Surface
+from r2s.physics.tip import Tip
+from r2s.tasks.press import PressTask
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from push_limit import hostile
+
+TIP, M = Tip(PANDA), 8
+K = np.geomspace(2e3, 1e5, M)
+PUSH = 25.0  # N
+KINDS = pytest.mark.parametrize("stop", STOPS)
+
+
+def heights(q):
+    return np.array([UP @ (TIP(row)[0] - POINT) - PANDA.tool.radius for row in q])
+
+
+def stopped(stop):
+    """Press arms on surfaces of K, stop them after 1.2 s, and go on for as long as a driver may take, and 0.5 s.
+
+    Return (k, M) forces N and heights m from the stop on, (M,) cycles until the driver was done, and the last driver.
+    """
+    surface = Surface(POINT + np.zeros((M, 1)), UP + np.zeros((M, 1)), K, 1.25, 0.5, 0.3, 1e-4)
+    sim = Simulator(PANDA, replace(TRUE, surface=surface, delay=4e-3), M, 1)
+    torque = 0.3 * PANDA.tau_max
+    driver = DriverBatch(PANDA, torque, M, friction=TRUE.level, push_limit=replace(LIMIT, force_max=40.0, stop=stop))
+    starts = PressTask(**TASK_CONF).goals(PANDA, np.random.default_rng(0), M)[:, 9:]
+    sim.reset(starts, np.zeros((M, N)))
+    inwards = -np.array([UP @ TIP(q)[1] for q in starts])
+    rows, sent, going = [], np.zeros((M, N)), np.zeros(M)
+    for cycle in range(2200):
+        stiff = 400.0 * PANDA.tau_max / PANDA.tau_max.max()
+        # across the normal the start posture holds; along it the push acts against viscosity
+        away = starts - sim.q
+        away -= (away * inwards).sum(1, keepdims=True) * inwards / (inwards**2).sum(1, keepdims=True)
+        rate = (inwards * sim.dq).sum(1, keepdims=True)
+        command = (min(1.0, cycle / 300) * PUSH - 150.0 * rate) * inwards + stiff * away
+        if cycle == 1200:
+            driver.stop("a test")
+        sent = driver(sim.q.copy(), sim.dq.copy(), sent, None if cycle >= 1200 else command)
+        sim.rollout(sent[:, None], record=())
+        if cycle >= 1200:
+            rows.append([sim.contact_force @ UP, heights(sim.q)])
+            going += ~driver.done
+    force, height = np.moveaxis(np.array(rows), 1, 0)
+    return force, height, going, driver
+
+
+@pytest.fixture(scope="module")
+def results():
+    return {stop: stopped(stop) for stop in STOPS}
+
+
+@KINDS
+def test_a_stop_in_contact_does_what_it_says(stop, results):
+    """Hold keeps the force but for what friction hides; the others end without force, that close to the surface."""
+    force, height, going, driver = results[stop]
+    hidden = LIMIT.at(PANDA, TRUE.level, PANDA.q_home)[1]
+    assert (force[0] > 0.5 * PUSH).all()
+    assert (force <= force[0] + 1.0).all()  # the tip was at rest: nothing adds to the force
+    assert (going < 500).all()
+    if stop == "hold":
+        assert (np.abs(force - force[0]) < hidden).all()
+        pressing = (driver.held * -np.array([UP @ TIP(PANDA.q_home)[1]])).sum(1)
+        assert (pressing > 0).all()  # what the arm keeps when the driver hands it over
+        return
+    assert (force[-1] <= RELEASED).all()
+    above, farthest = height[-1], LEAVE * LEAVES_S
+    assert (above > (0.5 * RETREAT_M if stop == "retreat" else -1e-3)).all()
+    assert (above < (RETREAT_M if stop == "retreat" else 0.0) + farthest).all()
+
+
+def test_they_are_over_in_this_order(results):
+    """A stop that holds moves nothing, one that retreats farther than one that releases."""
+    travel = [(results[stop][1][-1] - results[stop][1][0]).mean() for stop in ("hold", "release", "retreat")]
+    assert abs(travel[0]) < 1e-3
+    assert travel[0] < travel[1] < travel[2] - 0.5 * RETREAT_M
+
+
+@pytest.mark.slow
+@KINDS
+def test_no_stop_amid_hostile_torques_exceeds_the_bound(stop):
+    """Silence at random times of hostile presses, 4 ms late, during the stop and after it."""
+    limit = replace(LIMIT, stop=stop)
+    force, bound, _, touched = hostile(PANDA, TRUE, limit, 1, 64, delay=4, cycles=3000, stops=True).T
+    assert (force < bound).all()
+    assert (touched > 100).mean() > 0.1
+
+
+@pytest.mark.parametrize("variant", ["rigid", "elastic"])
+@KINDS
+def test_on_a_twin_an_episode_that_stops_or_ends_leaves_as_decided(stop, variant):
+    """First an episode whose policy falls silent in contact, then one that ends there."""
+    task = replace(make_task(), episode_s=4.5, stop=stop).pushing_within(PANDA, TRUE.level, 45.0, 0.03)
+    twin = make_twin(PANDA, variant=variant, seed=0, surface=True)
+    runner, rest = PolicyRunner(twin, task, TRUE.level), np.zeros((1, task.control(PANDA).action_dim))
+    goals = task.goals(PANDA, np.random.default_rng(1), 1)
+    for silent in (True, False):
+        state = runner.place(task.begin(PANDA.q_home[None], goals), 0)
+        for k in range(300):
+            command = task.control(PANDA).command(rest, task, state.t, goals)
+            state = runner.step(np.full_like(command, np.nan) if silent and k > 250 else command)
+            before = np.linalg.norm(state.force)
+            if state.stopped.all():
+                break
+        assert runner.end()[0] == silent
+        after = np.linalg.norm(runner.read()[0].O_F_ext_hat_K[:3])
+        hidden = task.push_limit.at(PANDA, TRUE.level, runner.read()[0].q)[1]
+        assert before > 2.0
+        if stop == "hold":
+            assert abs(after - before) < hidden
+        else:
+            assert after <= (0.0 if stop == "retreat" else RELEASED + (1.0 - SLIDES) * hidden)
+
+
+def test_a_wrong_decision_is_one_line():
+    with pytest.raises(UserError, match=r"^task.stop: 'relese'; allowed: hold, release, retreat; did you mean 'rel"):
+        replace(make_task(), stop="relese").pushing_within(PANDA, TRUE.level, 45.0, 0.03)
