@@ -31,8 +31,8 @@ def hostile(robot, dynamics, limit, seed, m, *, delay=0, cycles=3000, limited=Tr
 
     On surfaces of 2e3 to 1e5 N/m, elsewhere than the plane by up to 5 mm and 5 degrees, by full torque, retreats,
     oscillations and noise, `delay` cycles late. An arm that the driver stops, for example at a position limit, counts
-    until its motion has ended. stops: each falls silent in the second half of the time, is stopped as `limit.stop` says, and
-    counts to the end. Bounds: `PushLimit.bound` in the posture of the largest force, with the surface's
+    until its motion has ended. stops: each falls silent in the second half of the time, is stopped as `limit.stop`
+    says, and counts to the end. Bounds: `PushLimit.bound` in the posture of the largest force, with the surface's
     friction and without.
     """
     rng, n, up = np.random.default_rng(seed), robot.n, limit.normal

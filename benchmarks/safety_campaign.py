@@ -4,6 +4,8 @@
     python benchmarks/safety_campaign.py --first 17 --count 1       fault 17 again, its files are kept
     python benchmarks/safety_campaign.py --load       beside busy loops on all cores
     python benchmarks/safety_campaign.py --page       the page alone, from the results so far
+    python benchmarks/safety_campaign.py --contact    the arm presses, and its stop holds, releases or retreats
+                                                      (contact_faults.py, results/safety_campaign_contact.md)
 
 Fault k of a seed is drawn from (seed, k). A robot (tests/robot_side.py: the emulated control box, which records its
 cycles), the policy's process and the process of the arm run as on hardware, with the real client packages. They are
@@ -29,6 +31,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import contact_faults
 import numpy as np
 import pandas as pd
 from common import NEW, RESULTS, ROBOT, ROOT, SimulatedArm, markdown, put_section, stamp, write_page
@@ -55,6 +58,7 @@ from r2s.arm.clients.fr3 import within_fr3
 from r2s.arm.command_loop import REST_S, STILL
 from r2s.arm.driver import DAMP_S, DEADLINE_S
 from r2s.arm.emulator.control import MAX_MISSED, Fault
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.twins.make_twin import make_twin
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT
@@ -94,6 +98,7 @@ KINDS = {  # kind: motions in which it happens
     "torque step": MOTIONS,
     "joint limit": MOTIONS,
 }
+CONTACT = tuple(kind for kind in KINDS if kind != "held link")  # twins hold no link
 NETWORK = ("late answers", "lost states", "arm's process frozen")
 EMULATED = {"late answers": "late", "lost states": "drop", "stop button": "estop", "button released": "press",
             "held link": "hold", "torque step": "discontinuity", "joint limit": "joint_limit"}  # fmt: skip
@@ -120,11 +125,17 @@ class Case:
     payload: float
     declared: float
     twin_seed: int
+    stop: str = ""  # of `r2s.physics.push_limit.STOPS`; "": in free motion
 
     @property
     def step(self) -> int:
         """Step of the policy at which a fault of the policy or of its adapter comes."""
-        return self.cycle // TASK.substeps
+        return self.cycle // self.substeps
+
+    @property
+    def substeps(self) -> int:
+        """Cycles of a step of the policy."""
+        return contact_faults.press(self.stop).substeps if self.stop else TASK.substeps
 
     @property
     def harmless(self) -> bool:
@@ -134,15 +145,17 @@ class Case:
         return self.kind in ("wrong load", "held link") or (self.kind == "policy stalls" and self.count < 60)
 
 
-def draw(seed: int, number: int) -> Case:
+def draw(seed: int, number: int, contact: bool = False) -> Case:
     """Return fault `number` of a seed."""
     rng = np.random.default_rng([seed, number])
-    kind = list(KINDS)[number % len(KINDS)]
-    motion = str(rng.choice(KINDS[kind]))
+    kinds = list(CONTACT if contact else KINDS)
+    kind = kinds[number % len(kinds)]
+    motion = "episode" if contact else str(rng.choice(KINDS[kind]))
     realtime = bool(rng.random() < 0.25)
     if kind in ("policy stalls", "arm's process frozen"):
         realtime = True  # in lock-step the arm would wait
     own = motion in ("record", "ramp")  # no process of the arm
+    cycles = contact_faults.CYCLES if contact else CYCLES[motion]
     live = not own and (realtime or kind.startswith("policy") or rng.random() < 0.5)
     counts: dict[str, Any] = {"late answers": (1, 31), "lost states": (1, 31), "policy stalls": (20, 400)}
     counts |= {"button released": (5, 300), "held link": (100, 350), "action not finite": (0, 4)}
@@ -155,12 +168,13 @@ def draw(seed: int, number: int) -> Case:
     return Case(
         number=number, kind=kind, motion=motion, client=str(rng.choice(["panda", "fr3"])),
         twin="simulated" if kind == "held link" else str(rng.choice(["rigid", "elastic"])),
-        realtime=realtime, live=live, cycle=int(rng.integers(*CYCLES[motion])),
+        realtime=realtime, live=live, cycle=int(rng.integers(*cycles)),
         target=str(rng.choice(["policy", "arm"])),
         count=count, gap=int(rng.integers(1, 100)),
         payload=float(rng.uniform(0.2, 1.5)) if wrong else 0.0,
         declared=float(rng.uniform(0.0, 1.5)) if wrong and rng.random() < 0.5 else 0.0,
         twin_seed=int(rng.integers(10)),
+        stop=contact_faults.stop_of(number, len(kinds)) if contact else "",
     )  # fmt: skip
 
 
@@ -178,13 +192,15 @@ class Acts:
         # from a turning point, so that the arm swings about its start and keeps clear of itself
         swing = 0.6 * (-1) ** self._case.number * np.cos(0.12 * k)
         action = swing * np.array([1, 0.5, -1, 0.5, 0.3, 1, 0.3])
+        if self._case.stop:  # hybrid control presses; the action moves its target
+            action = 0.3 * action[: contact_faults.press(self._case.stop).control(contact_faults.ARM).action_dim]
         if self._case.kind == "policy stalls" and k == self._case.step:
             note(self._folder)
             time.sleep(1e-3 * self._case.count)
         if self._case.kind == "action not finite" and k >= self._case.step:
             note(self._folder)
             action = np.where(
-                np.arange(7) <= 6 * (self._case.count % 2), (np.nan, np.inf)[self._case.count // 2], action
+                np.arange(len(action)) <= 6 * (self._case.count % 2), (np.nan, np.inf)[self._case.count // 2], action
             )
         return action
 
@@ -226,7 +242,14 @@ def arm_of(case: Case) -> Any:
     if case.twin == "simulated":
         return SimulatedArm(ROBOT, NEW, position_noise=2e-5, velocity_noise=3e-3)
     load = {"payload": case.payload, "declared_payload": case.declared or None}
-    return make_twin(ROBOT, variant=case.twin, seed=case.twin_seed, **load)
+    if case.stop:
+        load |= {"surface": contact_faults.SURFACE}
+    return make_twin(robot_of(case)[0], variant=case.twin, seed=case.twin_seed, **load)
+
+
+def robot_of(case: Case) -> tuple[Any, dict[str, Any]]:
+    """Return the robot of a case, and further settings of its motion."""
+    return contact_faults.setting(case.stop, (case.twin_seed, case.number)) if case.stop else (ROBOT, {})
 
 
 def kills_of(case: Case) -> tuple[Kill, ...]:
@@ -256,9 +279,10 @@ def run_case(case: Case, folder: Path) -> bool:
     )
     settings = {"adapter": Adapts(case, folder)} if case.motion == "episode" else {}
     own = {"far": 0.5, "loaded": case.kind == "wrong load", "wakes": case.kind.endswith("frozen")}
-    own |= {"declared": case.declared or None, "realtime": case.realtime}
+    robot, given = robot_of(case)
+    own |= {"declared": case.declared or None, "realtime": case.realtime} | given
     motion = Motion(case.motion, case.live, Acts(case, folder), settings, **own)  # type: ignore[arg-type]
-    return not run_side(side, ROBOT, motion, folder, LONGEST_S)
+    return not run_side(side, robot, motion, folder, LONGEST_S)
 
 
 # --- the judge
@@ -294,6 +318,11 @@ def judge(case: Case, folder: Path, ended: bool) -> dict:
         out["braking_ms"] = int(cycles.cycle[speed.argmax()] - cycles.cycle[0]) if moves else 0
         out["rest_ms"] = int(log.cycle[end] - cycles.cycle[0])
         out["speed"] = float(np.abs(cycles.dq[-1]).max())
+    if case.stop:
+        driven = bool(log.kind[end] == ENDED) and case.kind != "arm's process killed"
+        out |= contact_faults.judge_force(case.stop, case.twin_seed, log, row, end, driven)
+        out["over"] += out["over_force"]
+        out["wrong"] = out["wrong"] or out["undecided"]
     return out | {"wrong": out["wrong"] or mistake(case, out, bool(log.kind[end] == ABORTED))}
 
 
@@ -362,8 +391,8 @@ def mistake(case: Case, out: dict, aborted: bool) -> str:
     stalled = out["stalled"]  # answers that a busy machine gave too late
     allowed = BRAKED_S / SIM_DT + LAG + stalled
     if case.kind in ("policy stalls", "action not finite", "adapter not finite", "policy frozen"):
-        allowed += TASK.substeps  # the deadline counts from the last command
-    if out["braking_ms"] > allowed and case.kind not in ("held link", "wrong load"):
+        allowed += case.substeps  # the deadline counts from the last command
+    if out["braking_ms"] > allowed and not case.stop and case.kind not in ("held link", "wrong load"):
         return f"braking after {out['braking_ms']} ms"
     latest = DEADLINE_S + DAMP_S + REST_S * (out["speed"] > STILL)  # a joint that friction does not hold slides
     if out["rest_ms"] > latest / SIM_DT + LAG + stalled:
@@ -374,11 +403,13 @@ def mistake(case: Case, out: dict, aborted: bool) -> str:
 # --- the campaign
 
 
-def work(seed: int, numbers: list[int], results: Path, keep: bool) -> None:
+def work(seed: int, numbers: list[int], results: Path, keep: bool, contact: bool) -> None:
     """Run faults and append their results."""
     warm(ROBOT)
+    if contact:
+        warm_press()
     for number in numbers:
-        case, began = draw(seed, number), time.monotonic()
+        case, began = draw(seed, number, contact), time.monotonic()
         for attempt in range(ATTEMPTS):
             folder = Path(tempfile.mkdtemp(prefix="fault_"))
             try:
@@ -394,6 +425,19 @@ def work(seed: int, numbers: list[int], results: Path, keep: bool) -> None:
             file.write(json.dumps(out) + "\n")
         if out["wrong"] or out["over"] or out["after"] or out["hung"] or keep:
             print(json.dumps(out), folder if keep else "", flush=True)
+
+
+def warm_press() -> None:
+    """Compile what presses."""
+    task = contact_faults.press("release")
+    goals = task.goals(contact_faults.ARM, np.random.default_rng(0), 1)
+    for variant in ("rigid", "elastic"):
+        twin = make_twin(contact_faults.ARM, variant=variant, surface=contact_faults.SURFACE)
+        runner = PolicyRunner(twin, task, NEW.level)
+        state = runner.place(task.begin(contact_faults.ARM.q_home[None], goals), 0)
+        control = task.control(contact_faults.ARM)
+        runner.step(control.command(np.zeros((1, control.action_dim)), task, state.t, goals))
+        runner.end()
 
 
 @contextmanager
@@ -415,7 +459,7 @@ def spin() -> None:
         pass
 
 
-def page(rows: pd.DataFrame, seed: int, words: str, load: bool, repeated: int) -> None:
+def page(rows: pd.DataFrame, seed: int, words: str, o: argparse.Namespace, repeated: int) -> None:
     """Write benchmarks/results/safety_campaign.md, or its section of faults beside a load; repeated: run again."""
     table = {}
     for (kind, motion), group in rows.groupby(["kind", "motion"], sort=False):
@@ -435,11 +479,20 @@ def page(rows: pd.DataFrame, seed: int, words: str, load: bool, repeated: int) -
         f"- {r.number}: {r.kind}, {r.motion}, {r.client}, {r.twin}: {r.wrong}" for r in rows.itertuples() if r.wrong
     ]
     parts = [markdown(frame.fillna("")), *(["\n".join(wrong)] if wrong else [])]
-    if load:
-        page = RESULTS / "safety_campaign.md"
+    name = "safety_campaign" + "_contact" * o.contact
+    if o.contact:
+        total += (
+            f" Forces: at most {rows.share.max():.2f} of the bound of docs/explanation/safety.md, "
+            f"{int(rows.over_force.sum())} over it; "
+            f"{int((rows.undecided.fillna('') != '').sum())} stops not as decided."
+        )
+    if o.load:
+        page = RESULTS / f"{name}.md"
         put_section(page, "Beside busy loops on all cores", [stamp(words), total, *parts])
     else:
-        write_page("safety_campaign", "Safety campaign", words, [total, __doc__.split("\n\n")[2], HOW, *parts])
+        write_page(
+            name, "Safety campaign" + " in contact" * o.contact, words, [total, __doc__.split("\n\n")[2], HOW, *parts]
+        )
 
 
 HOW = """
@@ -465,28 +518,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("seed", 0), ("first", 0), ("count", 1000), ("workers", 2)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--contact", action="store_true", help="faults of an arm that presses")
     parser.add_argument("--load", action="store_true", help="busy loops on all cores beside")
     parser.add_argument("--page", action="store_true", help="write the page from the results so far")
     o = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # no process is left; the workers inherit it
     FAULTS.mkdir(parents=True, exist_ok=True)
-    results = FAULTS / f"seed_{o.seed}{'_load' * o.load}.jsonl"
+    results = FAULTS / f"seed_{o.seed}{'_contact' * o.contact}{'_load' * o.load}.jsonl"
     known = read_results(results)
     numbers = [k for k in range(o.first, o.first + o.count) if o.count == 1 or k not in known]
     if not o.page:
-        live = [k for k in numbers if draw(o.seed, k).realtime]
+        live = [k for k in numbers if draw(o.seed, k, o.contact).realtime]
         with busy((os.cpu_count() or 1) if o.load else 0):
-            run_workers(o.workers, [k for k in numbers if k not in live], (o.seed, results, o.count == 1))
-            run_workers(1, live, (o.seed, results, o.count == 1))  # real time needs two cores for itself
+            run_workers(o.workers, [k for k in numbers if k not in live], (o.seed, results, o.count == 1, o.contact))
+            run_workers(1, live, (o.seed, results, o.count == 1, o.contact))  # real time needs two cores for itself
     if o.count > 1 or o.page:
         words = " ".join(["python", "benchmarks/safety_campaign.py", *(w for w in sys.argv[1:] if w != "--page")])
         rows = pd.DataFrame(sorted(read_results(results).values(), key=lambda r: r["number"]))
         repeated = len(results.read_text().splitlines()) - len(rows) + int(rows.attempt.sum())
-        page(rows, o.seed, words, o.load, repeated)
+        page(rows, o.seed, words, o, repeated)
 
 
-def run_workers(count: int, numbers: list[int], settings: tuple[int, Path, bool]) -> None:
-    """Run faults in `count` processes; settings: seed, file of results, whether to keep a fault's files."""
+def run_workers(count: int, numbers: list[int], settings: tuple[int, Path, bool, bool]) -> None:
+    """Run faults in `count` processes; settings: seed, file of results, whether to keep a fault's files, contact."""
     seed, *others = settings
     parts = [numbers[i::count] for i in range(min(count, len(numbers)))]
     workers = [FORK.Process(target=work, args=(seed, part, *others)) for part in parts]

@@ -31,6 +31,7 @@ import psutil
 
 from r2s.arm import realtime_process
 from r2s.arm.clients import fci
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.emulated import CLIENTS
 from r2s.arm.clients.fr3 import within_fr3
 from r2s.arm.clients.franka import Franka
@@ -51,7 +52,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.tasks.reach import ReachTask
 
 CYCLE, MISSED, ENDED, ABORTED, SIGNALLED, STRAY = range(6)  # kinds of rows; STRAY: a command without a motion
-WIDTH = 4 + 4 * 7
+WIDTH = 4 + 4 * 7 + 3
 TASK = ReachTask(episode_s=1.5)
 RATE = 0.3 * np.array([87.0, 87, 87, 87, 12, 12, 12])  # Nm/s, of ramps: fast, so that they move early
 FAR = np.array([1.0, 0.2, 0.0, 0.2, 0.0, 0.0, 0.5])  # rad from home: an approach of 4 s
@@ -70,7 +71,7 @@ class Kill:
 class Log(NamedTuple):
     """Rows of the robot: kind, motion, cycle, s of the monotonic clock, and (., 7) rad, rad/s, Nm.
 
-    last: the torque that the arm applied before the command `tau` of the same row.
+    last: the torque that the arm applied before the command `tau` of the same row. force: (., 3) N on the surface.
     """
 
     kind: np.ndarray
@@ -81,15 +82,16 @@ class Log(NamedTuple):
     dq: np.ndarray
     last: np.ndarray
     tau: np.ndarray
+    force: np.ndarray
 
     @staticmethod
     def read(folder: Path) -> "Log":
         """Return the rows so far."""
         path = folder / "robot"
         rows = np.fromfile(path).reshape(-1, WIDTH) if path.exists() else np.zeros((0, WIDTH))
-        head, moving = rows[:, :4], rows[:, 4:].reshape(-1, 4, 7)
+        head, moving = rows[:, :4], rows[:, 4:-3].reshape(-1, 4, 7)
         return Log(head[:, 0].astype(int), head[:, 1].astype(int), head[:, 2].astype(int), head[:, 3],
-                   *np.moveaxis(moving, 1, 0))  # fmt: skip
+                   *np.moveaxis(moving, 1, 0), rows[:, -3:])  # fmt: skip
 
     def after(self, row: int) -> "Log":
         """Return the rows from `row` on."""
@@ -139,9 +141,9 @@ class RecordedControl(Control):
         """Write a row."""
         s = self._arm.read()
         tau = np.full(7, np.nan) if tau is None else tau
-        self._file.write(
-            np.concatenate([[kind, self._motion, self._cycle, time.monotonic()], s.q, s.dq, s.tau_J_d, tau]).tobytes()
-        )
+        force = np.zeros(3) if s.O_F_ext_hat_K is None else s.O_F_ext_hat_K[:3]
+        head = [kind, self._motion, self._cycle, time.monotonic()]
+        self._file.write(np.concatenate([head, s.q, s.dq, s.tau_J_d, tau, force]).tobytes())
 
 
 class RecordedServer(Server):
@@ -282,6 +284,7 @@ class Motion(NamedTuple):
         far: share of FAR and 1.2 FAR, the lengths of an approach and of a recording. forks: see `fork_the_arm`.
         wakes: whether frozen processes go on after the motion. declared: kg of the load that the client expects.
         realtime: whether the client asks this computer for real time.
+        task, goal, friction: of an episode; goal (k,), friction (7,) Nm. collision: of the arm's reflexes.
     """
 
     kind: str
@@ -295,6 +298,10 @@ class Motion(NamedTuple):
     wakes: bool = False
     declared: float | None = None
     realtime: bool = False
+    task: Any = TASK
+    goal: Any = (0.4, 0.2, 0.4)
+    friction: Any = (1.0,) * 7
+    collision: CollisionThresholds = CAUTIOUS
 
 
 def fork_the_arm() -> None:
@@ -328,11 +335,12 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
         _put(folder / "idle", "")
         time.sleep(60)
 
+    given = motion.task, np.array(motion.friction)
     open_arm = partial(_open, robot, client, address, Refuses(folder, motion.thinks_s), motion)
     try:
         with ExitStack() as stack:
             if motion.live:
-                arms = stack.enter_context(RealtimeRunner(open_arm, robot, TASK, np.ones(7), **motion.settings))
+                arms = stack.enter_context(RealtimeRunner(open_arm, robot, *given, **motion.settings))
                 _put(folder / "arm.pid", arms._process.pid)
                 idle() if motion.kind == "idle" else _run_policy(arms, motion, result)
             else:
@@ -342,7 +350,7 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
                 if motion.kind == "idle":
                     idle()
                 elif motion.kind in ("approach", "episode"):
-                    _run_policy(PolicyRunner(arm, TASK, np.ones(7), **motion.settings), motion, result)
+                    _run_policy(PolicyRunner(arm, *given, **motion.settings), motion, result)
                 else:
                     _measure(arm, motion)
     except (Exception, KeyboardInterrupt) as error:
@@ -353,22 +361,23 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
 
 
 def _open(robot: Robot, client: str, address: str, operator: Refuses, motion: Motion) -> Franka:
-    arm = CLIENTS[client][0](robot, address, operator=operator, declared_payload=motion.declared)
+    thresholds = {"collision_torque": motion.collision.torque, "collision_force": motion.collision.force}
+    arm = CLIENTS[client][0](robot, address, operator=operator, declared_payload=motion.declared, **thresholds)
     arm.realtime = motion.realtime  # without a real-time kernel, which the client's own option requires
     return arm
 
 
 def _run_policy(arms: RealtimeRunner | PolicyRunner, motion: Motion, result: dict) -> None:
     """Approach and end there, or run an episode, and try another after a stop."""
-    robot, goals = arms.robot, np.array([[0.4, 0.2, 0.4]])
-    controller, approaches = TASK.control(robot), motion.kind == "approach"
+    robot, goals, task = arms.robot, np.array([motion.goal]), motion.task
+    controller, approaches = task.control(robot), motion.kind == "approach"
     start = robot.q_home + (motion.far * FAR if approaches else 0)
     for episode in range(1 if approaches else 2):
         state = arms.place(start[None], episode)
-        for k in range(0 if approaches else TASK.steps):
+        for k in range(0 if approaches else task.steps):
             if state.stopped.all():
                 break
-            state = arms.step(controller.command(motion.policy(k)[None], TASK, state.t, goals))
+            state = arms.step(controller.command(motion.policy(k)[None], task, state.t, goals))
         arms.end()
         result |= {"stops": [str(stop) for stop in arms.stops], "halted": arms.halted}
         if not arms.stops:

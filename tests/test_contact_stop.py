@@ -2,22 +2,29 @@
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import ROOT
-from test_press import PANDA, TRUE, N, TASK_CONF, make_task
+from conftest import ROOT, conf
+from omegaconf import OmegaConf
+from test_command_loop import Button
+from test_press import PANDA, TASK_CONF, TRUE, N, make_task
 from test_push_limit import LIMIT, POINT, UP
 
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds, thresholds_of
+from r2s.arm.clients.franka import Franka
 from r2s.arm.driver import DriverBatch
+from r2s.arm.emulator.control import Control
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.twins.make_twin import make_twin
 from r2s.errors import UserError
 from r2s.physics.contact_stop import LEAVES_S, RELEASED, RETREAT_M, SLIDES
-from r2s.physics.push_limit import LEAVE, STOPS
+from r2s.physics.push_limit import LEAVE, STOPS, PushLimit
 from r2s.physics.simulator import Simulator
 from r2s.physics.surface import Surface
 from r2s.physics.tip import Tip
+from r2s.stages.build import _arm_settings
 from r2s.tasks.press import PressTask
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -105,7 +112,7 @@ def test_no_stop_amid_hostile_torques_exceeds_the_bound(stop):
     assert (touched > 100).mean() > 0.1
 
 
-@pytest.mark.parametrize("variant", ["rigid", "elastic"])
+@pytest.mark.parametrize("variant", ["rigid", pytest.param("elastic", marks=pytest.mark.slow)])
 @KINDS
 def test_on_a_twin_an_episode_that_stops_or_ends_leaves_as_decided(stop, variant):
     """First an episode whose policy falls silent in contact, then one that ends there."""
@@ -115,10 +122,11 @@ def test_on_a_twin_an_episode_that_stops_or_ends_leaves_as_decided(stop, variant
     goals = task.goals(PANDA, np.random.default_rng(1), 1)
     for silent in (True, False):
         state = runner.place(task.begin(PANDA.q_home[None], goals), 0)
+        before = 0.0
         for k in range(300):
             command = task.control(PANDA).command(rest, task, state.t, goals)
             state = runner.step(np.full_like(command, np.nan) if silent and k > 250 else command)
-            before = np.linalg.norm(state.force)
+            before = np.linalg.norm(state.force) if k <= 250 or not silent else before
             if state.stopped.all():
                 break
         assert runner.end()[0] == silent
@@ -134,3 +142,56 @@ def test_on_a_twin_an_episode_that_stops_or_ends_leaves_as_decided(stop, variant
 def test_a_wrong_decision_is_one_line():
     with pytest.raises(UserError, match=r"^task.stop: 'relese'; allowed: hold, release, retreat; did you mean 'rel"):
         replace(make_task(), stop="relese").pushing_within(PANDA, TRUE.level, 45.0, 0.03)
+
+
+def test_the_reflexes_of_an_arm_follow_the_force_of_its_task():
+    """What the client sets: above what the limit allows, at tip and joints, cautious without one, or as typed."""
+    limit = PushLimit(45.0, 0.03, POINT, UP)
+    given = {"arm": conf("arm/panda") | {"address": "arm"}}
+    settings = _arm_settings(OmegaConf.create(given), PANDA, SimpleNamespace(push_limit=limit))
+    client = Button()
+    thresholds = CollisionThresholds(settings["collision_torque"], settings["collision_force"])
+    Franka(PANDA, client, operator=None, collision=thresholds).move_to(PANDA.q_home)  # type: ignore[arg-type]
+    q = TIP.posture(POINT + PANDA.tool.radius * UP)
+    most = limit.bound(PANDA, q, 1e5)
+    assert most > limit.force_max
+    assert (np.array(client.collision.force[:3]) > most).all()
+    assert (np.array(client.collision.torque) > most * np.abs(UP @ TIP(q)[1])).all()
+    for x, low in ((client.collision.torque, CAUTIOUS.torque), (client.collision.force, CAUTIOUS.force)):
+        assert (np.array(x) >= low).all()
+        assert (np.array(x) < 100.0).all()  # where libfranka's examples switch the reflexes off
+    for task in (None, SimpleNamespace(push_limit=None)):
+        free = _arm_settings(OmegaConf.create(given), PANDA, task)
+        assert (free["collision_torque"], free["collision_force"]) == (CAUTIOUS.torque, CAUTIOUS.force)
+    given["arm"]["collision_force"] = [30.0] * 6
+    typed = _arm_settings(OmegaConf.create(given), PANDA, SimpleNamespace(push_limit=limit))
+    assert typed["collision_force"] == [30.0] * 6
+    assert typed["collision_torque"] == thresholds.torque
+    with pytest.raises(
+        UserError, match=r"^safety.force_max: 80 N, with safety.speed_near of 0.05 m/s, allows 1\d\d N"
+    ):
+        thresholds_of(PANDA, PushLimit(80.0, 0.05, POINT, UP))
+
+
+def test_the_emulated_box_holds_an_arm_that_presses():
+    """Where it presses it stays, and elsewhere inside the surface nothing can be placed."""
+    task = make_task()
+    start = task.goals(PANDA, np.random.default_rng(1), 1)[0]
+    box = Control(make_twin(replace(PANDA, q_home=start[9:]), seed=0, surface=True), 5)
+    box.begin()
+    box.first_answer()
+    inwards, tau = -UP @ TIP(start[9:])[1], np.zeros(N)
+    for _ in range(1500):
+        state = box._arm.read()
+        wanted = 15.0 * inwards - 2.0 * state.dq
+        tau = tau + np.clip(wanted - tau, -0.9, 0.9)
+        box.cycle(tau)
+    assert box.running
+    force = np.linalg.norm(box._arm.read().O_F_ext_hat_K[:3])
+    assert force > 5.0
+    box.end()
+    assert not box.running
+    box.begin()
+    box.first_answer()
+    box.cycle(np.zeros(N))
+    assert box.running

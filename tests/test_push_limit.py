@@ -11,7 +11,7 @@ from test_press import FRICTIONLESS, PANDA, TRUE, N, make_draw, make_task, press
 
 from r2s.arm.driver import DriverBatch
 from r2s.errors import UserError
-from r2s.physics.push_limit import OVERSHOOT, SPEED_NEAR, PushLimit, tip_motion, push_limit
+from r2s.physics.push_limit import OVERSHOOT, SPEED_NEAR, PushLimit, push_limit, tip_motion
 from r2s.physics.safety_filter import filter_limits
 from r2s.physics.simulator import Simulator
 from r2s.physics.surface import Surface

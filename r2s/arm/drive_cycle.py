@@ -202,7 +202,7 @@ def _brake(i, seen, arm, bounds, model, memory):
     memory.target[i] = 0.0
     if seen and memory.damped[i] == 1:
         memory.share[i] = min(1.0, (np.abs(arm.dq) / model.limits[:, DQ_ALLOWED]).max())
-    if seen and len(memory.push[i]) > 0 and (why == SILENT or why == LAW_NOT_FINITE or why == REQUESTED):
+    if seen and len(memory.push[i]) > 0 and why in (SILENT, LAW_NOT_FINITE, REQUESTED):
         if memory.damped[i] * SIM_DT > LEAVES_S:
             memory.push[i, PHASE] = OVER
         needs = stop_torque(

@@ -129,7 +129,7 @@ class DriverBatch:
 
     @property
     def held(self) -> np.ndarray:
-        """(m, n) Nm, the compensation that is kept while an arm is brought to rest, and the force of a stop that holds."""
+        """(m, n) Nm, the compensation kept while an arm is brought to rest, and the force of a stop that holds."""
         m = self._memory
         if not self.decides_contact:
             return m.held

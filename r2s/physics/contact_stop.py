@@ -23,7 +23,7 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.safety_filter import DQ_ALLOWED, FRICTION_WIDTH, RATE
 
 RELEASED = 0.5  # N
-SLIDES = 0.25  # friction of slowly sliding joints, as a share of the level that holds them; 0.35 with conf/friction/paper
+SLIDES = 0.25  # friction of slowly sliding joints, share of the level that holds them; 0.35 with conf/friction/paper
 RETREAT_M = 0.01  # m, of the tip that came from `task.clearance` = 15 mm above the plane
 LEAVES_S = 0.4  # s; 0.1 s is left to brake, and 20 N on the softest surface of conf/dr/contact.yaml are 10 mm deep
 MOST = 0.25  # share of the allowed speeds, at which a joint moves the tip outwards at most

@@ -41,7 +41,7 @@ from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
 # Columns of a limit, and what it keeps between cycles: RESISTED N, SPEED m/s, whether it has begun; and of a stop
-# (contact_stop.py): its phase, the force N as it began, the height m at which it had released the surface, and its pull N
+# (contact_stop.py): its phase, the force N as it began, the height m at which it had released the surface, its pull N
 FORCE_MAX, SPEED_NEAR, SLOPE, MARGIN, POINT, NORMAL, TIP, RADIUS, RESISTED, SPEED, BEGUN = (
     *(0, 1, 2, 3, 4, 7, 10, 13, 14, 15, 16),
 )

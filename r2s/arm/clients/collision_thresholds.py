@@ -64,8 +64,8 @@ def thresholds_of(robot: Robot, limit: PushLimit | None) -> CollisionThresholds:
     torque, force = (np.maximum(low, ERROR * low + x) for low, x in zip(cautious, reached, strict=True))
     if max(torque.max(), force.max()) >= OFF:
         raise UserError(
-            f"safety.force_max: {limit.force_max:g} N and safety.speed_near: {limit.speed_near:.3g} m/s allow {most:.3g} N "
-            f"on a rigid surface, for which the arm's reflexes would need thresholds of {OFF:g} N or Nm, that is none; "
-            "lower one, or set arm.collision_torque and arm.collision_force"
+            f"safety.force_max: {limit.force_max:g} N, with safety.speed_near of {limit.speed_near:.3g} m/s, allows "
+            f"{most:.3g} N on a rigid surface; for that the arm's reflexes would be off ({OFF:g} N or Nm); lower "
+            "one, or set arm.collision_torque and arm.collision_force"
         )
     return CollisionThresholds(tuple(torque.round(1).tolist()), tuple(force.round(1).tolist()))

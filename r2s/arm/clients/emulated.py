@@ -5,10 +5,10 @@ from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
 from typing import Any
 
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.fr3 import FR3
 from r2s.arm.clients.franka import Franka
-from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.process import Emulator
 from r2s.arm.twins.rigid_twin import RigidTwin

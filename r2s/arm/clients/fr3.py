@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from r2s.arm.clients import connection_check, fr3_limits
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.connection_check import Connection
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
-from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.libfranka import Client
 from r2s.physics.payload import payload_of
 from r2s.physics.robot import Robot

@@ -13,9 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from r2s.arm.clients import fci
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.connection_check import Connection, Finding, refuse
 from r2s.arm.clients.consent import Operator
-from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.libfranka import Client
 from r2s.arm.command_loop import STILL, CommandLoop
 from r2s.arm.driver import Driver

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.connection_check import PANDA, Connection
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
-from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.libfranka import Client, one_line
 from r2s.arm.interface import ArmStopped
 from r2s.physics.payload import payload_of

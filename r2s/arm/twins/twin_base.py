@@ -17,6 +17,7 @@ from r2s.physics.robot import SIM_DT, Robot
 
 NOISE_BLOCK = 1000  # cycles of noise drawn at once
 MAX_EXTRA_DELAY_S = 0.02
+STAYS = 2e-3  # rad, of an arm that holds where its encoders say that it is
 
 
 class TwinBase:
@@ -85,12 +86,16 @@ class TwinBase:
         self._sent = np.zeros(robot.n)
 
     def move_to(self, q: np.ndarray) -> ArmState:
-        """Place the arm at rest at q (n,) rad; friction holds what gravity compensation leaves."""
+        """Place the arm at rest at q (n,) rad; friction holds what gravity compensation leaves.
+
+        Inside the surface it can only stay where it presses.
+        """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
-        if (depth := self._touch.start(q)) > 0:
+        stays = np.abs(q - self._q).max() < STAYS  # where it presses, as under the arm's own position control
+        if (depth := self._touch.start(q)) > 0 and not stays:
             raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
         self._update_payload()
