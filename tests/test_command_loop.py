@@ -12,9 +12,9 @@ from conftest import ROOT, conf
 
 from r2s.arm import driver as law
 from r2s.arm.clients import fci
+from r2s.arm.clients.collision_thresholds import CAUTIOUS
 from r2s.arm.clients.consent import CONSENT, operator_agrees
 from r2s.arm.clients.franka import ACCELERATION, TORQUE_SHARE, Franka
-from r2s.arm.clients.libfranka import CAUTIOUS
 from r2s.arm.command_loop import SLIDING, CommandLoop
 from r2s.arm.driver import Driver
 from r2s.arm.emulator.control import HOLD

@@ -18,6 +18,7 @@ from r2s.arm.driver import DriverBatch
 from r2s.arm.emulator.control import Control
 from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.twins.make_twin import make_twin
+from r2s.arm.warm_up import warm_up
 from r2s.errors import UserError
 from r2s.physics.contact_stop import LEAVES_S, RELEASED, RETREAT_M, SLIDES
 from r2s.physics.push_limit import LEAVE, STOPS, PushLimit
@@ -177,7 +178,8 @@ def test_the_emulated_box_holds_an_arm_that_presses():
     """Where it presses it stays, and elsewhere inside the surface nothing can be placed."""
     task = make_task()
     start = task.goals(PANDA, np.random.default_rng(1), 1)[0]
-    box = Control(make_twin(replace(PANDA, q_home=start[9:]), seed=0, surface=True), 5)
+    surface = {"point": POINT.tolist(), "normal": UP.tolist()}
+    box = Control(make_twin(replace(PANDA, q_home=start[9:]), seed=0, surface=surface), 5)
     box.begin()
     box.first_answer()
     inwards, tau = -UP @ TIP(start[9:])[1], np.zeros(N)
@@ -195,3 +197,10 @@ def test_the_emulated_box_holds_an_arm_that_presses():
     box.first_answer()
     box.cycle(np.zeros(N))
     assert box.running
+
+
+def test_a_task_that_presses_is_warmed_up():
+    """Its controller takes more numbers than an arm has joints, and no torques."""
+    task = make_task().pushing_within(PANDA, TRUE.level, 45.0, 0.03)
+    assert task.control(PANDA).command_size > N
+    warm_up(PANDA, task)

@@ -170,5 +170,10 @@ def test_a_surface_needs_a_tool_and_room(panda):
     ):
         make_twin(panda, surface=True)
     inside = {"point": [0.307, 0.0, 0.56], "normal": [0.0, 0.0, 1.0]}
+    with pytest.raises(
+        UserError, match=r"^arm\.surface: the tip at home would be \d+\.\d mm inside it; choose a point"
+    ):
+        make_twin(armed(), surface=inside)
+    below = armed().q_home + 0.2 * (np.arange(7) == 1)
     with pytest.raises(ArmStopped, match=r"^move_to: the tool's tip would be \d+\.\d mm inside the surface$"):
-        make_twin(armed(), surface=inside).move_to(armed().q_home)
+        make_twin(armed(), surface=TABLE).move_to(below)

@@ -25,9 +25,9 @@ import torch
 from conftest import ROOT, conf
 
 from r2s.arm.clients import fci, fr3_limits, libfranka
+from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.fr3 import FR3
 from r2s.arm.clients.franka import TORQUE_SHARE
-from r2s.arm.clients.libfranka import CAUTIOUS, CollisionThresholds
 from r2s.arm.clients.panda import Panda
 from r2s.arm.emulator.control import CUTOFF_HZ, Control, Fault
 from r2s.arm.emulator.process import Emulator, _read_robot, main

@@ -7,6 +7,7 @@ import numpy as np
 
 from r2s.adaptation.adapter import Adapter
 from r2s.arm.command_loop import CommandLoop
+from r2s.arm.driver import Driver
 from r2s.arm.interface import ArmState, ArmStopped
 from r2s.arm.policy_runner import as_state, episode_driver
 from r2s.arm.ramp import ramp
@@ -61,6 +62,7 @@ def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = No
     for loaded in (False, True):
         record(_Puppet(robot, 0.0), still, loaded=loaded)
     ramp(_Puppet(robot, 0.0), robot.q_home[None], largest=RAMP_NM)
+    CommandLoop(_Puppet(robot, SWING_RAD), Driver(robot, robot.tau_max, np.ones(robot.n))).damp(np.zeros(robot.n))
     if task is None:
         return
     driver = episode_driver(robot, task, 0.0, np.ones(robot.n))
@@ -71,6 +73,5 @@ def warm_up(robot: Robot, task: Task | None = None, adapter: Adapter | None = No
     with suppress(ArmStopped):
         for _ in range(2 * CYCLES):
             loop(command)
-        loop.rest()
         while True:  # without commands the driver stops the arm
             loop(None)

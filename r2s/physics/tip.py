@@ -73,5 +73,6 @@ def nominal_plane(robot: Robot, point: object = None, normal: object = None) -> 
     values = [e if x is None else np.array(x, dtype=float) for x, e in zip((point, normal), default, strict=True)]
     for name, value in zip(("point", "normal"), values, strict=True):
         if value.shape != (3,) or not np.isfinite(value).all() or (name == "normal" and not value.any()):
-            raise UserError(f"{name}: expected 3 numbers, got {value.tolist()}")
+            not_zero = ", not all 0" if name == "normal" else ""
+            raise UserError(f"{name}: expected 3 numbers{not_zero}, got {value.tolist()}")
     return values[0], values[1] / np.linalg.norm(values[1])

@@ -12,7 +12,7 @@ from r2s.physics.newton_euler import links_of
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Surface
-from r2s.physics.tip import default_plane, tilted
+from r2s.physics.tip import Tip, default_plane, tilted
 
 PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
@@ -68,7 +68,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     surface: False: none. True: a table below the tip at home. {point: m, normal}: that place.
 
     Raises:
-        UserError: another value, or a robot without a tool.
+        UserError: another value, a robot without a tool, or a surface inside the arm.
     """
     if surface is False or surface is None:
         return None
@@ -77,7 +77,7 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     point, normal = default_plane(robot) if surface is True else _place(surface)
     # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
     about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
-    return Surface(
+    out = Surface(
         point=point + rng.uniform(-PLACE, PLACE) * normal,
         normal=tilted(normal, about, tilt),
         stiffness=float(np.exp(rng.uniform(*np.log(STIFFNESS)))),
@@ -86,6 +86,13 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
         friction=float(rng.uniform(0.1, 0.5)),
         bristle=float(rng.uniform(1e-4, 3e-4)),  # m
     )
+    inside = out.depth(Tip(robot)(robot.q_home)[0], robot.tool.radius)
+    if inside > 0:
+        raise UserError(
+            f"arm.surface: the tip at home would be {1e3 * float(inside):.1f} mm inside it; choose a point below the "
+            "tip, and a normal towards it"
+        )
+    return out
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
