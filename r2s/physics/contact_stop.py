@@ -59,11 +59,11 @@ def stop_torque(limit, arm, kinematics, friction, limits, target):
     for j in range(n):
         share = max(share, LEAVE / mobility * abs(lever[j]) / limits[j, DQ_ALLOWED])
     for j in range(n):
-        wanted = -LEAVE / mobility * min(1.0, MOST / share) * lever[j]  # rad/s
-        ahead = friction[j] * np.tanh(wanted / FRICTION_WIDTH)
+        asked = -LEAVE / mobility * min(1.0, MOST / share) * lever[j]  # rad/s
+        ahead = friction[j] * np.tanh(asked / FRICTION_WIDTH)
         target[j] = arm.bias[j] + max(limit[RESISTED], 0.0) * row[j] + ahead
         behind -= lever[j] * ahead / mobility
-        ddq[j] = GAIN * (wanted - arm.dq[j])
+        ddq[j] = GAIN * (asked - arm.dq[j])
     pull = limit[PULL] + SIM_DT * GAIN**2 / mobility * (LEAVE * min(1.0, MOST / share) + speed)
     limit[PULL] = min(max(pull, 0.0), behind)
     for j in range(n):
