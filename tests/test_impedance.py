@@ -27,6 +27,7 @@ from r2s.physics.robot import load_robot
 from r2s.physics.surface import Tool
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.track import TrackTask
+from r2s.tasks.wipe import WipeTask
 
 PANDA = load_robot(**conf("robot/panda"))
 N = PANDA.n
@@ -394,6 +395,7 @@ CONTROLS = {
     "hybrid": lambda model: cartesian_impedance(
         PANDA, Pose(), model, action="both", hybrid=True, normal=[0, 0, 1], force=5.0
     ),
+    "sliding": lambda model: cartesian_impedance(PANDA, WipeTask(), model, hybrid=True, integral_rate=8.0),
     "joint": lambda model: joint_impedance(PANDA, REACH, model, action="both"),
     "joint path": lambda model: joint_impedance(PANDA, TrackTask(pool=2), model, action="stiffness"),
 }
@@ -405,7 +407,8 @@ def stream(control, cycles=1000):
     action = control.action_offset + control.action_scale * rng.uniform(-1.2, 1.2, (rows, control.action_dim))
     given = rng.normal(0, 0.4, (rows, control.setpoint_size))
     if control.hybrid:
-        given[:, -6:] = [0.0, 0.6, 0.8, 5.0, 3.0, 1.0] + np.array([0, 0, 0, 1, 3, 0]) * rng.normal(size=(rows, 1))
+        contact = slice(control.target_size, control.target_size + 6)
+        given[:, contact] = [0.0, 0.6, 0.8, 5.0, 3.0, 1.0] + np.array([0, 0, 0, 1, 3, 0]) * rng.normal(size=(rows, 1))
     command = np.repeat(np.concatenate([action, given], axis=1), 20, axis=0)
     q = PANDA.q_home + rng.uniform(-0.1, 0.1, (cycles, N)) + np.repeat(rng.uniform(-0.5, 0.5, (rows, N)), 20, axis=0)
     return q, 0.3 * rng.normal(size=(cycles, N)), command, np.arange(cycles) % 400 == 0

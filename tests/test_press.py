@@ -17,7 +17,8 @@ from r2s.learning.randomization import ContactRandomization
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.physics.tip import Tip, default_plane
-from r2s.tasks.press import FORCES, NORMAL, POINT, PressTask
+from r2s.tasks.press import PressTask
+from r2s.tasks.surface_task import FORCES, NORMAL, POINT
 from r2s.tasks.task import Episodes, State, observation_scale, observe
 
 BARE = load_robot(**conf("robot/panda"))
@@ -230,14 +231,17 @@ def test_what_does_not_fit_is_one_line():
 
 
 @pytest.mark.slow
-def test_train_and_transfer_to_a_twin(tmp_path):
+@pytest.mark.parametrize("task", ["press", "wipe"])
+def test_train_and_transfer_to_a_twin(task, tmp_path):
     """From the command line: a short training improves nothing yet, but the policy touches the surface of a twin."""
     short = "budget.env_steps=4000", "budget.minutes=null", "evaluation.episodes=2", "algo.n_envs=8", "compile=false"
-    succeed("task=press", *short, f"root={tmp_path}", "name=toy", "threads=1")
+    succeed(f"task={task}", *short, f"root={tmp_path}", "name=toy", "threads=1")
     transfer = "stage=transfer", f"policy={tmp_path}/train/toy", "arm=twin", "evaluation.episodes=2", "threads=1"
     refused = r2s(*transfer, f"root={tmp_path}")
     assert refused.returncode == 2
-    assert "arm.surface: PressTask touches a surface, and this arm has none" in refused.stdout + refused.stderr
+    assert (
+        f"arm.surface: {task.title()}Task touches a surface, and this arm has none" in refused.stdout + refused.stderr
+    )
     succeed(*transfer, "arm.surface=true", f"root={tmp_path}", "name=twin")
     rows = json.loads((tmp_path / "transfer/twin/summary.json").read_text())
     assert {"mujoco", "predicted", "twin"} <= set(rows)

@@ -46,8 +46,13 @@ class Impedance(Controller):
 
     @property
     def setpoint_size(self) -> int:
-        """Target, and for hybrid control normal (3), force, measured force, and whether it is measured."""
-        return self.target_size + 6 * self.hybrid
+        """Target; of hybrid control normal (3), force, measured force, and whether it is measured; pull (3)."""
+        return self.target_size + 6 * self.hybrid + 3 * self.slides
+
+    @property
+    def slides(self) -> bool:
+        """Whether the target slides on a surface, so that the task has a pull."""
+        return bool(self.hybrid and self.parameters[law.APPROACH] == law.SLIDES)
 
     def holding_torque(self, q: np.ndarray) -> np.ndarray:
         """Return the model's torque (n,) Nm at rest at q (n,) rad."""
@@ -64,12 +69,13 @@ class Impedance(Controller):
         if not self.hybrid:
             return target
         contact = task.contact(t, goals) if self.contact is None else np.tile(self.contact, (len(t), 1))
-        return np.concatenate([target, contact, np.zeros((len(t), 2))], axis=1)
+        pull = [task.pull(t, goals)] if self.slides else []
+        return np.concatenate([target, contact, np.zeros((len(t), 2)), *pull], axis=1)
 
     def with_force(self, command: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Return the commands (m, c) of hybrid control with the measured force (m,) N against the normal."""
-        out = command.copy()
-        out[:, -2], out[:, -1] = force, 1.0
+        out, at = command.copy(), self.command_size - 3 * self.slides - 2
+        out[:, at], out[:, at + 1] = force, 1.0
         return out
 
 
@@ -196,7 +202,7 @@ def cartesian_impedance(
     p[law.FORCE_LIMIT] = force_clip**2 / (2 * stiffness)
     p[law.MOMENT_LIMIT] = moment_clip**2 / (2 * rotational_stiffness) if rotates else 0.0
     p[law.HYBRID], p[law.RATE] = hybrid, integral_rate
-    p[law.APPROACH] = hybrid and normal is None and getattr(task, "approaches", False)
+    p[law.APPROACH] = getattr(task, "approaches", 0) if hybrid and normal is None else 0
     p[law.FORCE_MAX], p[law.INTEGRAL_MAX] = force_clip, integral_max * force_clip
     p[law.TASK_AXES], p[law.TARGET_SIZE] = 6 if rotates else 3, task.target_size
     rows[:, law.K_JOINT] = null_stiffness * limit

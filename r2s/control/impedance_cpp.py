@@ -15,6 +15,7 @@ struct Pose { double r[9], p[3]; };
 struct Law {
   static double least(double a, double b) { return b < a ? b : a; }
   static double most(double a, double b) { return b > a ? b : a; }
+  static double follows() { return parameters[APPROACH] == 1.0 ? 0.0 : 1.0; }
   static const double* row(int i) { return parameters + HEAD + i * ROW; }
   static void rotate(const double* r, const double* v, double* o) {
     for (int i = 0; i < 3; ++i) o[i] = r[3 * i] * v[0] + r[3 * i + 1] * v[1] + r[3 * i + 2] * v[2];
@@ -123,7 +124,7 @@ struct Law {
     } else {
       for (int j = 0; j < n; ++j)
         memory[LEVEL] -= memory[at + n + j] * (q[j] - memory[at + 2 * n + j] -
-                                               (1.0 - parameters[APPROACH]) * memory[at + j] * parameters[CYCLE_S]);
+                                               follows() * memory[at + j] * parameters[CYCLE_S]);
     }
     memory[LEVEL] = least(most(memory[LEVEL], 0.0), parameters[TANK]);
   }
@@ -239,7 +240,7 @@ _CARTESIAN = """
     }
     return most(0.5 * (3.0 - trace), 0.0);
   }
-  static void update(const double* command, const Pose* frames, const double (*jacobian)[n], double* memory) {
+  static void update(const double* velocity, const Pose* frames, const double (*jacobian)[n], double* memory) {
     constexpr int a = AXES, at = STIFFNESS + SPRINGS;
     const double* K = memory + STIFFNESS;
     double *D = memory + at + 3 * n, *N = D + n * n, mass[n * n], mobility[n * n], W[a * a], G[a][n], across[n];
@@ -266,11 +267,8 @@ _CARTESIAN = """
           G[i][j] += along * mobility[k * n + j];
         }
       }
-    const int velocity = int(parameters[TARGET_AT]) + 3;
     for (int i = 0; i < n; ++i) {
-      memory[at + i] = 0.0;
-      for (int k = 0; k < (parameters[TARGET_SIZE] >= 6.0 ? 3 : 0); ++k)
-        memory[at + i] += G[k][i] * command[velocity + k];
+      memory[at + i] = G[0][i] * velocity[0] + G[1][i] * velocity[1] + G[2][i] * velocity[2];
       for (int j = 0; j < n; ++j) {
         N[i * n + j] = i == j ? 1.0 : 0.0;
         for (int k = 0; k < a; ++k) N[i * n + j] -= jacobian[k][i] * G[k][j];
@@ -302,20 +300,48 @@ _CARTESIAN = """
     }
     return least(most(asked + memory[INTEGRAL], 0.0), all);
   }
+  static void slide(const double* normal, const double* error, const double* dq, const double (*jacobian)[n],
+                    double* velocity, double* memory, double* aside) {
+    double up = 0.0, rises = 0.0, fast = SLIDING * SLIDING, along[3], side[3];
+    for (int k = 0; k < 3; ++k) {
+      up += velocity[k] * normal[k];
+      for (int j = 0; j < n; ++j) rises += normal[k] * jacobian[k][j] * dq[j];
+    }
+    for (int k = 0; k < 3; ++k) along[k] = velocity[k] - up * normal[k];
+    for (int k = 0; k < 3; ++k) fast += along[k] * along[k], rises -= memory[SLOPE + k] * along[k];
+    const double learns = SLOPE_RATE * parameters[CYCLE_S] * rises / fast, limit = parameters[INTEGRAL_MAX];
+    for (int k = 0; k < 3; ++k) {
+      memory[SLOPE + k] += learns * along[k];
+      for (int c = 0; c < 3; ++c) velocity[c] += memory[SLOPE + k] * along[k] * normal[c];
+    }
+    for (int k = 0; k < 3; ++k) along[k] /= std::sqrt(fast), side[k] = along[k];
+    for (int i = 0; i < 2; ++i) {
+      double& sum = memory[ACROSS + i];
+      for (int k = 0; k < 3; ++k)
+        sum += parameters[CYCLE_S] * parameters[RATE] * parameters[K_DEFAULT] * error[k] * side[k];
+      sum = least(most(sum, -limit), limit);
+      for (int k = 0; k < 3; ++k) aside[k] += sum * side[k];
+      cross(normal, along, side);
+    }
+  }
 };
 constexpr int at = STIFFNESS + SPRINGS;
 const int shift = int(parameters[DISPLACED]), target = int(parameters[TARGET_AT]);
-const bool begins = memory[BEGUN] == 0.0, pushes = parameters[HYBRID] > 0.0;
-const double follows = 1.0 - parameters[APPROACH];
-double place[3], jacobian[6][n], error[3], wrench[6] = {}, along = 0.0;
+const bool begins = memory[BEGUN] == 0.0, pushes = parameters[HYBRID] > 0.0, slides = parameters[APPROACH] == SLIDES;
+double place[3], jacobian[6][n], error[3], velocity[3] = {}, aside[3] = {}, wrench[6] = {}, along = 0.0;
 Pose frames[n];
 Law::arm_pose(q, frames, jacobian, place);
 Law::refill(q, memory, at);
 for (int k = 0; k < 3; ++k) error[k] = command[target + k] - place[k] + (shift >= 0 ? command[shift + k] : 0.0);
 const double* normal = command + target + int(parameters[TARGET_SIZE]);
+for (int k = 0; k < (parameters[TARGET_SIZE] >= 6.0 ? 3 : 0); ++k) {
+  velocity[k] = command[target + 3 + k];
+  if (slides) error[k] += parameters[CYCLE_S] * (memory[SINCE] - 0.5 * parameters[HOLD]) * velocity[k];
+}
 if (pushes) {
   along = error[0] * normal[0] + error[1] * normal[1] + error[2] * normal[2];
   for (int k = 0; k < 3; ++k) error[k] -= along * normal[k];
+  if (slides) Law::slide(normal, error, dq, jacobian, velocity, memory, aside);
 }
 const double tilt = AXES == 6 ? Law::rotation_error(frames[n - 1].r, command, wrench + 3) : 0.0;
 Law::task_stiffness(command, error, tilt, begins, memory);
@@ -329,13 +355,14 @@ if (pushes) {
   if (parameters[APPROACH] > 0.0) push = Law::least(push, Law::most(-parameters[K_DEFAULT] * along, 0.0));
   along = push + wrench[0] * normal[0] + wrench[1] * normal[1] + wrench[2] * normal[2];
   for (int k = 0; k < 3; ++k) wrench[k] -= along * normal[k];
+  for (int k = 0; k < (slides ? 3 : 0); ++k) wrench[k] += normal[6 + k] + aside[k] + push * memory[SLOPE + k];
 }
-if (memory[SINCE] == 0.0) Law::update(command, frames, jacobian, memory);
+if (memory[SINCE] == 0.0) Law::update(velocity, frames, jacobian, memory);
 const double *D = memory + at + 3 * n, *N = D + n * n;
 for (int j = 0; j < n; ++j) {
   double damping = 0.0, torque = 0.0;
   for (int k = 0; k < n; ++k) {
-    damping -= parameters[RATIO] * D[j * n + k] * (dq[k] - follows * memory[at + k]);
+    damping -= parameters[RATIO] * D[j * n + k] * (dq[k] - Law::follows() * memory[at + k]);
     torque += N[j * n + k] * Law::row(k)[K_JOINT] * (Law::row(k)[HOME] - q[k]);
   }
   for (int k = 0; k < AXES; ++k) torque += jacobian[k][j] * wrench[k];

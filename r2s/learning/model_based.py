@@ -134,7 +134,7 @@ def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     control = task.control(robot)
     if control.name != "hybrid" or not hasattr(task, "contact"):
         raise UserError(
-            f"algo: hybrid_force cannot do {type(task).__name__} under control={control.name}; task=press with "
-            "control=hybrid is allowed"
+            f"algo: hybrid_force cannot do {type(task).__name__} under control={control.name}; task=press or "
+            "wipe with control=hybrid is allowed"
         )
     return ZeroAction(control.action_dim)

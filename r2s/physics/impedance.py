@@ -26,25 +26,29 @@ from r2s.physics.newton_euler import (
 
 # Parameters: cycles between two updates of D and N, 2 zeta, energies J at which force and moment saturate, first
 # level and size of the tank J, cycle s; places in the command (-1: none), size of the target, number of the task's
-# axes (3 or 6); whether the law is hybrid, rate of its integral 1/s, largest force and integral N. APPROACH: 1 if a
-# hybrid force is at most that of the spring to the target, and dq_r is the direction of friction only; else 0
+# axes (3 or 6); whether the law is hybrid, rate of its integrals 1/s, largest force and integral N. APPROACH: above 0
+# if a hybrid force is at most that of the spring to the target; 1: dq_r is the direction of friction only; SLIDES:
+# the target moves on the surface, which may be tilted
 HOLD, RATIO, FORCE_LIMIT, MOMENT_LIMIT, FILL, TANK, CYCLE_S = range(7)
 DISPLACED, STIFFNESS_AT, TARGET_AT, TARGET_SIZE, TASK_AXES, HYBRID, RATE, FORCE_MAX, INTEGRAL_MAX = range(7, 16)
 K_DEFAULT, K_LOW, K_HIGH = 16, 20, 24  # 4 each: x, y, z N/m and rotation Nm/rad
 TIP, HOME_AXES, GRAVITY = 28, 31, 40  # tip in the last link, that link's axes at home, m/s^2
 APPROACH, HEAD = 43, 44
+SLIDES = 2  # a value of APPROACH
 # Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
 # friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
 # saturates, home
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
 K_JOINT, JOINT_LIMIT, HOME, ROW = 44, 47, 48, 49
-# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; then the stiffnesses,
-# and rows of n: dq_r, the last damping torque, the last q; matrices D and N^T
-SINCE, BEGUN, LEVEL, INTEGRAL, STIFFNESS = range(5)
+# Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; of a sliding tip, the
+# integrals along the path and to its side (2) N and the slope of the surface (3); then the stiffnesses, and rows of
+# n: dq_r, the last damping torque, the last q; matrices D and N^T
+SINCE, BEGUN, LEVEL, INTEGRAL, ACROSS, SLOPE, STIFFNESS = 0, 1, 2, 3, 4, 6, 9
 SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
 FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
+SLOPE_RATE, SLIDING = 10.0, 0.02  # 1/s, of the estimated slope; m/s, below which a sliding tip tells less of it
 SMALLEST = 0.01  # share of a rise of the stiffness below which it stays
 MOBILITY = 1e-3  # 1/kg and 1/(kg m^2): directions with less, near a singularity, count as blocked
 
@@ -168,7 +172,7 @@ def refill(q, n, parameters, memory, at):
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
     else:
         for j in range(n):
-            follows = (1.0 - parameters[APPROACH]) * memory[at + j]
+            follows = 0.0 if parameters[APPROACH] == 1.0 else memory[at + j]
             moved = q[j] - memory[at + 2 * n + j] - follows * parameters[CYCLE_S]
             memory[LEVEL] -= memory[at + n + j] * moved
     memory[LEVEL] = min(max(memory[LEVEL], 0.0), parameters[TANK])

@@ -4,6 +4,7 @@ import numpy as np
 
 from r2s.compiled import njit
 from r2s.physics.impedance import (
+    ACROSS,
     APPROACH,
     BEGUN,
     CYCLE_S,
@@ -30,6 +31,10 @@ from r2s.physics.impedance import (
     RATIO,
     ROW,
     SINCE,
+    SLIDES,
+    SLIDING,
+    SLOPE,
+    SLOPE_RATE,
     SMALLEST,
     SPRINGS,
     STIFFNESS,
@@ -155,8 +160,8 @@ def rotation_error(R, command, parameters, error):
 
 
 @njit(cache=True, error_model="numpy")
-def update(command, parameters, frames, jacobian, memory):
-    """Write dq_r (n,) rad/s, D and N^T (n, n) of this posture into memory."""
+def update(velocity, parameters, frames, jacobian, memory):
+    """Write dq_r (n,) rad/s of the target's velocity (3,) m/s, D and N^T (n, n) of this posture into memory."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
     D = memory[at + 3 * n : at + 3 * n + n * n].reshape((n, n))
@@ -183,11 +188,8 @@ def update(command, parameters, frames, jacobian, memory):
                 for c in range(a):
                     along += W[i, c] * jacobian[c, k]
                 G[i, j] += along * mobility[k, j]
-    velocity = int(parameters[TARGET_AT]) + 3
     for i in range(n):
-        memory[at + i] = 0.0
-        for k in range(3 if parameters[TARGET_SIZE] >= 6.0 else 0):
-            memory[at + i] += G[k, i] * command[velocity + k]
+        memory[at + i] = G[0, i] * velocity[0] + G[1, i] * velocity[1] + G[2, i] * velocity[2]
         for j in range(n):
             N[i, j] = 1.0 if i == j else 0.0
             for k in range(a):
@@ -228,26 +230,69 @@ def normal_force(command, shift, parameters, memory):
 
 
 @njit(cache=True, error_model="numpy")
+def slide(normal, error, dq, jacobian, velocity, parameters, memory, aside):
+    """Learn what a tip meets that slides on a surface; write the force (3,) N that holds it on the path.
+
+    Adds the rate at which the surface rises to the target's velocity (3,) m/s. The slope g of the surface is the
+    least squares of the tip's speed along the normal = g velocity, with the gradient method (Widrow and Hoff, 1960).
+    The force is the integral of the error along the path, as friction acts, and to its side, each clamped.
+    """
+    up, rises, fast = 0.0, 0.0, SLIDING * SLIDING
+    for k in range(3):
+        up += velocity[k] * normal[k]
+        for j in range(len(dq)):
+            rises += normal[k] * jacobian[k, j] * dq[j]
+    along = velocity - up * normal
+    for k in range(3):
+        fast += along[k] * along[k]
+        rises -= memory[SLOPE + k] * along[k]
+    learns = SLOPE_RATE * parameters[CYCLE_S] * rises / fast
+    for k in range(3):
+        memory[SLOPE + k] += learns * along[k]
+        velocity += memory[SLOPE + k] * along[k] * normal
+    along /= np.sqrt(fast)
+    side, most = along.copy(), parameters[INTEGRAL_MAX]
+    rate = parameters[CYCLE_S] * parameters[RATE] * parameters[K_DEFAULT]
+    aside[:] = 0.0
+    for i in range(2):
+        for k in range(3):
+            memory[ACROSS + i] += rate * error[k] * side[k]
+        memory[ACROSS + i] = min(max(memory[ACROSS + i], -most), most)
+        aside += memory[ACROSS + i] * side
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            side[k] = normal[a] * along[b] - normal[b] * along[a]
+
+
+@njit(cache=True, error_model="numpy")
 def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     """Impedance of the tip: `control=cartesian_impedance`, and with a force along a normal `control=hybrid`.
 
     command: displacement of the target (3) m and, with six axes, (3) rad as a rotation vector, then stiffness (3) N/m
     and, with six axes, (1) Nm/rad, where the action has them. Then the task's target: position (3), and where it has
     them velocity (3) m/s and rotation vector from home (3) rad. For hybrid: see `normal_force`; with APPROACH the
-    force grows with the distance to a target that moves into a surface, until it is the one asked for.
+    force grows with the distance to a target that moves into a surface, until it is the one asked for. A target that
+    SLIDES is that of the middle of a period, and behind the contact the command has what pulls at the tip (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
-    frames, jacobian, place = np.empty((n, POSE)), np.empty((6, n)), np.empty(3)
+    frames, jacobian, place, velocity = np.empty((n, POSE)), np.empty((6, n)), np.empty(3), np.zeros(3)
     arm_pose(q, parameters, frames, jacobian, place)
     refill(q, n, parameters, memory, at)
     shift, target, error, wrench = int(parameters[DISPLACED]), int(parameters[TARGET_AT]), np.empty(3), np.zeros(6)
+    aside = np.zeros(3)
     for k in range(3):
         error[k] = command[target + k] - place[k] + (command[shift + k] if shift >= 0 else 0.0)
-    normal, along = target + int(parameters[TARGET_SIZE]), 0.0
+    normal, along, slides = target + int(parameters[TARGET_SIZE]), 0.0, parameters[APPROACH] == SLIDES
+    if parameters[TARGET_SIZE] >= 6.0:
+        velocity[:] = command[target + 3 : target + 6]
+    if slides:  # a sliding target moves on within a period
+        error += parameters[CYCLE_S] * (memory[SINCE] - 0.5 * parameters[HOLD]) * velocity
     if parameters[HYBRID] > 0.0:
         along = error[0] * command[normal] + error[1] * command[normal + 1] + error[2] * command[normal + 2]
         for k in range(3):
             error[k] -= along * command[normal + k]
+    if slides:
+        slide(command[normal : normal + 3], error, dq, jacobian, velocity, parameters, memory, aside)
     tilt = rotation_error(pose_axes(frames[n - 1]), command, parameters, wrench[3:]) if a == 6 else 0.0
     task_stiffness(command, error, tilt, begins, parameters, memory)
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
@@ -264,9 +309,11 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
         along += push
         for k in range(3):
             wrench[k] -= along * command[normal + k]
+            if slides:
+                wrench[k] += command[normal + 6 + k] + aside[k] + push * memory[SLOPE + k]
     if memory[SINCE] == 0.0:
-        update(command, parameters, frames, jacobian, memory)
-    D, N, follows = at + 3 * n, at + 3 * n + n * n, 1.0 - parameters[APPROACH]
+        update(velocity, parameters, frames, jacobian, memory)
+    D, N, follows = at + 3 * n, at + 3 * n + n * n, 0.0 if parameters[APPROACH] == 1.0 else 1.0
     for j in range(n):
         damping, torque = 0.0, 0.0
         for k in range(n):

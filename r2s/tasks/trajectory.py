@@ -19,6 +19,7 @@ from r2s.physics.robot import Robot
 from r2s.physics.safety_filter import APPROACH, DECELERATION, DQ_ALLOWED, OFFSET, Q_HIGH, Q_LOW, RATE, filter_limits
 
 KINDS = ("fourier", "eight", "circle", "waypoints")
+SPACE = np.eye(3)
 GRID_M = 0.01  # m, step of u between two postures of the inverse kinematics
 HARMONICS = 3  # of a random Fourier curve
 LEADS = 60  # points from home to the start of a path, and as many for the posture to converge there
@@ -36,9 +37,13 @@ X, V = slice(0, 3), slice(3, 6)  # columns of a plan, followed by q, dq, ddq
 Curve = Callable[[np.ndarray], np.ndarray]
 
 
-def curve(kind: str, rng: np.random.Generator, size: float) -> Curve:
-    """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its centre and with |dx/du| <= 1."""
-    a, b, _ = np.linalg.qr(rng.standard_normal((3, 3)))[0].T
+def curve(kind: str, rng: np.random.Generator, size: float, axes: np.ndarray = SPACE) -> Curve:
+    """Return the curve u (T,) m -> x(u) - x(0) (T, 3) m, within `size` m of its centre and with |dx/du| <= 1.
+
+    axes: (k, 3), perpendicular unit vectors of the plane, or of the space, in which it lies.
+    """
+    k = len(axes)
+    a, b = np.linalg.qr(rng.standard_normal((k, k)))[0].T[:2] @ axes
     way = rng.choice([-1.0, 1.0])
     match kind:
         case "circle":
@@ -47,9 +52,9 @@ def curve(kind: str, rng: np.random.Generator, size: float) -> Curve:
             pace = 1 / (np.sqrt(2) * size)  # lemniscate of Gerono, fastest at its crossing
             return lambda u: size * (np.outer(np.sin(pace * u), a) + 0.5 * way * np.outer(np.sin(2 * pace * u), b))
         case "waypoints":
-            return _waypoints(rng, size)
+            return _waypoints(rng, size, axes)
     order = np.arange(1, HARMONICS + 1)
-    both = rng.standard_normal((2, HARMONICS, 3)) / order[:, None]
+    both = rng.standard_normal((2, HARMONICS, k)) @ axes / order[:, None]
     angles = np.linspace(0, 2 * np.pi, 400)[:, None] * order
 
     def series(angle: np.ndarray) -> np.ndarray:
@@ -61,12 +66,12 @@ def curve(kind: str, rng: np.random.Generator, size: float) -> Curve:
     return lambda u: series(np.outer(u / fastest, order)) - start
 
 
-def _waypoints(rng: np.random.Generator, size: float) -> Curve:
-    """Return a curve of minimum-jerk motions between random points of a ball."""
+def _waypoints(rng: np.random.Generator, size: float, axes: np.ndarray) -> Curve:
+    """Return a curve of minimum-jerk motions between random points of a ball, or of a disc."""
     points = [np.zeros(3)]
     length = 0.0
     while length < 8.0:  # m of u, more than the length of an episode
-        direction = rng.standard_normal(3)
+        direction = rng.standard_normal(len(axes)) @ axes
         point = size * rng.uniform(0.3, 1.0) * direction / np.linalg.norm(direction)
         if len(points) == 1 or np.linalg.norm(point - points[-1]) > 0.3 * size:
             length += PEAK * float(np.linalg.norm(point - points[-1]))

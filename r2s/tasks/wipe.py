@@ -1,0 +1,189 @@
+"""Task wipe: follow a timed path on a surface whose place is roughly known, under a normal force."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from r2s.errors import UserError, check_number, choices, nearest
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.impedance import SLIDES
+from r2s.physics.robot import Robot
+from r2s.physics.tip import Tip
+from r2s.tasks.measures import MeasureTable
+from r2s.tasks.surface_task import FAR_N, HARD_N, NORMAL, SurfaceTask, near, rough
+from r2s.tasks.task import Episodes, ObservationTerm, State
+from r2s.tasks.trajectory import KINDS, V, X, clock, curve
+from r2s.tasks.wipe_measures import GOOD_M, GOOD_N, WIPE, wipe_measures
+
+A = slice(6, 9)  # columns of a path, after those of place and velocity
+SLOW_V = 0.01  # m/s, at which the expected friction of the surface reaches its level
+FAR_M = 0.01  # m, tanh scale of the path error
+REST_S = 0.3  # s, between the whole force and the path, and at the path's end
+
+
+@dataclass(frozen=True)
+class WipeTask(SurfaceTask):
+    """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
+
+    A goal is the row of `SurfaceTask` with one force twice, then place, velocity and acceleration (9,) of the path
+    before the first control step and after each.
+
+    Attributes:
+        speed: (low, high) m/s, drawn peak speed. size: (low, high) m, of paths about their middle. kinds: subset of
+            KINDS, drawn with equal probability. ramp_s: s, of the path's acceleration, and of its deceleration.
+        friction: of the surface, expected. The others: see `SurfaceTask`.
+        inertia: (3, 3) kg, of the tip at the nominal plane.
+    """
+
+    episode_s: float = 8.0
+    spread: float = 0.08
+    speed: tuple[float, float] = (0.05, 0.2)
+    size: tuple[float, float] = (0.03, 0.05)
+    kinds: tuple[str, ...] = KINDS
+    ramp_s: float = 0.4
+    friction: float = 0.3
+    inertia: np.ndarray = field(default=None, repr=False)  # type: ignore[assignment]
+    measure_table: ClassVar[MeasureTable] = WIPE
+    approaches: ClassVar[int] = SLIDES
+    own_settings: ClassVar[dict[str, Any]] = {"stiffness": 900.0, "integral_rate": 8.0}
+    reward_terms = "force", "path", "precision", "excess", "smoothness", "filter_penalty"
+    observation_summary = (
+        "q dq tip tanh(height/5 mm) tip_velocity tanh(rate/0.01) force/20 tanh(force_error/10) ahead/5mm effort "
+        "limited tanh(path_error/3 mm) path_velocity; rad, rad/s, m, m/s, N"
+    )
+
+    def __post_init__(self):
+        super().__post_init__()
+        self._check_range("speed", "m/s", equal=True)
+        self._check_range("size", "m", equal=True)
+        for kind in self.kinds or ("",):
+            if kind not in KINDS:
+                raise UserError(f"task.kinds: '{kind}'; allowed: {choices(KINDS)}{nearest(str(kind), KINDS)}")
+        check_number(
+            "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
+        )  # its middle is that of a square
+        check_number("task.ramp_s", self.ramp_s, "(0, inf)")
+        check_number("task.friction", self.friction, "[0, inf)")
+        check_number("task.episode_s", self.episode_s, f"[{self.begin_s + 2 * self.ramp_s + REST_S:g}, 60]")
+
+    @property
+    def begin_s(self) -> float:
+        """When the path begins, s: the tip has touched for sure, and the largest force has risen."""
+        return self.down_s + self.force[1] / self.force_rate + REST_S
+
+    def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
+        """Return the task with the model of one arm; see `SurfaceTask.with_model`."""
+        task, tip = super().with_model(robot, dynamics), Tip(robot)
+        q = tip.posture(self.plane(robot)[0])
+        q = robot.q_home if q is None else q  # `goals` raises
+        jacobian, mass = tip(q)[1], task.model.mass(q[None])[0]  # type: ignore[union-attr]
+        return replace(task, inertia=np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T)))
+
+    def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
+        """Return (steps + 1, 3) m, a curve of KINDS at a speed ~ U(speed), anywhere within `spread`."""
+        size, speed = rng.uniform(*self.size), rng.uniform(*self.speed)
+        shape = curve(self.kinds[rng.integers(len(self.kinds))], rng, size, axes)
+        t = np.arange(self.steps + 1) / self.ctrl_hz - self.begin_s
+        path = shape(speed * clock(t.clip(0.0), self.episode_s - REST_S - self.begin_s, self.ramp_s)[0])
+        middle = 0.5 * (path.max(0) + path.min(0))
+        free = self.spread - np.linalg.norm(path - middle, axis=1).max()
+        about, away = rng.uniform(0, 2 * np.pi), free * np.sqrt(rng.uniform())
+        return path - middle + away * np.array([np.cos(about), np.sin(about)]) @ axes
+
+    def forces_of(self, rng: np.random.Generator) -> tuple[float, float]:
+        """Return a force ~ U(force), twice."""
+        force = rng.uniform(*self.force)
+        return force, force
+
+    def rest_of(self, path: np.ndarray) -> np.ndarray:
+        """Return ((steps + 1) 9,), place m, velocity m/s and acceleration m/s^2 of the path's rows."""
+        spline = CubicSpline(np.arange(len(path)) / self.ctrl_hz, path)
+        return np.hstack([path, spline(spline.x, 1), spline(spline.x, 2)]).ravel()
+
+    def rows(self, goals: np.ndarray) -> np.ndarray:
+        """Return (m, steps + 1, 9), the paths of the goals."""
+        return goals[:, -9 * (self.steps + 1) :].reshape(len(goals), -1, 9)
+
+    def now(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 9), place, velocity and acceleration of the paths at t (m,) s, linear between rows."""
+        rows, which = self.rows(goals), np.arange(len(t))
+        k = (t * self.ctrl_hz).clip(0.0, self.steps)
+        low = np.minimum(k.astype(np.int64), self.steps - 1)
+        share = (k - low)[:, None]
+        return (1.0 - share) * rows[which, low] + share * rows[which, low + 1]
+
+    def goal_positions(self, goals: np.ndarray) -> np.ndarray:
+        """Return (m, steps, 3) m, the path on the nominal plane after each step."""
+        return self.rows(goals)[:, 1:, X]
+
+    def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 3) m, the point of the path at t (m,) s."""
+        return self.now(t, goals)[:, X]
+
+    def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 4), normal and force N of hybrid control."""
+        return goals[:, NORMAL.start : 7]
+
+    def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return the target (m, 6) of an impedance, m and m/s: that of the middle of the period that begins at t."""
+        middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
+        now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
+        return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
+
+    def pull(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 3) N, what accelerates the tip along the path, and overcomes the expected friction."""
+        now = self.now(t + 0.5 / self.ctrl_hz, goals)
+        speed = np.linalg.norm(now[:, V], axis=1, keepdims=True)
+        return now[:, A] @ self.inertia + self.friction * goals[:, 6:7] * now[:, V] / np.maximum(speed, SLOW_V)
+
+    def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (3 n + 18,) to normalise `observe` by: the task's own scales."""
+        mean, std = super().observation_scale(robot)
+        return np.append(mean, np.zeros(6)), np.concatenate([std, np.ones(3), np.full(3, 0.5 * self.speed[1])])
+
+    def observe(self, state: State, goals: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the observations (m, 3 n + 18) float32; see `observation_terms`."""
+        n, now, normal = state.q.shape[1], self.now(state.t, goals), goals[:, NORMAL]
+        first = super().observe(state, goals, torque)
+        offset = first[:, 2 * n : 2 * n + 3]
+        away = offset - (offset * normal).sum(1, keepdims=True) * normal
+        return np.concatenate([first, np.tanh(away / GOOD_M), now[:, V]], axis=1, dtype=np.float32)
+
+    def observation_terms(self, robot: Robot) -> list[ObservationTerm]:
+        """Return the terms of an observation, in the order of `observe`."""
+        return [
+            *super().observation_terms(robot),
+            ObservationTerm(f"tanh(path error / {GOOD_M:g} m)", "1", "path_error", divided_by=GOOD_M, tanh=True),
+            ObservationTerm("velocity of the path", "m/s", "velocity"),
+        ]
+
+    def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 2) N, the force against the nominal normal, and the one asked for."""
+        return self.pressed(state, goals, goals[:, 6])
+
+    def judge(
+        self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distance from the path along the nominal plane (m,) m, and the reward terms (m, 6).
+
+        force -tanh(error / 5 N); path -tanh(distance / 1 cm); precision: product of 1 - tanh(error / 5 N) / 2 -
+        tanh(error / 2 N) / 2 and the same of the distance with 1 cm and 3 mm; excess: -tanh of the force beyond the
+        one asked for / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        """
+        beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
+        offset = self.tip(state.q)[0] - self.at(state.t, goals)
+        away = np.linalg.norm(offset - (offset * normal).sum(1, keepdims=True) * normal, axis=1)
+        error, precise = np.abs(beyond), near(np.abs(beyond), FAR_N, GOOD_N) * near(away, FAR_M, GOOD_M)
+        terms = [-np.tanh(error / FAR_N), -np.tanh(away / FAR_M), precise, -np.tanh(beyond.clip(0.0) / HARD_N)]
+        return away, np.stack([*terms, -rough(ddq), -state.limited], axis=1)
+
+    def measures(self, episodes: Episodes) -> dict[str, float]:
+        """Return one row of evaluations.csv, see `wipe_measures`."""
+        return wipe_measures(episodes, round(self.begin_s * self.ctrl_hz), self.ctrl_hz)
+
+    def score(self, row: Mapping[str, float]) -> float:
+        """Return the wiped share in percent, minus 1 for every percent of stopped episodes."""
+        return 100 * (row["wiped"] - row["stopped"])
