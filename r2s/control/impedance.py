@@ -111,7 +111,7 @@ def joint_impedance(
     if action == "stiffness" and not moves:
         raise UserError(f"action: the target of {type(task).__name__} is home at all times; allowed: target, both")
     if stiffness is None:
-        K = np.minimum(CLIP * limit / displacement, _fastest(task) ** 2 / np.diag(_at_home(p, robot)[1]))
+        K = np.minimum(CLIP * limit / displacement, fastest_spring(task) ** 2 / np.diag(_at_home(p, robot)[1]))
     else:
         K = per_joint("stiffness", stiffness, robot.n, f"the {robot.n} joints of {robot.name}")
         if not (np.isfinite(K).all() and (K > 0).all()):
@@ -195,7 +195,7 @@ def cartesian_impedance(
     moment_clip = _clip("moment_clip", "Nm", moment_clip, limit, jacobian[3:])
     if stiffness is None:
         slow = np.linalg.eigvalsh(jacobian[:3] @ mobility @ jacobian[:3].T)[-1]
-        stiffness = min(force_clip / CLIP_M, _fastest(task) ** 2 / slow)
+        stiffness = min(force_clip / CLIP_M, fastest_spring(task) ** 2 / slow)
     check_number("stiffness", stiffness, "(0, inf)")
     K = np.array([stiffness] * 3 + [rotational_stiffness])
     p[law.K_DEFAULT : law.K_HIGH + 4] = np.concatenate([K, softest * K, K])
@@ -272,7 +272,7 @@ def _clip(name: str, unit: str, value: float | None, limit: np.ndarray, jacobian
     return float(value)
 
 
-def _fastest(task: ControlledTask) -> float:
+def fastest_spring(task: ControlledTask) -> float:
     """Return the highest frequency w of a spring, rad/s: critically damped, its loop has the rate 2 w."""
     return 0.5 * BANDWIDTH_LATENCY / (1 / (2 * np.pi * task.cutoff_hz) + LATENCY)
 

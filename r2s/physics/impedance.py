@@ -48,7 +48,9 @@ SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
 FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
-SLOPE_RATE, SLIDING = 10.0, 0.02  # 1/s, of the estimated slope; m/s, below which a sliding tip tells less of it
+# 1/s, of the estimated slope: it settles while a path gains its speed, `ramp_s` of 0.4 s. m/s, below which a sliding
+# tip shows less of it: five times the noise of a tip's speed, 3e-3 rad/s (Panda) at levers of 0.5 m in seven joints
+SLOPE_RATE, SLIDING = 10.0, 0.02
 SMALLEST = 0.01  # share of a rise of the stiffness below which it stays
 MOBILITY = 1e-3  # 1/kg and 1/(kg m^2): directions with less, near a singularity, count as blocked
 

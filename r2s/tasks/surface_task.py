@@ -6,7 +6,7 @@ of q, dq and the commanded torque.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -78,7 +78,6 @@ class SurfaceTask(BaseTask):
     touches = True
     approaches: ClassVar[int] = 1  # read by `control=hybrid`: its law's APPROACH
     target_size: ClassVar[int] = 6
-    own_settings: ClassVar[dict[str, Any]] = {}  # of the task's own controller
 
     def __post_init__(self):
         self._as_reach()  # raises for a wrong rate
@@ -126,6 +125,11 @@ class SurfaceTask(BaseTask):
         own = cartesian_impedance(robot, task, dynamics, hybrid=True, displacement=RESIDUAL_M, **self.own_settings)
         task._check_force(own)
         return replace(task, own=own, parameters=own.parameters)
+
+    @property
+    def own_settings(self) -> dict[str, float]:
+        """Settings of the task's own controller that differ from the defaults of `cartesian_impedance`."""
+        return {}
 
     def controlled_by(self, controller: Controller) -> Self:
         """Return the task with this controller; raise UserError if it cannot exert the forces."""

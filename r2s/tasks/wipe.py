@@ -2,14 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from r2s.control.impedance import fastest_spring
 from r2s.errors import UserError, check_number, choices, nearest
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.impedance import SLIDES
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 from r2s.tasks.measures import MeasureTable
@@ -22,6 +24,7 @@ A = slice(6, 9)  # columns of a path, after those of place and velocity
 SLOW_V = 0.01  # m/s, at which the expected friction of the surface reaches its level
 FAR_M = 0.01  # m, tanh scale of the path error
 REST_S = 0.3  # s, between the whole force and the path, and at the path's end
+STEADY = 0.25  # of the rate of an integral at which the path oscillates without end: a gain margin of 12 dB
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,6 @@ class WipeTask(SurfaceTask):
     inertia: np.ndarray = field(default=None, repr=False)  # type: ignore[assignment]
     measure_table: ClassVar[MeasureTable] = WIPE
     approaches: ClassVar[int] = SLIDES
-    own_settings: ClassVar[dict[str, Any]] = {"stiffness": 900.0, "integral_rate": 8.0}
     reward_terms = "force", "path", "precision", "excess", "smoothness", "filter_penalty"
     observation_summary = (
         "q dq tip tanh(height/5 mm) tip_velocity tanh(rate/0.01) force/20 tanh(force_error/10) ahead/5mm effort "
@@ -76,11 +78,24 @@ class WipeTask(SurfaceTask):
 
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
         """Return the task with the model of one arm; see `SurfaceTask.with_model`."""
-        task, tip = super().with_model(robot, dynamics), Tip(robot)
+        tip = Tip(robot)
         q = tip.posture(self.plane(robot)[0])
         q = robot.q_home if q is None else q  # `goals` raises
-        jacobian, mass = tip(q)[1], task.model.mass(q[None])[0]  # type: ignore[union-attr]
-        return replace(task, inertia=np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T)))
+        jacobian, mass = tip(q)[1], InverseDynamics(robot, dynamics).mass(q[None])[0]
+        inertia = np.linalg.inv(jacobian @ np.linalg.solve(mass, jacobian.T))
+        return super(WipeTask, replace(self, inertia=inertia)).with_model(robot, dynamics)
+
+    @property
+    def own_settings(self) -> dict[str, float]:
+        """Stiffness N/m and rate of the integrals 1/s, from the tip's inertia at the plane.
+
+        A path wants the stiffest spring that the latency allows, K = m w^2 of the lightest direction m. Under the
+        critical damping of the law, M s^3 + 2 (K M)^(1/2) s^2 + K s + K r = 0 of the heaviest direction M is stable
+        for r < 2 (K / M)^(1/2) (Routh and Hurwitz), of which r is STEADY.
+        """
+        masses = np.linalg.eigvalsh(self.inertia)
+        K = float(masses[0] * fastest_spring(self) ** 2)
+        return {"stiffness": K, "integral_rate": float(STEADY * 2.0 * np.sqrt(K / masses[-1]))}
 
     def path(self, rng: np.random.Generator, axes: np.ndarray) -> np.ndarray:
         """Return (steps + 1, 3) m, a curve of KINDS at a speed ~ U(speed), anywhere within `spread`."""
