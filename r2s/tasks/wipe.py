@@ -31,8 +31,8 @@ STEADY = 0.25  # of the rate of an integral at which the path oscillates without
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal is the row of `SurfaceTask` with one force twice, then place, velocity and acceleration (9,) of the path
-    before the first control step and after each.
+    A goal is the row of `SurfaceTask` with the force at the path's begin and at its end, which `goals` makes equal,
+    then place, velocity and acceleration (9,) of the path before the first control step and after each.
 
     Attributes:
         speed: (low, high) m/s, drawn peak speed. size: (low, high) m, of paths about their middle. kinds: subset of
@@ -139,8 +139,10 @@ class WipeTask(SurfaceTask):
         return self.now(t, goals)[:, X]
 
     def contact(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 4), normal and force N of hybrid control."""
-        return goals[:, NORMAL.start : 7]
+        """Return (m, 4), normal and force N of hybrid control; it changes along the path if both ends' differ."""
+        share = ((t - self.begin_s) / (self.episode_s - REST_S - self.begin_s)).clip(0.0, 1.0)
+        force = goals[:, 6] + share * (goals[:, 7] - goals[:, 6])
+        return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return the target (m, 6) of an impedance, m and m/s: that of the middle of the period that begins at t."""
@@ -150,9 +152,9 @@ class WipeTask(SurfaceTask):
 
     def pull(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m, 3) N, what accelerates the tip along the path, and overcomes the expected friction."""
-        now = self.now(t + 0.5 / self.ctrl_hz, goals)
+        now, force = self.now(t + 0.5 / self.ctrl_hz, goals), self.contact(t, goals)[:, 3:]
         speed = np.linalg.norm(now[:, V], axis=1, keepdims=True)
-        return now[:, A] @ self.inertia + self.friction * goals[:, 6:7] * now[:, V] / np.maximum(speed, SLOW_V)
+        return now[:, A] @ self.inertia + self.friction * force * now[:, V] / np.maximum(speed, SLOW_V)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (3 n + 18,) to normalise `observe` by: the task's own scales."""
@@ -177,7 +179,7 @@ class WipeTask(SurfaceTask):
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m, 2) N, the force against the nominal normal, and the one asked for."""
-        return self.pressed(state, goals, goals[:, 6])
+        return self.pressed(state, goals, self.contact(state.t, goals)[:, 3])
 
     def judge(
         self, state: State, ddq: np.ndarray, goals: np.ndarray, scale: np.ndarray

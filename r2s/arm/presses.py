@@ -1,0 +1,124 @@
+"""Record presses and slides on a surface with any arm: what an identification of the surface needs.
+
+The arm follows paths of `task=wipe` by hybrid control with its identified model, behind the driver, while the force
+rises along one path and falls along the next. Joints in motion show the force (docs/how_to/surfaces.md).
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from r2s.arm.command_loop import CommandLoop
+from r2s.arm.interface import Arm, ArmState, ArmStopped, speed_share
+from r2s.arm.policy_runner import episode_driver
+from r2s.arm.realtime import Timing
+from r2s.excitation.motion_checks import Space
+from r2s.excitation.paths import approach
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.impedance import FORCE_MAX
+from r2s.physics.robot import SIM_DT, Robot
+from r2s.recordings.recording import Recording
+from r2s.tasks.wipe import WipeTask
+
+LOADS = 0.25, 0.9  # of the largest force of the controller: the least and the most of a path
+PAUSE_S = 2.0  # s, of the clock between two paths: longer than between slides of one press (identification/contact)
+
+
+@dataclass(frozen=True)
+class PressPlan(WipeTask):
+    """Paths under a force that changes from one end to the other; the next path has it the other way round."""
+
+    speed: tuple[float, float] = (0.05, 0.1)
+    force: tuple[float, float] = (1.0, 2.0)  # see `press_plan`
+
+    def goals(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Return goals as of `WipeTask`; every other one begins with the larger force."""
+        goals = super().goals(robot, rng, count)
+        goals[:, 6:8] = self.force
+        goals[1::2, 6:8] = self.force[::-1]
+        return goals
+
+
+def press_plan(
+    robot: Robot,
+    dynamics: Dynamics,
+    point: Sequence[float] | None = None,
+    normal: Sequence[float] | None = None,
+) -> PressPlan:
+    """Return the plan of an arm with a tool; point (3,) m and normal (3,) of the plane, roughly: 5 mm, 5 degrees.
+
+    Raises:
+        UserError: no tool, or a wrong plane.
+    """
+    plan = PressPlan(point=point, normal=normal).with_model(robot, dynamics)  # type: ignore[arg-type]
+    low, high = (share * float(plan.own.parameters[FORCE_MAX]) for share in LOADS)  # type: ignore[union-attr]
+    return replace(plan, force=(low, high))
+
+
+def record_presses(
+    arm: Arm,
+    plan: PressPlan,
+    dynamics: Dynamics,
+    count: int,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    timing: Timing | None = None,
+) -> Recording:
+    """Follow `count` drawn paths on the surface; return the commands, one trajectory per path.
+
+    Rows are as in `r2s.arm.recorder.record`; the clock pauses for PAUSE_S between paths.
+
+    Args:
+        arm: moved above the first point of each path, and always stopped at the end. dynamics: its model.
+        seed: of the paths. progress: called after every path with (paths done, total).
+        timing: receives the durations of the cycles.
+
+    Raises:
+        ArmStopped: the arm or the driver ended a path; the exception's `recording` holds the paths before, if any.
+        UserError: the tip does not reach the surface, or no safe path leads there.
+    """
+    robot, control = arm.robot, plan.control(arm.robot)
+    goals = plan.goals(robot, np.random.default_rng(seed), count)
+    starts = plan.begin(np.zeros((count, robot.n)), goals)
+    space = Space(robot)
+    for k, start in enumerate(starts, 1):
+        approach(robot, robot.q_home, start, what=f"the start of path {k}", space=space)
+    log: deque[tuple[ArmState, np.ndarray]] = deque()
+    share = speed_share(arm)
+    loop = CommandLoop(arm, episode_driver(robot, plan, 0.0, dynamics.level, dynamics.armature, share), log)
+    idle, timing, ends = np.zeros((1, control.action_dim)), timing or Timing(), [0]
+    try:
+        for k in range(count):
+            loop.place(starts[k])
+            timing.begin()
+            for step in range(plan.steps):
+                command = control.command(idle, plan, np.array([step / plan.ctrl_hz]), goals[k : k + 1])[0]
+                hold = control.holding_torque(loop.state.q)
+                for cycle in range(plan.substeps):
+                    loop(command if cycle == 0 else None, hold)
+                    timing.cycle(loop.clock, loop.state)
+            loop.settle()
+            loop.end()
+            ends.append(len(log))
+            if progress is not None:
+                progress(k + 1, count)
+        timing.check(arm)
+    except ArmStopped as stop:
+        if len(ends) > 1:
+            stop.recording = _recording(log, ends, robot.name)
+        raise
+    finally:
+        loop.end()
+    return _recording(log, ends, robot.name)
+
+
+def _recording(log: deque[tuple[ArmState, np.ndarray]], ends: list[int], name: str) -> Recording:
+    """Return the rows of whole paths; path k has the rows ends[k] to ends[k + 1]."""
+    rows = list(log)[: ends[-1]]
+    path = np.repeat(np.arange(len(ends) - 1), np.diff(ends))
+    t = np.arange(len(rows)) * SIM_DT + path * PAUSE_S
+    q, dq, tau = (np.array(x) for x in zip(*((s.q, s.dq, sent) for s, sent in rows), strict=True))
+    return Recording(t=t, q=q, dq=dq, tau=tau, torque="commanded", trajectory=path, name=name)
