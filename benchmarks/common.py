@@ -24,6 +24,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments
     "known_truth": (r"\d+",),
     "grid": (r"\d+(,\d+)*", NUMBER),
     "least_squares": (NUMBER,),
+    "press": (rf"minutes={NUMBER}", r"(rigid|elastic)_\d+"),
     "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
     "transfer": ("page", "twins", "noise", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),

@@ -1,10 +1,10 @@
-"""task=press or wipe on the hidden twins: the reference on the nominal and on the identified model, and a policy.
+"""task=press and wipe on the hidden twins: the reference on the nominal and on the identified model, and policies.
 
-    python benchmarks/press.py [task=wipe] [minutes=8] [rigid_0 elastic_0 ...]
+    python benchmarks/press.py [minutes=8] [rigid_0 elastic_0 ...]
 
-Identifies each twin, evaluates `algo=hybrid_force` with both models, trains a policy on the identified one if minutes
-are given, and runs all on the twin with its surface, EPISODES goals each. Writes results/TASK.md. Finished
-runs are kept in runs/TASK and not repeated; both tasks share the identifications.
+Identifies each twin, evaluates `algo=hybrid_force` with both models, trains policies on the identified one if minutes
+are given, and runs all on the twin with its surface, EPISODES goals each. Writes results/press.md. Finished runs are
+kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and minutes= twice more.
 """
 
 import json
@@ -18,10 +18,14 @@ from r2s.tasks.press_measures import PRESS
 from r2s.tasks.wipe_measures import WIPE
 
 EPISODES, SIMULATED = 12, 100
+RUNS = ROOT / "runs" / "press"
 TABLES = {"press": PRESS, "wipe": WIPE}
-TITLES = {"press": "Pressing on a surface", "wipe": "Wiping a surface"}
-FORCES = {"press": "forces of 5 to 20 N with one step", "wipe": "forces of 5 to 20 N, paths at 0.05 to 0.2 m/s"}
+FORCES = {
+    "press": "Pressing: forces of 5 to 20 N with one step",
+    "wipe": "Wiping: paths at 0.05 to 0.2 m/s under 5 to 20 N",
+}
 NOMINAL = "friction=gaz2019", "inertia=nominal"
+Twin = tuple[str, str]  # variant and seed
 
 
 def rows_of(task: str, folder: Path, row: str) -> dict[str, str]:
@@ -30,50 +34,57 @@ def rows_of(task: str, folder: Path, row: str) -> dict[str, str]:
     return {table[key].column.replace("\n", " "): table[key].cell(values[key]) for key in table.rows}
 
 
-def main() -> None:
-    """Run what is missing and write the page."""
-    words = sys.argv[1:]
-    task = "wipe" if "task=wipe" in words else "press"
-    runs = ROOT / "runs" / task
-    minutes = next((w.removeprefix("minutes=") for w in words if w.startswith("minutes=")), None)
-    names = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
-    identified = ROOT / "runs" / "press"
-    twins = [(*name.split("_"), identified / "identify" / name) for name in names]
-    identify_twins([(v, int(s), folder) for v, s, folder in twins], identified)
-    press = f"task={task}", f"root={runs}", f"evaluation.episodes={SIMULATED}"
-    jobs = [[*press, *NOMINAL, "algo=hybrid_force", "name=nominal"]]
-    models = {"reference, nominal": "nominal"}
-    for v, s, folder in twins:
-        calibrated = [*press, f"calibration={folder}"]
-        jobs.append([*calibrated, "algo=hybrid_force", f"name=identified_{v}_{s}"])
-        if minutes:
-            jobs.append([*calibrated, "algo=tqc", f"budget.minutes={minutes}", f"name=policy_{v}_{s}"])
+def models_of(task: str, twins: list[Twin], minutes: str | None) -> dict[str, dict[Twin, str]]:
+    """Train or evaluate what is missing in simulation; return {label: {twin: name of its run}}."""
+    common = f"task={task}", f"root={RUNS}", f"evaluation.episodes={SIMULATED}"
+    jobs = [[*common, *NOMINAL, "algo=hybrid_force", f"name={task}_nominal"]]
+    names = {"reference, nominal": dict.fromkeys(twins, f"{task}_nominal")}
+    algos = {"reference": ["algo=hybrid_force"]}
+    if minutes:
+        algos["policy"] = ["algo=tqc", f"budget.minutes={minutes}"]
+    for what, words in algos.items():
+        names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in twins}
+        for (v, s), name in names[f"{what}, identified"].items():
+            jobs.append([*common, f"calibration={RUNS / 'identify' / f'{v}_{s}'}", *words, f"name={name}"])
     run_parallel(jobs)
-    models |= {"reference, identified": "identified_{}_{}"} | (
-        {"policy, identified": "policy_{}_{}"} if minutes else {}
-    )
-    jobs = [
+    return names
+
+
+def section(task: str, names: dict[str, dict[Twin, str]]) -> list[str]:
+    """Run the models on their twins; return the part of a task for the page."""
+    runs = [(label, *twin, name) for label, each in names.items() for twin, name in each.items()]
+    on_twin = {(label, v, s): f"{name}_on_{v}_{s}" for label, v, s, name in runs}
+    arm = "simulator=none", "arm=twin", "arm.surface=true", f"evaluation.episodes={EPISODES}", f"root={RUNS}"
+    run_parallel(
         [
-            *("stage=transfer", f"root={runs}", f"policy={runs / 'train' / folder.format(v, s)}", "simulator=none"),
-            *("arm=twin", "arm.surface=true", f"arm.variant={v}", f"arm.seed={s}", f"evaluation.episodes={EPISODES}"),
-            f"name={v}_{s}_{folder.split('_')[0]}",
+            *("stage=transfer", *arm, f"policy={RUNS / 'train' / name}"),
+            *(f"arm.variant={v}", f"arm.seed={s}", f"name={on_twin[label, v, s]}"),
         ]
-        for v, s, _ in twins
-        for folder in models.values()
-    ]
-    run_parallel(jobs)
-    table, simulated = {}, {}
-    for label, folder in models.items():
-        for v, s, _ in twins:
-            table[f"{label}: {v} {s}"] = rows_of(task, runs / "transfer" / f"{v}_{s}_{folder.split('_')[0]}", "twin")
-            simulated[f"{label} ({v} {s})"] = rows_of(task, runs / "train" / folder.format(v, s), "best")
-    parts = [
-        f"{EPISODES} goals on each twin, {FORCES[task]}. No force is fed back.",
-        markdown_rows(table, "on the twin"),
+        for label, v, s, name in runs
+    )
+    transferred = {
+        f"{label}: {v} {s}": rows_of(task, RUNS / "transfer" / name, "twin")
+        for (label, v, s), name in on_twin.items()
+    }
+    simulated = {f"{label}: {v} {s}": rows_of(task, RUNS / "train" / name, "best") for label, v, s, name in runs}
+    return [
+        f"## {FORCES[task]}",
+        f"{EPISODES} goals on each twin. No force is fed back.",
+        markdown_rows(transferred, "on the twin"),
         f"In MuJoCo, {SIMULATED} goals with `dr=contact`: each with a surface of its own, friction within 10 %.",
         markdown_rows(simulated, "in simulation"),
     ]
-    write_page(task, TITLES[task], "python benchmarks/press.py " + " ".join(words), parts)
+
+
+def main() -> None:
+    """Run what is missing and write the page."""
+    words = sys.argv[1:]
+    minutes = next((w.removeprefix("minutes=") for w in words if w.startswith("minutes=")), None)
+    named = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
+    twins = [(v, s) for v, _, s in (name.partition("_") for name in named)]
+    identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
+    parts = [part for task in TABLES for part in section(task, models_of(task, twins, minutes))]
+    write_page("press", "Pressing and wiping", " ".join(["python benchmarks/press.py", *words]), parts)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Faults of the safety campaign while an arm presses: a signal, an action that is not finite, an adapter that raises."""
+"""Faults of the safety campaign while an arm presses: a signal, an action that is not finite, an adapter that fails."""
 
 import subprocess
 import sys

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from r2s.errors import UserError, check_number
+from r2s.identification.contact.contact_file import load_contact
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.parameters import ParameterSpace
 from r2s.physics.dynamics import Dynamics
@@ -19,6 +20,7 @@ from r2s.physics.tip import nominal_plane, tilted
 
 Draw = Callable[[np.random.Generator, int], Dynamics]  # (generator, m) -> dynamics of m arms, or of one for all
 
+DRAWN = "point", "normal", "stiffness", "exponent", "damping", "friction", "bristle"  # of a `Surface`
 TRIES = 64  # rejections of a tensor before the center replaces it
 
 
@@ -148,6 +150,7 @@ class ContactRandomization:
         point: (3,) m, normal: (3,), of the nominal plane; None: of a table below the tip at home.
         stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
         place: m. tilt: degrees.
+        surface: run folder of an identified surface, whose posterior is drawn instead; None: the ranges.
 
     Raises:
         UserError: a range that is none, or outside what a surface may have; no tool.
@@ -167,6 +170,15 @@ class ContactRandomization:
     point: Sequence[float] | None = None
     normal: Sequence[float] | None = None
     payload: Sequence[float] | None = None
+    surface: str | None = None
+
+    @cached_property
+    def _identified(self) -> Surface | None:
+        """All draws of the posterior."""
+        if not self.surface:
+            return None
+        draws = load_contact(self.surface, "dr.surface").draws
+        return Surface(**{k: np.array([getattr(s, k) for s in draws]) for k in DRAWN})
 
     @cached_property
     def _arms(self) -> UniformRandomization:
@@ -177,7 +189,7 @@ class ContactRandomization:
         return nominal_plane(self.robot, self.point, self.normal)
 
     def __post_init__(self):
-        _ = self._arms, self._plane  # raise for wrong settings
+        _ = self._arms, self._plane, self._identified  # raise for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
             pair = getattr(self, name)
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
@@ -192,6 +204,10 @@ class ContactRandomization:
 
     def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
         """Return the dynamics of m arms."""
+        if (known := self._identified) is not None:
+            row = rng.integers(len(known.stiffness), size=m)  # type: ignore[arg-type]
+            drawn = Surface(**{k: getattr(known, k)[row] for k in DRAWN})
+            return replace(self._arms(rng, m), surface=drawn)
         (point, n), (least, most) = self._plane, np.log(self.stiffness)
         about, tilt = rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, self.tilt, (m, 1)))
         surface = Surface(

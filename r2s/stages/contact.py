@@ -1,11 +1,11 @@
-"""stage=identify data.contact=FILE: presses on a surface -> contact.yaml, its table and figure."""
+"""stage=identify data.contact=FILE or data.presses=N: presses on a surface -> contact.yaml, its table and figure."""
 
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError
+from r2s.errors import Stopped, UserError
 from r2s.files import located
 from r2s.stages.build import console
 from r2s.stages.data import read_file
@@ -45,6 +45,61 @@ def contact_data(cfg, robot, file):
     for recording in recordings:
         check_recording(robot, recording)
     return ContactData(recordings[0], recordings[1] if len(recordings) > 1 else None, files)
+
+
+def press_parts(cfg, robot, arm):
+    """Return the `PressPlan` of data.presses, checked before there is a run folder.
+
+    Raises:
+        UserError: no tool or surface, or a wrong setting.
+    """
+    from r2s.arm.presses import press_plan
+    from r2s.stages.build import check_source, is_simulated
+    from r2s.stages.data import check_data
+
+    check_data(cfg)
+    if robot.tool is None:
+        raise UserError("robot.tool: data.presses needs the tip that touches: robot.tool=TOOL.json")
+    if is_simulated(cfg) and not cfg.arm.get("surface"):
+        raise UserError("arm.surface: data.presses touches a surface, and this arm has none; true is allowed")
+    check_source(cfg, robot)
+    plane = {"point": cfg.data.press_point, "normal": cfg.data.press_normal}
+    plane = {k: None if v is None else tuple(v) for k, v in plane.items()}
+    return press_plan(robot, arm.space.dynamics(arm.x), **plane)
+
+
+def pressed_surface(cfg, run, arm, plan):
+    """Return the `ContactData` of presses on the arm of the config; a resumed run reads the file that it has.
+
+    Raises:
+        Stopped: the arm was stopped; the paths so far are contact_until_stop.npz.
+    """
+    from r2s.arm.interface import ArmStopped
+    from r2s.arm.presses import record_presses
+    from r2s.arm.realtime import Timing
+    from r2s.progress import Progress
+    from r2s.recordings.readers import read
+    from r2s.stages.build import opened_arm
+
+    path = run.folder / "contact.npz"
+    if not path.is_file():
+        progress, timing = Progress("press and slide on the surface", in_cycle=True), Timing()
+        dynamics = arm.space.dynamics(arm.x)
+        how = {"seed": cfg.data.excitation_seed, "timing": timing}
+        try:
+            with opened_arm(cfg, plan.model.robot, 3, plan) as connected:
+                show = lambda k, n: progress(k / n, f"{k} paths")  # noqa: E731
+                out = record_presses(connected, plan, dynamics, cfg.data.presses, **how, progress=show)
+        except ArmStopped as stop:
+            if stop.recording is not None:
+                stop.recording.save(run.folder / "contact_until_stop.npz")
+            raise Stopped(f"while the arm pressed: {stop}; resume={run.folder} goes on") from None
+        finally:
+            for row in timing.table():
+                run.log("timing", {"motion": "contact", **row})
+        out.save(path)
+        progress.close(f"{out.duration:.1f} s of presses")
+    return ContactData(read(path, torque="commanded"), None, [path])
 
 
 def calibrated_arm(cfg, robot):

@@ -1,7 +1,7 @@
 """Training motion, validation motion and breakaway ramps of stage=identify, from files or recorded on an arm."""
 
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from r2s.stages.build import opened_source, within_speed_share
 from r2s.stages.parts import called, plain
 
 SLOW_MS = 1.5  # ms between rows, from which the hold of a command is printed
+LEAST_PRESSES = 4
 MAX_OVERLAP = 0.2  # share of a validation motion that may repeat training motion, such as the path to a start
 
 
@@ -24,6 +25,8 @@ class ArmData:
         excitation_seed: seed of the first motion; the second has the next one.
         excitation: file of the first motion; None: it is optimized.
         ramp_poses: postures at which every joint is ramped both ways; 0: no ramps.
+        presses: paths on a surface that are recorded instead; 0: none. press_point: (3,) m, press_normal: (3,), of
+            its plane, roughly; None: a table below the tip at home.
 
     Raises:
         UserError: a number outside its range.
@@ -35,6 +38,9 @@ class ArmData:
     excitation_seed: int
     excitation: str | None
     ramp_poses: int
+    presses: int = field(default=0, kw_only=True)
+    press_point: list[float] | None = field(default=None, kw_only=True)
+    press_normal: list[float] | None = field(default=None, kw_only=True)
 
     def __post_init__(self):
         from r2s.excitation.fourier import LEAST_S, LONGEST_S
@@ -42,6 +48,12 @@ class ArmData:
         check_number("data.seconds", self.seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
         check_number("data.excitation_seed", self.excitation_seed, "[0, inf)", whole=True)
         check_number("data.ramp_poses", self.ramp_poses, "[0, inf)", whole=True)
+        check_number("data.presses", self.presses, "[0, inf)", whole=True)
+        if 0 < self.presses < LEAST_PRESSES:
+            raise UserError(
+                f"data.presses: expected 0, or at least {LEAST_PRESSES}: three places determine a plane and "
+                f"one validates, got {self.presses}"
+            )
         if self.torque not in ("commanded", "measured"):
             raise UserError(f"data.torque: expected commanded or measured, got '{self.torque}'")
 

@@ -7,7 +7,14 @@ from typing import Any
 from r2s.errors import UserError, check_number
 from r2s.files import located
 from r2s.stages.build import check_source, console, make_dynamics, make_robot, open_run
-from r2s.stages.contact import calibrated_arm, contact_data, identify_surface, keep_calibration
+from r2s.stages.contact import (
+    calibrated_arm,
+    contact_data,
+    identify_surface,
+    keep_calibration,
+    press_parts,
+    pressed_surface,
+)
 from r2s.stages.data import check_cutoff, check_data, file_data, ramp_poses, read_user_ramps, record_arm
 from r2s.stages.parts import part
 from r2s.stages.payload import LoadedData, identify_load, loaded_data, torque_of_calibration
@@ -96,6 +103,10 @@ def with_known_arm(cfg):
     """
     from omegaconf import OmegaConf
 
+    if cfg.data.get("presses"):
+        if not cfg.calibration:
+            raise UserError("data.presses: give the arm, identified from free motion, by calibration=RUN_FOLDER")
+        return "presses"
     key = next((k for k in ("contact", "loaded") if cfg.data.get(k)), None)
     if key is None or not OmegaConf.is_missing(cfg.data, "path"):
         return None
@@ -108,6 +119,15 @@ def with_known_arm(cfg):
 def identify_with_known_arm(cfg, overrides, key):
     """Presses -> contact.yaml, or a loaded recording -> payload.yaml, on top of the arm of `calibration=`."""
     robot = make_robot(cfg)
+    if key == "presses":
+        arm = calibrated_arm(cfg, robot)
+        plan = press_parts(cfg, robot, arm)
+        with open_run(cfg, overrides) as run:
+            entry = identify_surface(cfg, run, arm, pressed_surface(cfg, run, arm, plan))
+            keep_calibration(cfg, run)
+            run.summary({"contact": entry})
+        print(f"written: {run.folder}")
+        return
     file = file_data(cfg, cfg.data[key])
     if key == "contact":
         data = contact_data(cfg, robot, file)

@@ -11,13 +11,14 @@ PARENTS = (
     "policy",
     "adapt.calibration",
     "estimate.surface",
+    "dr.surface",
 )  # config keys that name a run folder
 FILES = ("robot.mjcf", "robot.tool")  # config keys that name a file; those of the package belong to its commit
 # of a run folder, what another job may read
 READ = (
     *("config.yaml", "overrides.yaml", "policy.yaml", "summary.json", "measures.json", "evaluations.csv"),
     *("parameters.yaml", "posterior.npz", "contact.yaml", "contact_posterior.npz", "policy.pt", "timing.csv"),
-    *("train.npz", "validation.npz", "ramps.npz", "episodes_*"),
+    *("train.npz", "validation.npz", "ramps.npz", "contact.npz", "episodes_*"),
 )
 
 
@@ -25,8 +26,8 @@ def parents_of(cfg) -> list[str]:
     """Return the run folders (or parameter files) that a config names."""
     from omegaconf import OmegaConf
 
-    copied = cfg.resume and (Path(cfg.resume) / "parameters.yaml").is_file()  # a resumed training reads its own copy
-    keys = [key for key in PARENTS if not (copied and key == "calibration")]
+    copies = {"calibration": "parameters.yaml", "dr.surface": "contact.yaml"}  # that a resumed training reads
+    keys = [k for k in PARENTS if not (cfg.resume and k in copies and (Path(cfg.resume) / copies[k]).is_file())]
     return [str(Path(str(value))) for key in keys if (value := OmegaConf.select(cfg, key))]
 
 

@@ -1,4 +1,7 @@
-"""stage=pipeline: identify, train and transfer on one machine; each step is a command with its own run folder."""
+"""stage=pipeline: identify, train and transfer on one machine; each step is a command with its own run folder.
+
+With a task on a surface, the arm presses on it before the trainings, and the surface is identified on top of the arm.
+"""
 
 import os
 import subprocess
@@ -11,19 +14,27 @@ from typing import Any
 from r2s.compiled import RELAYED
 from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
-from r2s.stages.build import GROUP, console, make_robot, open_run, unread
+from r2s.stages.build import GROUP, console, is_simulated, make_robot, open_run, unread
+from r2s.stages.parts import target
 from r2s.stages.run_config import CONF, PACKAGE, PROGRAM, replayed
 
-STEPS = (
-    "1/3 record the arm and identify it",
-    "2/3 train on both models, in parallel",
-    "3/3 run both policies on the arm",
-)
+STEPS = {  # by the first label of their commands
+    "identify": "record the arm and identify it",
+    "surface": "press on the surface and identify it",
+    "identified": "train on both models, in parallel",
+    "transfer": "run the policies on the arm",
+}
 STOPPED = 3  # exit status of a step that a stopped arm ended, see r2s/cli.py
 MODELS = ("identified", "nominal")
 # with adapt=: also computed torque with the identified model, and the identified policy with the adapter
-COMPUTED, ADAPTED = "computed", "adapted"
-ROWS = {COMPUTED: "computed torque", ADAPTED: "identified model + adapter"}
+COMPUTED, ADAPTED, SURFACE = "computed", "adapted", "surface"
+REFERENCE = "reference"  # with a task on a surface: hybrid control with the identified model, without learning
+ROWS = {
+    COMPUTED: "computed torque",
+    ADAPTED: "identified model + adapter",
+    REFERENCE: "hybrid control, identified model",
+}
+PATHS = 6  # presses, 8 s each; the last one validates
 CHANGES = ("arm.payload", "arm.declared_payload", "arm.friction_scale", "arm.extra_delay_s")  # of the arm at work
 WHY = {
     "calibration": "it identifies the arm itself",
@@ -120,16 +131,23 @@ def compose_step(words: Sequence[str], option: str) -> Any:
         raise UserError(f"{option}: {reason}") from None
 
 
+def touches(cfg: Any) -> bool:
+    """Return whether the task presses a tool on a surface."""
+    return bool(getattr(target(cfg.task, "task"), "touches", False))
+
+
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the labels of the trainings and of the transfers."""
-    if cfg.adapt.name == "none":
-        return MODELS, MODELS
-    return (*MODELS, COMPUTED), (*MODELS, COMPUTED, ADAPTED)
+    without = COMPUTED, REFERENCE
+    trained = (*MODELS, *(x for x, has in zip(without, (cfg.adapt.name != "none", touches(cfg)), strict=True) if has))
+    if touches(cfg):
+        trained = tuple(x for x in trained if x != COMPUTED)
+    return trained, trained if cfg.adapt.name == "none" else (*trained, ADAPTED)
 
 
 def check_free(root: Path, name: str, cfg: Any) -> None:
     """Raise UserError if the run folder of a step of the pipeline `name` exists."""
-    steps = [root / "identify" / name]
+    steps = [root / "identify" / name, *([root / "identify" / f"{name}_{SURFACE}"] if touches(cfg) else [])]
     for stage, each in zip(("train", "transfer"), labels(cfg), strict=True):
         steps += [root / stage / f"{name}_{m}" for m in each]
     if taken := [str(folder) for folder in steps if folder.exists()]:
@@ -137,7 +155,7 @@ def check_free(root: Path, name: str, cfg: Any) -> None:
 
 
 def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, list[str]]]:
-    """Return {label: words of a command} for each step: identify, train, transfer.
+    """Return {label: words of a command} for each step: identify, with a surface press on it, train, transfer.
 
     Both trainings have the same settings, time and machine, so that on the arm only the model differs. With an
     adapter, identification runs on the unchanged arm; payload, friction and delay change in the transfer only.
@@ -159,7 +177,7 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
         config.stage, config.calibration = stage, calibration
         if typed is not overrides:  # without an adapter
             config.adapt = {"name": "none"}
-        full = f"{name}_{label}" if stage != "identify" else name
+        full = f"{name}_{label}" if label != "identify" else name
         threads = cfg.threads if stage == "identify" else max(1, both // 2)
         head = [f"root={root}", f"stage={stage}", f"name={full}", f"threads={threads}"]
         return [*overrides_for(typed, config), *head, *words]
@@ -167,28 +185,63 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     minutes = cfg.pipeline.train_minutes
     budget = [] if minutes is None else [f"budget.minutes={minutes}"]
     known = f"calibration={root / 'identify' / name}"
-    bare = without("adapt")
+    bare, touched = without("adapt"), touches(cfg)
+    drawn = [f"dr.surface={root / 'identify' / f'{name}_{SURFACE}'}"] if touched and "surface" in cfg.dr else []
     trained = {
-        "identified": step("train", "identified", *budget, known, calibration=known, typed=bare),
+        "identified": step("train", "identified", *budget, known, *drawn, calibration=known, typed=bare),
         "nominal": step("train", "nominal", *budget, *choice, typed=bare),
     }
-    if adapts:
-        reference = without(
-            "adapt", "algo", "dr", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device"
-        )
-        words = "algo=computed_torque", "dr=none", known
-        trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=reference)
+    unlearned = without("adapt", "algo", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device")
+    if REFERENCE in labels(cfg)[0]:
+        words, typed = ["algo=hybrid_force", known, *drawn], [o for o in unlearned if not o.startswith("control")]
+        trained[REFERENCE] = step("train", REFERENCE, *words, calibration=known, typed=typed)
+    elif adapts:
+        words, typed = ["algo=computed_torque", "dr=none", known], [o for o in unlearned if not o.startswith("dr")]
+        trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=typed)
+    table = surface_words(cfg) if touched else []
     transferred = {}
     for label in labels(cfg)[1]:
         policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
-        transferred[label] = step("transfer", label, policy, typed=overrides if label == ADAPTED else bare)
-    unchanged = without(*CHANGES) if adapts else overrides
-    return [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
+        transferred[label] = step("transfer", label, policy, *table, typed=overrides if label == ADAPTED else bare)
+    unchanged = without(*(CHANGES if adapts else ()), *(["arm.surface"] if touched else []))
+    steps = [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
+    if touched:
+        words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table]
+        pressed = step("identify", SURFACE, *words, calibration=known, typed=without("adapt", "data"))
+        steps.insert(1, {SURFACE: pressed})
+    return steps
+
+
+def surface_words(cfg: Any) -> list[str]:
+    """Return the words that give a simulated arm a surface at the plane of the task, if it has none."""
+    if not is_simulated(cfg) or cfg.arm.get("surface"):
+        return []
+    plane = {k: cfg.task[k] for k in ("point", "normal")}
+    if None in plane.values():
+        return ["arm.surface=true"]
+    return ["arm.surface={" + ",".join(f"{k}:{list(v)}" for k, v in plane.items()) + "}"]
+
+
+def tool_words(cfg: Any) -> list[str]:
+    """Return the words that give the presses the tool and the plane of the task."""
+    tool = [f"robot.tool={cfg.task.tool}"] if cfg.robot.get("tool") is None else []
+    given = {k: cfg.task[k] for k in ("point", "normal") if cfg.task[k] is not None}
+    return tool + [f"data.press_{k}={list(v)}" for k, v in given.items()]
+
+
+def add_friction(cfg: Any, surface: Path, trained: dict[str, list[str]], overrides: Sequence[str]) -> None:
+    """Add the surface's identified friction to the trainings with the identified model, if the task expects one."""
+    from r2s.identification.contact.contact_file import load_contact
+
+    if "friction" not in cfg.task or any(o.startswith("task.friction=") for o in overrides):
+        return
+    for label in trained.keys() - {"nominal"}:
+        trained[label].append(f"task.friction={load_contact(surface).surface.friction:.4g}")
 
 
 def check_steps(cfg: Any, overrides: Sequence[str]) -> None:
     """Raise UserError if a step would refuse an override, before the arm is identified."""
-    first, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
+    first, *_, trained, _ = commands(cfg, cfg.name or "pipeline", overrides)
     identify.make_parts(compose_step(first["identify"], "stage=identify"))
     train.make_parts(compose_step(trained["nominal"], "stage=train"))  # the other training needs the identified model
 
@@ -222,17 +275,22 @@ def pipeline(cfg, overrides):
         name = run.folder.name
         check_free(root, name, cfg)
         os.environ.setdefault(GROUP, name)  # one group of its steps in trackers
-        for what, step in zip(STEPS, commands(cfg, name, overrides), strict=True):
-            print(what, file=sys.stderr)
+        identified, surface = root / "identify" / name, root / "identify" / f"{name}_{SURFACE}"
+        steps = commands(cfg, name, overrides)
+        for k, step in enumerate(steps, 1):
+            what = STEPS.get(next(iter(step)), "") if step is not steps[-1] else STEPS["transfer"]
+            print(f"{k}/{len(steps)} {what}", file=sys.stderr)
+            if touches(cfg) and step is steps[-2]:
+                add_friction(cfg, surface, step, overrides)
             run_step(step)
-        identified = root / "identify" / name
         trained = {m: root / "train" / f"{name}_{m}" for m in MODELS}
         transferred = {ROWS.get(m, f"{m} model"): root / "transfer" / f"{name}_{m}" for m in labels(cfg)[1]}
         rows = {}
         for label, folder in transferred.items():
             for where, row in read_summary(folder, "transfer").items():
                 rows[f"{label}, {where}"] = row
-        run.summary({"identify": read_summary(identified, "identify"), "reach": rows})
+        found = {"contact": read_summary(surface, "identify")["contact"]} if touches(cfg) else {}
+        run.summary({"identify": read_summary(identified, "identify"), **found, "reach": rows})
         measures = pages.pipeline(run, robot, identified, trained, transferred, rows)
         print_measures(console(), measures, rows, "policies trained on the identified and on the nominal model")
     print(f"written: {run.folder} (look: rerun {run.folder / 'recording.rrd'})")

@@ -34,6 +34,7 @@ WHY = {
     "search": "only stage=identify searches; calibration= loads its result",
 }
 CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification that a training copies
+SURFACE = ("contact.yaml", "contact_posterior.npz")  # likewise, of dr.surface=
 
 
 def reads(cfg):
@@ -184,29 +185,33 @@ def split_algo(cfg):
 
 
 def with_own_calibration(cfg):
-    """Return the config of a training; if resumed, `calibration=` is its own copy, as the original may be gone."""
-    if not (cfg.calibration and cfg.resume and (Path(cfg.resume) / CALIBRATION[0]).is_file()):
+    """Return the config of a training; if resumed, its models are its own copies, as the originals may be gone."""
+    if not cfg.resume:
         return cfg
     model = cfg.copy()
-    model.calibration = cfg.resume
+    if cfg.calibration and (Path(cfg.resume) / CALIBRATION[0]).is_file():
+        model.calibration = cfg.resume
+    if cfg.dr.get("surface") and (Path(cfg.resume) / SURFACE[0]).is_file():
+        model.dr.surface = cfg.resume
     return model
 
 
 def keep_calibration(cfg, folder):
-    """Copy the identified parameters into the run folder, so that it transfers without its parent."""
+    """Copy the identified parameters and surface into the run folder, so that it transfers without its parents."""
     import shutil
 
     from r2s.files import atomic_write
 
-    if not cfg.calibration or (folder / CALIBRATION[0]).is_file():
-        return
-    source = Path(cfg.calibration)
-    for name in reversed(CALIBRATION):  # `with_own_calibration` looks for the first, so that is written last
-        path = source / name if source.is_dir() else source.with_name(name)
-        path = source if name == CALIBRATION[0] and not source.is_dir() else path
-        if path.is_file():
-            with atomic_write(folder / name) as part:
-                shutil.copyfile(path, part)
+    for given, names in ((cfg.calibration, CALIBRATION), (cfg.dr.get("surface"), SURFACE)):
+        if not given or (folder / names[0]).is_file():
+            continue
+        source = Path(given)
+        for name in reversed(names):  # `with_own_calibration` looks for the first, so that is written last
+            path = source / name if source.is_dir() else source.with_name(name)
+            path = source if name == names[0] and not source.is_dir() else path
+            if path.is_file():
+                with atomic_write(folder / name) as part:
+                    shutil.copyfile(path, part)
 
 
 def title(cfg):

@@ -61,6 +61,8 @@ def trained_config(cfg, option="policy"):
     for node in (trained, trained.dr):  # dr=identified draws from the same calibration
         if node.get("calibration"):
             node.calibration = str(source)
+    if trained.dr.get("surface"):
+        trained.dr.surface = str(source)
     return source, trained
 
 

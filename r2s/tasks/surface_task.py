@@ -6,7 +6,7 @@ of q, dq and the commanded torque.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -127,7 +127,7 @@ class SurfaceTask(BaseTask):
         return replace(task, own=own, parameters=own.parameters)
 
     @property
-    def own_settings(self) -> dict[str, float]:
+    def own_settings(self) -> dict[str, Any]:
         """Settings of the task's own controller that differ from the defaults of `cartesian_impedance`."""
         return {}
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -48,7 +48,7 @@ class WipeTask(SurfaceTask):
     kinds: tuple[str, ...] = KINDS
     ramp_s: float = 0.4
     friction: float = 0.3
-    inertia: np.ndarray = field(default=None, repr=False)  # type: ignore[assignment]
+    inertia: np.ndarray = field(default=None, repr=False)  # type: ignore[arg-type, assignment]
     measure_table: ClassVar[MeasureTable] = WIPE
     approaches: ClassVar[int] = SLIDES
     reward_terms = "force", "path", "precision", "excess", "smoothness", "filter_penalty"
@@ -86,7 +86,7 @@ class WipeTask(SurfaceTask):
         return super(WipeTask, replace(self, inertia=inertia)).with_model(robot, dynamics)
 
     @property
-    def own_settings(self) -> dict[str, float]:
+    def own_settings(self) -> dict[str, Any]:
         """Stiffness N/m and rate of the integrals 1/s, from the tip's inertia at the plane.
 
         A path wants the stiffest spring that the latency allows, K = m w^2 of the lightest direction m. Under the
