@@ -1,4 +1,4 @@
-"""Faults of the safety campaign while an arm presses: a signal, an action that is not finite, an adapter that fails."""
+"""Faults of the safety campaign while an arm presses: a signal, an action that is not finite, a failing adapter."""
 
 import subprocess
 import sys
