@@ -1,6 +1,7 @@
 """Measure the cost of r2s over its peers as ratios (`make bench`). Writes runs/bench/bench.json.
 
-Every ratio alternates r2s and its peer and takes the median, so that a slower machine slows both down.
+Every ratio alternates r2s and its peer and takes the median, so that a slower machine slows both down. Learners are
+compared like with like: eager with eager, compiled with compiled, each with float32 and with bfloat16 products.
 """
 
 import copy
@@ -10,7 +11,9 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import mujoco
@@ -31,6 +34,23 @@ from r2s.physics.simulator import Simulator
 from r2s.tasks.reach import ReachTask
 
 REPEATS = 15
+HIDDEN = (256, 256)  # units per hidden layer of actor and critics
+LR = 5e-4
+
+
+@dataclass(frozen=True)
+class Mode:
+    """How updates run: compiled or eager; `matmul`: precision of products, see `matmul_precision`."""
+
+    compiled: bool
+    matmul: str
+
+    def __str__(self) -> str:
+        precision = {"highest": "float32", "medium": "bfloat16"}[self.matmul]
+        return f"{'compiled' if self.compiled else 'eager'} {precision}"
+
+
+MODES = [Mode(compiled, matmul) for compiled in (False, True) for matmul in ("highest", "medium")]
 
 
 def duel(ours: Callable[[], object], peer: Callable[[], object], work: float) -> tuple[float, float]:
@@ -89,11 +109,8 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
     return duel(ours, peer, arms * steps)
 
 
-def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
-    """Compare TQC updates with TorchRL's eager TQCLoss, same networks, batch and optimiser, updates/s.
-
-    Updates of r2s are compiled, same as in training; `matmul` is the precision of their matrix products.
-    """
+def torchrl_update(algo: TQC, batch: Mapping[str, torch.Tensor], lr: float) -> Callable[[], object]:
+    """Return TorchRL's update on this batch: TQCLoss with the networks, batch and optimiser of `algo`."""
     from tensordict import TensorDict
     from tensordict.nn import TensorDictModule
     from torch import nn
@@ -101,18 +118,14 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     from torchrl.modules.distributions import TanhNormal
     from torchrl.objectives import SoftUpdate, TQCLoss
 
-    torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
-    d, n, b = len(mean), robot.n, 256
-    algo = TQC((mean, std), torch.ones(n), hidden=(256, 256))
-    with matmul_precision(matmul):
-        algo.compile(b)
+    (b, d), n = batch["observation"].shape, batch["action"].shape[1]
+    widths = [d + n, *(len(x[0, 0]) for x in algo.critics.norm_scale)]
 
     class Critic(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            body = [nn.Linear(d + n, 256), nn.LayerNorm(256), nn.ReLU(), nn.Linear(256, 256), nn.LayerNorm(256)]
-            self.net = nn.Sequential(*body, nn.ReLU(), nn.Linear(256, 25))
+            body = [m for i, o in pairwise(widths) for m in (nn.Linear(i, o), nn.LayerNorm(o), nn.ReLU())]
+            self.net = nn.Sequential(*body, nn.Linear(widths[-1], 25))
 
         def forward(self, observation, action):
             return self.net(torch.cat([observation, action], -1))
@@ -124,30 +137,60 @@ def learner(robot, threads: int, matmul: str) -> tuple[float, float]:
     )
     critic = ValueOperator(Critic(), in_keys=["observation", "action"])
     loss = TQCLoss(actor, critic, num_qvalue_nets=2, target_entropy=-float(n), alpha_init=0.01)
-    loss.make_value_estimator(gamma=0.98)
-    target = SoftUpdate(loss, eps=0.995)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-4, fused=True)
-    seen, after, action, reward = torch.randn(b, d), torch.randn(b, d), torch.rand(b, n) * 2 - 1, torch.randn(b)
+    loss.make_value_estimator(gamma=algo.gamma)
+    target = SoftUpdate(loss, eps=1.0 - algo.tau)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
     flags = torch.zeros(b, 1, dtype=torch.bool)
-    following = {"observation": after, "reward": reward[:, None], "done": flags, "terminated": flags.clone()}
-    theirs = TensorDict({"observation": seen, "action": action, "next": following}, batch_size=[b])
-    batch = {"observation": seen, "next_observation": after, "action": action, "reward": reward}
-    batch["terminated"] = torch.zeros(b)
+    following = {"observation": batch["next_observation"], "reward": batch["reward"][:, None]}
+    following |= {"done": flags, "terminated": flags.clone()}
+    seen = {"observation": batch["observation"], "action": batch["action"], "next": following}
+    transitions = TensorDict(seen, batch_size=[b])
 
-    def ours() -> None:
-        with matmul_precision(matmul):
-            for _ in range(10):
-                algo.update(batch)
+    def update() -> TensorDict:  # as in TorchRL's sota-implementations, which compile the whole function
+        out = loss(transitions)
+        (out["loss_qvalue"] + out["loss_actor"] + out["loss_alpha"]).backward()
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        target.step()
+        return out.detach()
 
-    def peer() -> None:
-        for _ in range(10):
-            out = loss(theirs)
-            (out["loss_qvalue"] + out["loss_actor"] + out["loss_alpha"]).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-            target.step()
+    return update
 
-    return duel(ours, peer, 10)
+
+def random_batch(robot, b: int) -> dict[str, torch.Tensor]:
+    """Return a batch of b random transitions of task=reach."""
+    d, n = len(ReachTask().observation_scale(robot)[0]), robot.n
+    batch = {"observation": torch.randn(b, d), "next_observation": torch.randn(b, d)}
+    return batch | {"action": torch.rand(b, n) * 2 - 1, "reward": torch.randn(b), "terminated": torch.zeros(b)}
+
+
+def make_tqc(robot, mode: Mode, b: int, hidden: Sequence[int] = HIDDEN) -> TQC:
+    """Return a learner in this mode for batches of b."""
+    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
+    algo = TQC((mean, std), torch.ones(robot.n), hidden=hidden, gamma=0.98, tau=0.005, lr=LR)
+    if mode.compiled:
+        with matmul_precision(mode.matmul):
+            if not algo.compile(b):
+                sys.exit("error: the losses do not compile on this machine; install a C++ compiler")
+    return algo
+
+
+def learner(robot, threads: int, mode: Mode, b: int = 256, hidden: Sequence[int] = HIDDEN) -> tuple[float, float]:
+    """Compare TQC updates with TorchRL's, both in the same mode: networks, batch, optimiser; updates/s."""
+    torch.set_num_threads(threads)
+    algo, batch = make_tqc(robot, mode, b, hidden), random_batch(robot, b)
+    theirs = torchrl_update(algo, batch, LR)
+    theirs = torch.compile(theirs) if mode.compiled else theirs
+
+    def repeated(update: Callable[[], object]) -> Callable[[], object]:
+        def run() -> None:
+            with matmul_precision(mode.matmul):
+                for _ in range(10):
+                    update()
+
+        return run
+
+    return duel(repeated(lambda: algo.update(batch)), repeated(theirs), 10)
 
 
 class Sb3:
@@ -172,11 +215,11 @@ class Sb3:
         assert self._process.stdout is not None
         assert self._process.stdout.readline().strip() == "ready"
 
-    def update(self, threads: int, count: int) -> float:
-        """Return the duration of `count` updates, s."""
+    def update(self, threads: int, count: int, matmul: str) -> float:
+        """Return the duration of `count` updates with this precision of products, s."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(f"{threads} {count}\n")
+        self._process.stdin.write(f"{threads} {count} {matmul}\n")
         return float(self._process.stdout.readline())
 
     def close(self) -> None:
@@ -184,28 +227,25 @@ class Sb3:
         self._process.terminate()
 
 
-def against_sb3(robot, threads: int, matmul: str, sb3: Sb3) -> tuple[float, float]:
-    """Compare TQC updates with replay sampling with sb3-contrib's `train`, which samples too, updates/s."""
+def against_sb3(robot, threads: int, mode: Mode, sb3: Sb3) -> tuple[float, float]:
+    """Compare TQC updates with replay sampling with sb3-contrib's `train`, which samples too, updates/s.
+
+    sb3-contrib has no compiled mode: both have the same precision of products, and its update is eager.
+    """
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
     torch.set_num_threads(threads)
-    mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
-    d, n, count = len(mean), robot.n, 50
-    algo = TQC((mean, std), torch.ones(n), hidden=(256, 256), gamma=0.98, tau=0.005)
-    with matmul_precision(matmul):
-        algo.compile(256)
+    algo, count = make_tqc(robot, mode, 256), 50
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
-    rows = {"observation": torch.randn(2000, d), "next_observation": torch.randn(2000, d)}
-    rows |= {"action": torch.rand(2000, n) * 2 - 1, "reward": torch.randn(2000), "terminated": torch.zeros(2000)}
-    replay.extend(TensorDict(rows, batch_size=[2000]))
+    replay.extend(TensorDict(random_batch(robot, 2000), batch_size=[2000]))
 
     def ours() -> None:
-        with matmul_precision(matmul):
+        with matmul_precision(mode.matmul):
             for _ in range(count):
                 algo.update(replay.sample())
 
-    return duel(ours, lambda: sb3.update(threads, count), count)
+    return duel(ours, lambda: sb3.update(threads, count, mode.matmul), count)
 
 
 def twin(robot) -> tuple[float, float]:
@@ -231,10 +271,10 @@ def main() -> None:
         at = f"{threads} thread{'s' * (threads > 1)}"
         rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)
         rows[f"TorchRL environment / bare Batch, arm steps/s, {at}"] = environment(robot, dynamics, threads)
-        for matmul, name in (("highest", "float32"), ("medium", "bfloat16")):
-            way = f"updates/s, {name} products, {at}"
-            rows[f"TQC / TorchRL's TQCLoss, {way}"] = learner(robot, threads, matmul)
-            rows[f"TQC / sb3-contrib's TQC, {way}"] = against_sb3(robot, threads, matmul, sb3)
+        for mode in MODES:
+            rows[f"TQC / TorchRL's TQCLoss, both {mode}, updates/s, {at}"] = learner(robot, threads, mode)
+            peer = "both" if not mode.compiled else "ours"
+            rows[f"TQC / sb3-contrib's TQC, {peer} {mode}, updates/s, {at}"] = against_sb3(robot, threads, mode, sb3)
     sb3.close()
     table = Table(title=f"{MACHINE}, mujoco {mujoco.__version__}, torch {torch.__version__}")
     for column in ("what", "r2s", "peer", "ratio"):

@@ -1,8 +1,8 @@
 """Time updates of sb3-contrib's TQC in its own environment; bench.py starts this script.
 
-Reads "THREADS UPDATES" from standard input, does that many updates and answers with their duration in s. Networks,
-batch, quantiles and optimiser equal those of bench.py's `learner`, except LayerNorm, absent in sb3's networks: it
-would only make sb3 slower.
+Reads "THREADS UPDATES PRECISION" from standard input, does that many updates with this precision of matrix products
+and answers with their duration in s. Networks, batch, quantiles and optimiser equal those of bench.py's `learner`,
+except LayerNorm, absent in sb3's networks: it would only make sb3 slower.
 """
 
 import sys
@@ -38,10 +38,11 @@ def main() -> None:
     algo.learn(2000)  # fills the buffer
     print("ready", flush=True)
     for line in sys.stdin:
-        threads, updates = map(int, line.split())
-        torch.set_num_threads(threads)
+        threads, updates, matmul = line.split()
+        torch.set_num_threads(int(threads))
+        torch.set_float32_matmul_precision(matmul)
         began = time.perf_counter()
-        algo.train(gradient_steps=updates, batch_size=256)
+        algo.train(gradient_steps=int(updates), batch_size=256)
         print(time.perf_counter() - began, flush=True)
 
 
