@@ -4,6 +4,7 @@ tests/test_tqc.py holds what is TQC's own, and the helpers for batches and Torch
 """
 
 import copy
+import math
 import re
 from dataclasses import fields
 from functools import partial
@@ -353,6 +354,30 @@ def test_gaussian_exploration(kind):
 
 
 @pytest.mark.parametrize("kind", ALL)
+def test_exploration_is_correlated_and_falls(kind):
+    """Noise of an arm keeps its variance and has the correlation given; its share scales the deviation."""
+    algo, count = make(kind, explore_correlation=0.9), 4000
+    draws = torch.stack([algo.noise(torch.zeros(6, N)) for _ in range(count)])
+    # the correlation leaves (1 - 0.9) / (1 + 0.9) of the draws independent
+    wide = 5.0 / (count * 6 * N * 0.1 / 1.9) ** 0.5
+    assert abs(float(draws.square().mean()) - 1.0) < 2**0.5 * wide
+    assert abs(float((draws[1:] * draws[:-1]).mean()) - 0.9) < 2**0.5 * wide
+    other = make(kind, explore_correlation=0.9)
+    other.load_state_dict(algo.state_dict())
+    torch.manual_seed(1)
+    following = algo.noise(torch.zeros(6, N))
+    torch.manual_seed(1)
+    assert torch.equal(other.noise(torch.zeros(6, N)), following)
+    seen = torch.randn(4000, D)
+    algo.set_exploration(0.1)
+    if kind in (DDPG, TD3):
+        algo.explore_std = 0.5
+        assert (algo.explore(seen) - algo.policy.action(seen)).std() < 0.06
+    else:
+        assert float(algo.entropy_goal) == pytest.approx(algo.target_entropy + N * math.log(0.1))
+
+
+@pytest.mark.parametrize("kind", ALL)
 def test_action_l2_is_the_mean_square_in_the_actors_loss(kind):
     """action_l2 adds its weight times the mean squared action to the actor's loss and nothing to the critic's."""
     batch, noise = make_batch(), (torch.randn(B, N), torch.randn(B, N))
@@ -432,6 +457,7 @@ SHARED = {
     "tau": (0.0, -0.1, 1.01, float("inf"), "x"),
     "lr": (0.0, -5e-4, 2.0, float("nan"), None, "fast", False),
     "action_l2": (-0.1, float("inf"), None),
+    "explore_correlation": (-0.1, 1.0, None),
 }
 OWN = {
     DDPG: {"explore_std": (-0.1, None, float("nan"))},

@@ -67,7 +67,8 @@ def make_env(panda, family="sigmoid", seed=0):
 def make_algo(env):
     torch.manual_seed(0)
     mean, std = (torch.from_numpy(s) for s in env.task.observation_scale(env.robot))
-    return TQC((mean, std), torch.from_numpy(env.task.torque_limit(env.robot)), hidden=(16, 16))
+    scale = torch.from_numpy(env.task.torque_limit(env.robot))
+    return TQC((mean, std), scale, hidden=(16, 16), explore_correlation=0.9)
 
 
 @pytest.mark.parametrize("family", ["sigmoid", "bristle"])

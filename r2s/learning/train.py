@@ -66,6 +66,7 @@ class Loop:
         learning_starts: environment steps with uniform random actions.
         replay_size: capacity of the replay buffer.
         lr_decay, lr_end: from this share of the budget on, the learning rate falls linearly to the share lr_end.
+        explore_end: the standard deviation of exploration falls geometrically to this share at the end of the budget.
         eval_env_steps: environment steps between two evaluations; the last evaluation is at the end.
         compile: compile the losses first; the budget includes this time.
         matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
@@ -81,6 +82,7 @@ class Loop:
     replay_size: int = 1_000_000
     lr_decay: float = 0.6
     lr_end: float = 0.1
+    explore_end: float = 1.0
     eval_env_steps: int = 80_000
     compile: bool = False
     matmul: str = "highest"
@@ -92,6 +94,7 @@ class Loop:
         check_number("algo.replay_size", self.replay_size, f"[{self.batch_size}, inf)", whole=True)
         check_number("algo.lr_decay", self.lr_decay, "[0, 1]")
         check_number("algo.lr_end", self.lr_end, "[0, 1]")
+        check_number("algo.explore_end", self.explore_end, "(0, 1]")
         check_number("evaluation.env_steps", self.eval_env_steps, "[1, inf)", whole=True)
         if not isinstance(self.compile, bool):
             raise UserError(f"compile: expected true or false, got {self.compile!r}")
@@ -150,6 +153,7 @@ def train(
     while (spent := budget.spent(run.seconds, run.env_steps)) < 1.0:
         env.weights = env.reward.weights(env.task, spent, run.factor)
         algo.set_lr(loop.lr_share(spent))
+        algo.set_exploration(loop.explore_end**spent)
         run.step(spent)
         if run.env_steps < loop.learning_starts:
             continue
