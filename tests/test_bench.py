@@ -1,15 +1,18 @@
-"""The learner's benchmark compares like with like: both sides in one mode, on the same transitions."""
+"""benchmarks/bench.py compares learners like with like, and benchmarks/paper_returns.py has the costs of eq. (2)."""
 
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import bench
+from paper_returns import step_cost
 
 from r2s.learning.train import matmul_precision
+from r2s.tasks import rewards
 
 
 def test_modes_are_all_combinations():
@@ -44,3 +47,13 @@ def test_torchrl_update_learns_the_same():
         peer = [float(theirs()["loss_qvalue"]) for _ in range(60)]
     assert ours < first
     assert peer[-1] < peer[0]
+
+
+def test_step_cost_is_eq_2_and_cheapest_at_the_goal_below_1_54():
+    """The cost of benchmarks/paper_returns.py is that of r2s/tasks/rewards.py; shaking moves its minimum away."""
+    d, s = np.linspace(0.0, 0.9, 91), 3 * np.tanh(0.8)
+    ddq = np.tile([0.8, 0.8, 0.8, 0.0, 0.0, 0.0, 0.0], (len(d), 1))
+    terms = rewards.terms(d, np.ones(len(d)), np.zeros_like(ddq), ddq, np.zeros(len(d)))
+    np.testing.assert_allclose(step_cost(d, s), -terms @ rewards.PAPER)
+    assert step_cost(d, 1.54).argmin() == 0
+    assert step_cost(d, 1.8).argmin() > 0

@@ -41,6 +41,7 @@ REASONS = {
     "r2s.arm.ramp.ramp": "what a user of the protocol may set, all but two named",
     "r2s.arm.twins.make_twin.make_twin": YAML,
     "r2s.arm.twins.twin_base.TwinBase.__init__": YAML,
+    "r2s.learning.learner.Learner.__init__": YAML,
     "r2s.physics.dynamics.nominal_dynamics": YAML,
     "r2s.physics.robot.load_robot": YAML,
     "r2s.recordings.readers.read": "its arguments are the keys of conf/data/recording.yaml; files need few of them",
