@@ -205,9 +205,8 @@ def _brake(i, seen, arm, bounds, model, memory):
     if seen and len(memory.push[i]) > 0 and why in (SILENT, LAW_NOT_FINITE, REQUESTED):
         if memory.damped[i] * SIM_DT > LEAVES_S:
             memory.push[i, PHASE] = OVER
-        needs = stop_torque(
-            memory.push[i], arm, _kinematics(model, arm.q), model.friction, model.limits, memory.target[i]
-        )
+        own = memory.push[i], arm, _kinematics(model, arm.q)
+        needs = stop_torque(*own, model.friction, model.limits, memory.held[i], memory.target[i])
         memory.target[i] = np.minimum(np.maximum(memory.target[i], -bounds.torque), bounds.torque)
         memory.rests[i] &= memory.push[i, PHASE] == OVER
     memory.share[i] = max(needs, memory.share[i] - SIM_DT / BRAKE_S)

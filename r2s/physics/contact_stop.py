@@ -32,36 +32,39 @@ BEGINS, PRESSES, CLEAR, OVER = range(4)  # values of PHASE
 
 
 @njit(cache=True, error_model="numpy")
-def stop_torque(limit, arm, kinematics, friction, limits, target):
+def stop_torque(limit, arm, kinematics, friction, limits, held, target):
     """Write the target torque (n,) Nm of a cycle of a stop; return the share of the allowed speeds that it needs.
 
     Args:
         limit, arm, kinematics, friction: see `push_bound`. limits: see `filter_limits`.
+        held: (n,) Nm of an adapter, which come on top and which a load resists: R counts them as the surface's.
     """
     n = len(target)
     root, row, lever, ddq = np.empty((n, n)), np.empty(n), np.empty(n), np.zeros(n)
     height, speed, _, _ = tip_motion(limit, kinematics, arm.dq, row)
+    lever[:] = row
+    unpack(arm.mass, 1.0, ddq, root)
+    factor(root, root)
+    solve(root, lever)
+    mobility, behind, share, kept = 0.0, 0.0, 0.0, 0.0  # behind: N, friction of the joints that move outwards
+    for j in range(n):
+        mobility += row[j] * lever[j]
+        kept += lever[j] * held[j]
+    felt = limit[RESISTED] - kept / mobility
     if limit[PHASE] == BEGINS:  # a tip above the highest place of the true plane touches nothing
-        limit[FELT] = max(limit[RESISTED], 0.0) if height < 0.0 else 0.0
+        limit[FELT] = max(felt, 0.0) if height < 0.0 else 0.0
         limit[PHASE] = OVER if limit[STOP] == HOLD or height >= 0.0 else PRESSES
     target[:] = 0.0
     if limit[PHASE] == OVER:
         if limit[STOP] == HOLD:
             target[:] = limit[FELT] * row
         return 0.0
-    lever[:] = row
-    unpack(arm.mass, 1.0, ddq, root)
-    factor(root, root)
-    solve(root, lever)
-    mobility, behind, share = 0.0, 0.0, 0.0  # behind: N, friction of the joints that move outwards
-    for j in range(n):
-        mobility += row[j] * lever[j]
     for j in range(n):
         share = max(share, LEAVE / mobility * abs(lever[j]) / limits[j, DQ_ALLOWED])
     for j in range(n):
         asked = -LEAVE / mobility * min(1.0, MOST / share) * lever[j]  # rad/s
         ahead = friction[j] * np.tanh(asked / FRICTION_WIDTH)
-        target[j] = arm.bias[j] + max(limit[RESISTED], 0.0) * row[j] + ahead
+        target[j] = arm.bias[j] + max(felt, 0.0) * row[j] + ahead
         behind -= lever[j] * ahead / mobility
         ddq[j] = GAIN * (asked - arm.dq[j])
     pull = limit[PULL] + SIM_DT * GAIN**2 / mobility * (LEAVE * min(1.0, MOST / share) + speed)
@@ -70,7 +73,7 @@ def stop_torque(limit, arm, kinematics, friction, limits, target):
         target[j] -= limit[PULL] * row[j]
         for k in range(n):
             target[j] += packed_element(arm.mass, j, k) * ddq[k]
-    if limit[PHASE] == PRESSES and speed < -0.2 * LEAVE and limit[RESISTED] <= RELEASED - SLIDES * behind:
+    if limit[PHASE] == PRESSES and speed < -0.2 * LEAVE and felt <= RELEASED - SLIDES * behind:
         limit[PHASE], limit[HEIGHT] = (CLEAR if limit[STOP] == RETREAT else OVER), height
     if limit[PHASE] == CLEAR and height >= limit[HEIGHT] + RETREAT_M:
         limit[PHASE] = OVER
