@@ -102,7 +102,7 @@ def searches(name: str, **change) -> list:
 
 def identify_settings(torque: str = "commanded", **change) -> Settings:
     """Return the settings of stage=identify, except for the family."""
-    own = {k: v for k, v in conf("identify/default").items() if k != "validation_fraction"}
+    own = {k: v for k, v in conf("identify/default").items() if k not in ("validation_fraction", "from")}
     per_torque = ("terms", "prior", "candidate_terms", "prunable_terms")
     return Settings(**own | {k: own[k][torque] for k in per_torque} | change)
 
