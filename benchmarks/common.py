@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import date
 from pathlib import Path
 
@@ -102,7 +102,8 @@ def searches(name: str, **change) -> list:
 
 def identify_settings(torque: str = "commanded", **change) -> Settings:
     """Return the settings of stage=identify, except for the family."""
-    own = {k: v for k, v in conf("identify/default").items() if k not in ("validation_fraction", "from")}
+    names = {f.name for f in fields(Settings)}  # the stage reads the others
+    own = {k: v for k, v in conf("identify/default").items() if k in names}
     per_torque = ("terms", "prior", "candidate_terms", "prunable_terms")
     return Settings(**own | {k: own[k][torque] for k in per_torque} | change)
 
