@@ -221,7 +221,7 @@ COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / 
 
 
 COSTLY = ("task=track", "stage=estimate", "-m stage=transfer")  # others do it in process; six transfers
-OWN_TESTS = r"resume=|list|look|export|check|convert|engines|.*data\.contact=|.*gazebo_classic"
+OWN_TESTS = r"resume=|list|look|export|check|convert|engines|.*data\.contact=|.*gazebo_classic|.*experiment=results"
 TYPED = [c for c in COMMANDS if not re.match(OWN_TESTS, c)]
 
 

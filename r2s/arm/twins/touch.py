@@ -77,7 +77,14 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     point, normal = default_plane(robot) if surface is True else _place(surface)
     # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
     about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
-    out = Surface(
+    tip = Tip(robot)(robot.q_home)[0]
+    inside = float(robot.tool.radius - normal @ (tip - point))
+    if inside > 0:
+        raise UserError(
+            f"arm.surface: the tip at home would be {1e3 * inside:.1f} mm inside it; choose a point below the tip, and a "
+            "normal towards it"
+        )
+    return Surface(
         point=point + rng.uniform(-PLACE, PLACE) * normal,
         normal=tilted(normal, about, tilt),
         stiffness=float(np.exp(rng.uniform(*np.log(STIFFNESS)))),
@@ -86,13 +93,6 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
         friction=float(rng.uniform(0.1, 0.5)),
         bristle=float(rng.uniform(1e-4, 3e-4)),  # m
     )
-    inside = out.depth(Tip(robot)(robot.q_home)[0], robot.tool.radius)
-    if inside > 0:
-        raise UserError(
-            f"arm.surface: the tip at home would be {1e3 * float(inside):.1f} mm inside it; choose a point below the "
-            "tip, and a normal towards it"
-        )
-    return out
 
 
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
