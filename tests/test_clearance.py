@@ -120,7 +120,7 @@ def test_a_predicted_episode_that_the_driver_would_stop_is_found():
 def test_every_driver_has_a_fence():
     sources = [p.read_text() for p in (Path(r2s.__file__).parent / "arm").rglob("*.py")]
     made = [line for text in sources for line in re.findall(r"^.*[ (]Driver\(.*$", text, re.MULTILINE)]
-    made = [line for line in made if "class" not in line]
+    made = [line for line in made if "class" not in line and "_Puppet(" not in line]  # warm_up moves no arm
     assert len(made) == 4
     assert all("fence=" in line or "**how" in line for line in made)
 

@@ -94,8 +94,9 @@ def calls(name):
 
 
 def test_one_module_commands_arms():
-    """Only the emulator, which is the robot, commands its own arm too; other calls check reflexes."""
-    found = {c for c in calls("command") if not c.endswith("reflexes") and not c.startswith("arm/emulator/")}
+    """Only the emulator, which is the robot, commands its own arm too; others check reflexes or ask a controller."""
+    others = "reflexes", ":control"
+    found = {c for c in calls("command") if not c.endswith(others) and not c.startswith("arm/emulator/")}
     assert found == {"arm/command_loop.py:self.arm"}
     assert set(calls("exchange")) == {"arm/clients/franka.py:self._client"}  # called by `_send`, and that ...
     # ... by `Franka.command` only
