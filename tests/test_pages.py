@@ -24,6 +24,7 @@ ELSEWHERE = {  # what this file does not type, and why
     r"pip install": "from the network",
     r"(source|rerun|mlflow|wandb|tensorboard|TRACKIO_DIR=\S+) ": "the shell; programs of others, which wait",
     r"python benchmarks/": "takes minutes to hours; its page names the machine that it ran on",
+    r"python examples/": "test_envs.py and test_gym.py run them for some hundred steps",
     r"python( -m r2s| run.py)$": "names of doors: test_wheel.py, and every other command",
     r"(python run.py|r2s) (list|look|export)( RUN| runs/train/NAME)?$": "named alone: test_look.py, test_export.py",
     r"(python bundle/r2s_runtime.py|g\+\+) ": "test_export.py; the loop itself needs an arm",
