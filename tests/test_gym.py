@@ -63,7 +63,7 @@ def close(one, other):
 
 
 @pytest.mark.parametrize(
-    ("name", "few"), [(REACH, []), *((f"r2s/Panda{t}-v0", ["task.pool=2"]) for t in ("Track", "Press"))]
+    ("name", "few"), [(REACH, []), *((f"r2s/Panda{t}-v0", ["task.pool=2"]) for t in ("Track", "Press", "Wipe"))]
 )
 def test_the_checker_has_no_complaint(name, few):
     """check_env, with every warning an error."""
