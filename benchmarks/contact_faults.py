@@ -12,7 +12,8 @@ from r2s.arm.twins.touch import draw_surface
 from r2s.physics.contact_stop import RELEASED, SLIDES
 from r2s.physics.push_limit import STOPS, PushLimit
 from r2s.physics.surface import UNIT_DEPTH, Surface, load_tool
-from r2s.tasks.press import START, PressTask
+from r2s.tasks.press import PressTask
+from r2s.tasks.surface_task import START
 
 FORCE_MAX, SPEED_NEAR = 45.0, 0.03  # N, m/s
 CYCLES = 1500, 2600  # of an episode, in which the cause comes: the tip presses
