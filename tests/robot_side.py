@@ -86,9 +86,10 @@ class Log(NamedTuple):
 
     @staticmethod
     def read(folder: Path) -> "Log":
-        """Return the rows so far."""
+        """Return the rows so far; the last one may still be in writing."""
         path = folder / "robot"
-        rows = np.fromfile(path).reshape(-1, WIDTH) if path.exists() else np.zeros((0, WIDTH))
+        values = np.fromfile(path) if path.exists() else np.zeros(0)
+        rows = values[: len(values) // WIDTH * WIDTH].reshape(-1, WIDTH)
         head, moving = rows[:, :4], rows[:, 4:-3].reshape(-1, 4, 7)
         return Log(head[:, 0].astype(int), head[:, 1].astype(int), head[:, 2].astype(int), head[:, 3],
                    *np.moveaxis(moving, 1, 0), rows[:, -3:])  # fmt: skip

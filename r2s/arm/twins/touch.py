@@ -81,8 +81,8 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     inside = float(robot.tool.radius - normal @ (tip - point))
     if inside > 0:
         raise UserError(
-            f"arm.surface: the tip at home would be {1e3 * inside:.1f} mm inside it; choose a point below the tip, and a "
-            "normal towards it"
+            f"arm.surface: the tip at home would be {1e3 * inside:.1f} mm inside it; choose a point below the tip, "
+            "and a normal towards it"
         )
     return Surface(
         point=point + rng.uniform(-PLACE, PLACE) * normal,
