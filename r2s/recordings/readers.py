@@ -139,7 +139,7 @@ def from_table(table: Table, how: Options) -> Recording:
     held = notes.get("command_period") if saved else None
     arrays = {k: x.view() for k, x in arrays.items()}
     for x in arrays.values():
-        x.flags.writeable = False  # `Recording` need not copy what nobody changes
+        x.flags.writeable = False  # `Recording` need not copy arrays that do not change
     recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)  # type: ignore[arg-type]
     recording = replace(recording, notes=tuple(repairs), command_period=held)
     if how.max_gap_s is not None and not saved:

@@ -27,7 +27,7 @@ def table_cells(page: str) -> dict[Cell, str]:
 
 
 def without_rows(page: str) -> str:
-    """Return a page whose tables have their heads only; a table that nobody writes again then shows it."""
+    """Return a page whose tables keep their heads only, so that tables which are not made again stay empty."""
     kept, in_table = [], False
     for line in page.splitlines():
         rule = re.fullmatch(r"\|(?: *:?-+:? *\|)+", line) is not None
@@ -94,7 +94,7 @@ def _verdict(before: str, now: str) -> str:
     words = [re.sub(NUMBER, "", text) for text in (before, now)]
     if words[0] == words[1] and all(abs(x - y) <= 1.001 * u for x, y, u in zip(a, b, units, strict=True)):
         return "last digit"
-    pairs = [[(_numbers(m[0])) for m in INTERVAL.finditer(text)] for text in (before, now)]
+    pairs = [[_numbers(m[0]) for m in INTERVAL.finditer(text)] for text in (before, now)]
     if not pairs[0] or len(pairs[0]) != len(pairs[1]):
         return "without interval"
     overlap = all(a[0] <= b[1] and b[0] <= a[1] for a, b in zip(*pairs, strict=True))

@@ -17,8 +17,12 @@ SHOWN = 20  # cells in a terminal
 NOTE = "without interval: the figure has changed, and the page states no interval that would judge it"
 
 
-def page_report(console: Console, run: Run, page: str, cells: pd.DataFrame) -> dict[str, Any]:
-    """Print the cells that differ, write differences.csv, report.md and `all_pages`; return the summary."""
+def page_report(console: Console, run: Run, page: str, commit: str, cells: pd.DataFrame) -> dict[str, Any]:
+    """Print the cells that differ, write differences.csv, report.md and `all_pages`; return the summary.
+
+    Args:
+        run: gets the files. page: its name. commit: of the clone in which it was made. cells: of `compare_pages`.
+    """
     counts = {verdict: int((cells["verdict"] == verdict).sum()) for verdict in VERDICTS}
     cells.to_csv(run.folder / "differences.csv", index=False)
     shown = _shown(cells[cells["verdict"] != "equal"])
@@ -27,9 +31,8 @@ def page_report(console: Console, run: Run, page: str, cells: pd.DataFrame) -> d
     print_table(console, shown.head(SHOWN), title, NOTE)
     if len(shown) > SHOWN:
         console.print(f"{len(shown) - SHOWN} more in {run.folder / 'report.md'}", markup=False)
-    commit = run.meta["git"]["commit"]
     report_markdown(run.folder / "report.md", {title: [f"Commit {commit}. {NOTE}.", shown]})
-    summary = {"page": page, "cells": len(cells), **counts}
+    summary = {"page": page, "commit": commit, "cells": len(cells), **counts}
     all_pages(run.folder.parent, summary)
     return summary
 
@@ -40,7 +43,10 @@ def all_pages(folder: Path, last: dict[str, Any]) -> None:
     for path in sorted(folder.glob("*/summary.json")):
         other = json.loads(path.read_text())
         done.setdefault(other["page"], other)
-    rows = {page: {k: str(done[page][k]) for k in ("cells", *VERDICTS)} for page in sorted(done)}
+    rows = {
+        page: {"commit": done[page]["commit"][:7]} | {k: str(done[page][k]) for k in ("cells", *VERDICTS)}
+        for page in sorted(done)
+    }
     table = pd.DataFrame.from_dict(rows, orient="index").rename_axis("page")
     with atomic_write(folder / "report.md") as part:
         report_markdown(part, {"Results made again": [NOTE + ".", table]})

@@ -138,11 +138,10 @@ def touches(cfg: Any) -> bool:
 
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the labels of the trainings and of the transfers."""
-    without = COMPUTED, REFERENCE
-    trained = (*MODELS, *(x for x, has in zip(without, (cfg.adapt.name != "none", touches(cfg)), strict=True) if has))
-    if touches(cfg):
-        trained = tuple(x for x in trained if x != COMPUTED)
-    return trained, trained if cfg.adapt.name == "none" else (*trained, ADAPTED)
+    adapts = cfg.adapt.name != "none"
+    unlearned = [REFERENCE] if touches(cfg) else [COMPUTED] if adapts else []
+    trained = *MODELS, *unlearned
+    return trained, (*trained, ADAPTED) if adapts else trained
 
 
 def check_free(root: Path, name: str, cfg: Any) -> None:

@@ -59,7 +59,7 @@ def results(cfg, overrides):
     with open_run(cfg, overrides) as run:
         clone = run.folder / CLONE
         path = PAGES / f"{settings['page']}.md"
-        before = cloned(clone, path)
+        before, commit = cloned(clone, path)
         if git()["dirty"]:
             print("uncommitted changes are not part of the clone")
         progress = Progress(settings["page"])
@@ -69,26 +69,31 @@ def results(cfg, overrides):
         progress.close()
         now = (clone / path).read_text()
         (run.folder / path.name).write_text(now)
-        run.summary(page_report(console(), run, settings["page"], compare_pages(before, now)))
+        run.summary(page_report(console(), run, settings["page"], commit, compare_pages(before, now)))
     print(f"written: {run.folder}")
 
 
 def cloned(clone, path):
-    """Clone this commit unless an earlier part of the run did; return the committed page, "" for none.
+    """Clone this commit unless an earlier part of the run did; return its committed page ("": none) and its hash.
 
-    The tables of the clone's page lose their rows, so that one that is not made again shows it.
+    The tables of the clone's page lose their rows, so that one that is not made again shows it. The clone appears
+    under its name when it is complete.
     """
-    from r2s.files import atomic_write
     from r2s.reporting.page_comparison import without_rows
 
     if not clone.is_dir():
-        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
-        page = clone / path
-        if page.is_file():
-            with atomic_write(page) as part:
-                part.write_text(without_rows(page.read_text()))
-    shown = subprocess.run(["git", "show", f"HEAD:{path}"], cwd=clone, capture_output=True, text=True, check=False)
-    return shown.stdout if shown.returncode == 0 else ""
+        part = clone.with_name(f"{clone.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(part)], check=True)
+        if (page := part / path).is_file():
+            page.write_text(without_rows(page.read_text()))
+        part.rename(clone)
+
+    def output(*words):
+        done = subprocess.run(["git", *words], cwd=clone, capture_output=True, text=True, check=False)
+        return done.stdout if done.returncode == 0 else ""
+
+    return output("show", f"HEAD:{path}"), output("rev-parse", "HEAD").strip()
 
 
 def execute(words, clone, log):
