@@ -14,6 +14,7 @@ from typing import Any
 
 import psutil
 import pytest
+import torch
 import yaml
 from omegaconf import OmegaConf
 
@@ -27,6 +28,12 @@ SESSION = "R2S_TEST_SESSION"  # every process that a session starts inherits thi
 SERVERS = ("from multiprocessing.forkserver ", "from multiprocessing.resource_tracker ")
 NAME = pytest.StashKey[str]()
 GRACE_S = 10.0  # a server that watches its parent needs a moment to see that it is gone
+
+
+@pytest.fixture(autouse=True)
+def _seeded():
+    """A test that makes an untrained policy sees the same weights alone, in any order and on any worker."""
+    torch.manual_seed(0)
 
 
 def conf(path: str) -> dict:

@@ -277,11 +277,16 @@ def test_timing_counts_every_cycle():
 
 
 def test_a_slow_policy_is_not_taken_for_a_silent_one():
-    """At 10 Hz a target holds for 100 ms: no stop."""
+    """At 10 Hz a target holds for 100 ms: no stop. The action is zero, so nothing else can stop the arm."""
+
+    class Still:
+        def action(self, observation):
+            return torch.zeros(len(observation), 7)
+
     task = replace(TASK, ctrl_hz=10, episode_s=1.0)
     arm = SimulatedArm(PANDA, nominal_dynamics(PANDA, **conf("friction/paper")), position_noise=0, velocity_noise=0)
     driven = PolicyRunner(arm, task, LEVEL)
-    rollout(make_policy(PANDA, task, (8,)), driven, task, *fixed_episodes(PANDA, task, 1))
+    rollout(Still(), driven, task, *fixed_episodes(PANDA, task, 1))
     assert driven.stops == []
 
 
