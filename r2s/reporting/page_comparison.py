@@ -53,6 +53,15 @@ def compare_pages(before: str, now: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["section", "row", "column", "committed", "now", "verdict", "change"])
 
 
+def compare_all(before: dict[str, str], now: dict[str, str]) -> pd.DataFrame:
+    """Return `compare_pages` of {page: text}, joined; of several, a section begins with its page."""
+    parts = []
+    for page, text in before.items():
+        cells = compare_pages(text, now[page])
+        parts.append(cells if len(before) == 1 else cells.assign(section=f"{page}: " + cells["section"]))
+    return pd.concat(parts, ignore_index=True)
+
+
 def _tables(page: str) -> Iterator[tuple[str, list[str], list[list[str]]]]:
     """Yield section, head and rows of each table."""
     section, block = "", []

@@ -28,6 +28,8 @@ def reads(cfg):
 def commands_of(settings):
     """Return the commands (lists of words) of `results.page`, with `results.data` put in.
 
+    A command is `make ...` or the arguments of python.
+
     Raises:
         UserError: no such page; a page that needs data and none given; no checkout of r2s.
     """
@@ -51,15 +53,15 @@ def results(cfg, overrides):
     """Page -> the same page of this commit, differences.csv, report.md."""
     from r2s.progress import Progress
     from r2s.provenance import git
-    from r2s.reporting.page_comparison import compare_pages
+    from r2s.reporting.page_comparison import compare_all
     from r2s.reporting.results import page_report
 
     settings = plain(cfg.results)
     commands = commands_of(settings)
+    paths = [PAGES / f"{name}.md" for name in settings["page"].split("+")]
     with open_run(cfg, overrides) as run:
         clone = run.folder / CLONE
-        path = PAGES / f"{settings['page']}.md"
-        before, commit = cloned(clone, path)
+        before, commit = cloned(clone, paths)
         if git()["dirty"]:
             print("uncommitted changes are not part of the clone")
         progress = Progress(settings["page"])
@@ -67,16 +69,17 @@ def results(cfg, overrides):
             progress(k / len(commands), shlex.join(words)[:70])
             run.memo(f"command_{k}", lambda words=words: execute(words, clone, run.folder / "log.txt"))
         progress.close()
-        now = (clone / path).read_text()
-        (run.folder / path.name).write_text(now)
-        run.summary(page_report(console(), run, settings["page"], commit, compare_pages(before, now)))
+        for path in paths:
+            shutil.copy(clone / path, run.folder)
+        now = {path.stem: (clone / path).read_text() for path in paths}
+        run.summary(page_report(console(), run, settings["page"], commit, compare_all(before, now)))
     print(f"written: {run.folder}")
 
 
-def cloned(clone, path):
-    """Clone this commit unless an earlier part of the run did; return its committed page ("": none) and its hash.
+def cloned(clone, paths):
+    """Clone this commit unless an earlier part of the run did; return {page: committed text ("": none)} and its hash.
 
-    The tables of the clone's page lose their rows, so that one that is not made again shows it. The clone appears
+    The tables of the clone's pages lose their rows, so that one that is not made again shows it. The clone appears
     under its name when it is complete.
     """
     from r2s.reporting.page_comparison import without_rows
@@ -85,30 +88,30 @@ def cloned(clone, path):
         part = clone.with_name(f"{clone.name}.part")
         shutil.rmtree(part, ignore_errors=True)
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(part)], check=True)
-        if (page := part / path).is_file():
-            page.write_text(without_rows(page.read_text()))
+        for page in (part / path for path in paths):
+            if page.is_file():
+                page.write_text(without_rows(page.read_text()))
         part.rename(clone)
 
     def output(*words):
         done = subprocess.run(["git", *words], cwd=clone, capture_output=True, text=True, check=False)
         return done.stdout if done.returncode == 0 else ""
 
-    return output("show", f"HEAD:{path}"), output("rev-parse", "HEAD").strip()
+    return {p.stem: output("show", f"HEAD:{p}") for p in paths}, output("rev-parse", "HEAD").strip()
 
 
 def execute(words, clone, log):
-    """Run `python WORDS` in the clone, whose r2s it imports; output goes to log.
+    """Run `python WORDS`, or `make WORDS`, in the clone, whose r2s it imports; output goes to log.
 
     Raises:
         UserError: the command fails; its last line is in the message.
     """
+    command = words if words[0] == "make" else [sys.executable, *words]
     with open(log, "a+") as file:
-        file.write(f"$ python {shlex.join(words)}\n")
+        file.write(f"$ {shlex.join([Path(command[0]).name, *command[1:]])}\n")
         file.flush()
         env = os.environ | {"PYTHONPATH": str(clone.resolve())}
-        done = subprocess.run(
-            [sys.executable, *words], cwd=clone, env=env, stdout=file, stderr=subprocess.STDOUT, check=False
-        )
+        done = subprocess.run(command, cwd=clone, env=env, stdout=file, stderr=subprocess.STDOUT, check=False)
     if done.returncode:
         *_, last = log.read_text(errors="replace").splitlines()
         raise UserError(f"{words[0]} failed ({log}): {last.removeprefix('error: ')}")
