@@ -1,4 +1,4 @@
-"""Compare physics engines on one arm: motion in open loop, joint stops, a policy on 200 goals, the paper's figure 7.
+"""Compare physics engines on one arm: open loop, joint stops, a policy on 200 goals, contact, the paper's figure 7.
 
 `python benchmarks/engines.py RUN`, with RUN a run folder of stage=train. Gazebo Classic has to be installed
 (docs/how_to/gazebo.md). Writes benchmarks/results/engines.md and engines.png; finished transfers are not repeated.
@@ -28,6 +28,8 @@ from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import single_arm
 from r2s.reporting.figures.colours import OTHERS
 from r2s.reporting.figures.panels import panels
+from r2s.tasks.press_measures import PRESS
+from r2s.tasks.wipe_measures import WIPE
 
 REFERENCE, ODE = "MuJoCo", "Gazebo Classic, ODE"
 MAKERS = {
@@ -38,10 +40,12 @@ MAKERS = {
         ("simulator=gazebo_classic", "simulator.physics=dart"),
     ),
 }
+CONTACT = {"press": PRESS, "wipe": WIPE}
 MOTIONS = 4
 SWING = 0.12  # rad, half of what each joint would move alone in a motion
 STOP_SHARE = 0.03  # of each torque limit: pushes every joint into a stop
 ROTORS = 2e-3 * ROBOT.tau_max  # kg m^2, of the size that identification finds on a Panda
+CONTACT_GOALS = 24
 GOALS = 4  # of the figure, as in the paper's
 ALL_GOALS = 200
 
@@ -146,20 +150,51 @@ def stops(makers: dict[str, Callable[[Dynamics], Engine]]) -> list[str]:
     return [text, markdown_rows(rows, "engine")]
 
 
-def policy_rows(run: str) -> dict[str, dict]:
+def policy_rows(run: str, goals: int = ALL_GOALS, task: str = "reach") -> dict[str, dict]:
     """Transfer a policy to each engine; return {engine: measures}, and MuJoCo's."""
-    common = ["stage=transfer", f"policy={run}", "arm=none", f"evaluation.episodes={ALL_GOALS}"]
-    run_parallel([*common, *words, f"name={transfer_folder(name).name}"] for name, (_, words) in MAKERS.items())
+    common = ["stage=transfer", f"policy={run}", "arm=none", f"evaluation.episodes={goals}"]
+    run_parallel([*common, *words, f"name={transfer_folder(name, task).name}"] for name, (_, words) in MAKERS.items())
     found: dict[str, dict] = {}
     for name in MAKERS:
-        rows = json.loads((transfer_folder(name) / "summary.json").read_text())
+        rows = json.loads((transfer_folder(name, task) / "summary.json").read_text())
         found |= {REFERENCE: rows.pop("mujoco"), name: next(iter(rows.values()))}
     return found
 
 
-def transfer_folder(name: str) -> Path:
+def transfer_folder(name: str, task: str = "reach") -> Path:
     """Return the run folder of an engine's transfer."""
-    return ROOT / "runs" / "transfer" / f"engines_{name.lower().replace(', ', '_').replace(' ', '_')}"
+    return ROOT / "runs" / "transfer" / f"engines_{task}_{name.lower().replace(', ', '_').replace(' ', '_')}"
+
+
+def contact_tables() -> list[str]:
+    """Return the tables of the hybrid force controller in each engine, for both tasks in contact."""
+    parts = [
+        f"The model-based reference (`algo=hybrid_force`) on {CONTACT_GOALS} goals; `dr=contact` draws arm and "
+        "surface. r2s computes the contact force, each engine moves the arm. Last column: mean difference of the "
+        "normal force over goals and time."
+    ]
+    run_parallel(
+        [f"task={task}", "algo=hybrid_force", f"evaluation.episodes={CONTACT_GOALS}", f"name=engines_{task}"]
+        for task in CONTACT
+    )
+    for task, table in CONTACT.items():
+        measures = policy_rows(str(ROOT / "runs" / "train" / f"engines_{task}"), CONTACT_GOALS, task)
+        rows = {
+            name: {table[key].column.replace("\n", " "): table[key].cell(row[key]) for key in table.rows}
+            | {"force from MuJoCo, N": force_difference(name, task)}
+            for name, row in measures.items()
+        }
+        parts.append(markdown_rows(rows, f"task={task}"))
+    return parts
+
+
+def force_difference(name: str, task: str) -> str:
+    """Return the mean absolute difference of an engine's normal force from MuJoCo's, N."""
+    if name == REFERENCE:
+        return ""
+    folder = transfer_folder(name, task)
+    one, other = (np.load(path)["force"][..., 0] for path in sorted(folder.glob("episodes_*.npz")))
+    return f"{np.abs(one - other).mean():.1e}"
 
 
 def policy_table(run: str) -> list[str]:
@@ -212,6 +247,7 @@ def main(run: str) -> None:
         *("## Motion in open loop", *open_loop(makers)),
         *("## Into joint stops", *stops(makers)),
         *("## A policy", *policy_table(run)),
+        *("## In contact", *contact_tables()),
         *("## The paper's figure 7", *draw_rewards()),
     ]
     write_page("engines", "Physics engines", "python benchmarks/engines.py RUN", parts)
