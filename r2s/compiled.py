@@ -27,7 +27,7 @@ LONG_S = 2.0  # of one compilation, after which a user wonders what happens
 
 @cache
 def _sources(room: Path) -> bytes:
-    """Return a hash of the compiled modules that a function in folder `room` may contain."""
+    """Return a hash of the compiled modules whose functions a function in folder `room` may call."""
     if PACKAGE in room.parents:  # a sub-room counts as part of its room
         names = room.relative_to(PACKAGE).parts[0], "physics"
         paths = {path for name in names for path in (PACKAGE / name).rglob("*.py")}

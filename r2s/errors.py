@@ -52,7 +52,7 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
         whole: require an integer.
 
     Raises:
-        UserError: the value is not such a number.
+        UserError: the value is not a number within these bounds.
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):

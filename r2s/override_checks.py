@@ -45,7 +45,7 @@ SUBMITIT = ("submitit_slurm", "submitit_local")  # launchers of the extra `sweep
 
 
 def extended(words: Sequence[str]) -> list[str]:
-    """Return the words, with ++ before what is stated of a parameter, a key that no file of conf/ has."""
+    """Return the words with ++ before stated values of parameters, because no file of conf/ has their keys."""
     return [f"++{w}" if STATED.match(w) else w for w in words]
 
 

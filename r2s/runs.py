@@ -185,7 +185,7 @@ class Run:
         return self.folder / "figures" / f"{name}.png"
 
     def log(self, table: str, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to <table>.csv, whose first row sets the columns; return it rounded as in the file.
+        """Append a row to <table>.csv and return it rounded as in the file; the first row sets the columns.
 
         Decisions based on the rounded row are the same after a resume, which reads the file (`rewind`).
         """
@@ -360,7 +360,7 @@ def _lock(folder: Path) -> int:
 def status_of(meta: Mapping[str, Any]) -> str:
     """Return done, stopped, failed, running, or killed (meta.json has running, but the process is gone).
 
-    A process on another computer cannot be checked; its status is that of meta.json.
+    A process on another computer cannot be checked; meta.json then gives the status.
     """
     process = meta.get("process", {})
     if meta["status"] != "running" or process.get("host") != platform.node():

@@ -11,6 +11,7 @@ README, ARCHITECTURE = ROOT / "README.md", ROOT / "docs" / "explanation" / "arch
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 FILE = re.compile(r"\b(?:r2s|conf|docs|tests|benchmarks|notebooks)/[\w/]*\w+\.(?:py|yaml|md|png|svg|ipynb)\b")
 MOST_README_LINES = 60  # a screen, beside its picture
+MOST_WORDS = 20_000  # of all pages in docs/
 
 
 def table(page: Path, heading: str) -> list[list[str]]:
@@ -61,3 +62,8 @@ def test_a_reader_finds_the_line_in_three_hops(row):
 def test_the_readme_can_be_read_at_once():
     """It stays short; details have pages of their own."""
     assert len(README.read_text().splitlines()) <= MOST_README_LINES
+
+
+def test_the_pages_stay_short():
+    """One fact in one place: docs/ has at most MOST_WORDS words."""
+    assert sum(len(page.read_text().split()) for page in PAGES[1:]) <= MOST_WORDS

@@ -1,4 +1,4 @@
-"""Contact of a working arm: a force that its covariance does not explain, and that is no weight; compiled."""
+"""Contact of a working arm: a force larger than its covariance explains, and not a weight; compiled."""
 
 import numpy as np
 

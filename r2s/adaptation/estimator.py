@@ -134,7 +134,7 @@ class Estimator:
 
     @property
     def payload(self) -> np.ndarray:
-        """(10,), the payload's inertial parameters in the payload frame; zeros if the mass may as well be zero."""
+        """(10,), the payload's inertial parameters in the payload frame; zeros if its mass is not significant."""
         x = self._filter.x[:BODY]
         return x.copy() if x[0] > max(Z * np.sqrt(self._filter.P[0, 0]), LEAST_KG) else np.zeros(BODY)
 

@@ -8,7 +8,8 @@ c*^2, which gives
 
     w = max(0, 1 - s^2 / c^2),
 
-the positive part of the James-Stein shrinkage of 1961 for one number: a torque that may as well be zero is not added.
+the positive part of the James-Stein shrinkage of 1961 for one number: a torque that is consistent with zero is not
+added.
 
 The feedforward follows the motion at once, but a new estimate enters through a low-pass over one span. A torque step
 twists elastic gears and lets motors run ahead of their links; the filter interprets this as another payload. On a
@@ -74,8 +75,8 @@ class Feedforward:
 def plausible_payload(x, most, out):
     """Write the ten parameters of the payload nearest to the mass and centre of x (10,) within the arm's limits.
 
-    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is that of a
-    ball of water: data hardly show a tensor, and a wrong one feeds back the acceleration.
+    most: (2,) kg, m, largest mass, and largest distance of its centre from the payload frame. The tensor is a ball of
+    water's, because data hardly show a tensor and a wrong one feeds back the acceleration.
     """
     m = min(max(x[0], 0.0), most[0])
     out[:] = 0.0

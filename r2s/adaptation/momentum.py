@@ -17,7 +17,7 @@ MOMENTUM_WORK = 18  # columns of the workspace, per joint
 
 
 class MomentumTerms(NamedTuple):
-    """Momentum of n joints, and the torques that change it beside commands and friction."""
+    """Momentum of n joints, and the torques that change it, besides commands and friction."""
 
     p: np.ndarray  # (n,) Nm s
     coriolis: np.ndarray  # (n,) Nm, C^T dq

@@ -83,7 +83,7 @@ class MomentumResidual(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update_residual(arm, state, q, dq, tau, out):
-    """Process one cycle; return whether a span has ended, whose residual is then in `out`.
+    """Process one cycle; return whether a span has ended. Its residual is then in `out`.
 
     Args:
         arm: `ArmModel`. state: `ResidualState`. q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity,

@@ -137,7 +137,7 @@ def _fit_joint(residuals: list[MomentumResidual], j: int, level: float, model: f
 
 
 def _scaled(noise: Noise, scale: np.ndarray) -> Noise:
-    """Return the noise with each joint's times scale (n,)."""
+    """Return the noise with each joint's value multiplied by scale (n,)."""
     parts = {name: getattr(noise, name) * scale for name in ("white", "momentum_share", "model", "reversal")}
     return noise._replace(**parts, prior=_with_model(noise.prior, parts["model"], parts["momentum_share"]))
 
@@ -157,7 +157,7 @@ def _without_payload(noise: Noise) -> Noise:
 
 
 def _run(noise: Noise, residuals: list[MomentumResidual]) -> tuple[Filter, np.ndarray, np.ndarray]:
-    """Return the filter, its normalised innovations (M, n), nan unless a joint slides, and log odds (M,)."""
+    """Return the filter, its normalised innovations (M, n), nan where a joint rests, and log odds (M,)."""
     filter, innovations, odds = Filter.fresh(noise), [], []
     for r in residuals:
         update(filter, noise, r)

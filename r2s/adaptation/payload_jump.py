@@ -135,6 +135,6 @@ def apply_jump(filter, noise):
 
 @njit(cache=True)
 def widen_payload(P, noise):
-    """Raise the variances of mass and first moments to those of a new payload."""
+    """Raise the variances of mass and first moments to the values for a new payload."""
     for c in range(JUMP):
         P[c, c] += (NEW_PAYLOAD * noise.prior[c]) ** 2

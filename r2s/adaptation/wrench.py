@@ -7,9 +7,10 @@
 The force acts at the tip of `robot.tool`; without a tool it acts at the end effector, with a moment. wrench_filter.py
 describes the estimate. A contact is a force whose square, in units of its covariance, exceeds a threshold for 15 ms
 while a joint moves: a chi-square test of the hypothesis that no force acts. The threshold stands for one false alarm
-an hour. It is at least that of independent normal errors in each cycle. If motion without contact errs more, its tail
-counts: the largest values of half seconds have an exponential tail (extreme values of a chi-square variable:
-Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is continued to an hour.
+an hour. It is at least the threshold for independent normal errors in each cycle. If motion without contact errs
+more, its tail counts: the largest values of half seconds have an exponential tail (extreme values of a chi-square
+variable: Embrechts, Klueppelberg and Mikosch, Modelling Extremal Events, 1997, section 3.3), which is continued to an
+hour.
 """
 
 from collections.abc import Callable, Sequence
@@ -141,7 +142,7 @@ class WrenchObserver:
 
 
 def default_wrench_noise(robot: Robot, dynamics: Dynamics, model: np.ndarray | None = None) -> WrenchNoise:
-    """Return the uncertainty of an identified arm; model: (n,) Nm, error of its friction, None: of a typical size."""
+    """Return the uncertainty of an identified arm; model: (n,) Nm, error of its friction; None: a typical error."""
     arm = make_arm_model(robot, dynamics)
     floor = tuning.WRENCH_FRICTION_FLOOR * arm.level + 3e-3  # Nm: a wrist's
     friction = floor if model is None else np.maximum(tuning.WRENCH_FRICTION * model, floor)

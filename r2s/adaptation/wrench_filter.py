@@ -8,11 +8,11 @@ in a Kalman filter: Hu and Xiong, IEEE Trans. Ind. Electron. 65(2), 2018).
 What is known about f depends on the joint (wrench_friction.py):
 - It slides: b is the error of the identified friction, small and of short memory, and near a reversal as large as the
   noise of the speed leaves its side unknown. Such a joint measures the wrench.
-- It rests: friction balances the other torques and stays within the breakaway edges. Such a joint only says that the
-  wrench cannot have gone further than that.
+- It rests: friction balances the other torques and stays within the breakaway edges. Such a joint only limits how far
+  the wrench can have changed.
 The wrench changes with the motion of the tip, as a stiff environment would have it. With all joints at rest the tip
-is fixed: only a hand may change the force, until the edges hide no more. A torque that has diffused that far may lie
-anywhere between the edges: variance of a uniform distribution about their middle.
+is fixed: only a hand may change the force, and the breakaway edges hide this up to their width. A torque that has
+diffused that far may lie anywhere between the edges: variance of a uniform distribution about their middle.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """What the wrench filter knows about friction: which joints rest, on which side the others slide; compiled.
 
-A joint at rest is held: its speed stays 0, so that friction is what balances all other torques. With A = M_rs M_ss^-1
-of the joints at rest (r) and the sliding ones (s), the momentum of a joint at rest follows from theirs,
-dp_r/dt = A (dp_s/dt - M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
+A joint at rest is held: its speed stays 0, so its friction balances all other torques. With A = M_rs M_ss^-1 of the
+joints at rest (r) and the sliding ones (s), the momentum of a joint at rest follows from theirs, dp_r/dt = A (dp_s/dt
+- M'_ss dq_s) + M'_rs dq_s, and f_r = u_r + J_r^T wrench - dp_r/dt.
 """
 
 import numpy as np

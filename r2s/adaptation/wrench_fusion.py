@@ -1,7 +1,7 @@
 """External force from momentum and from an identified surface together.
 
 Encoders show how deep the tip is in the surface, and its law (r2s/physics/surface.py) gives the normal force F_s. Its
-variance s^2 is that of the surface's posterior, of the encoders, and of what the law leaves out. Momentum's force F
+variance s^2 adds the surface's posterior, the noise of the encoders, and the errors of the law. Momentum's force F
 has other errors, so one update of a Kalman filter combines both: F' = F + P n (F_s - n . F) / (n . P n + s^2). The
 difference passes a low-pass first, because angles have noise.
 
@@ -45,7 +45,7 @@ def surface_law(surface: Surface, draws: Sequence[Surface], radius: float, angle
 
 
 class FusedWrench(WrenchObserver):
-    """A `WrenchObserver` whose force is combined with that of a surface; contact is decided by momentum alone.
+    """A `WrenchObserver` that also uses the law of a surface; momentum alone decides whether there is contact.
 
     Args:
         surface, draws: identified, and its posterior (r2s/identification/contact/contact_file.py).

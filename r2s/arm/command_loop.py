@@ -142,7 +142,7 @@ class CommandLoop:
             self._cycle(held + np.clip(-REST_RATE * inertia * s.dq, -limit, limit))
 
     def settle(self) -> None:
-        """At the end of a plan: if the driver is bringing the arm to rest, let it, and raise its reason.
+        """At the end of a plan: if the driver is bringing the arm to rest, wait for it and raise its reason.
 
         Raises:
             StopRequested, ArmStopped: as a cycle.

@@ -151,7 +151,7 @@ def _watch(i, q, dq, given, bounds, memory):
 def resist(dq, spring, most, held):
     """Move a held compensation (n,) Nm against joints at dq (n,) rad/s that should be at rest.
 
-    What keeps them sliding is a load that the compensation does not know, or an estimate with the motion's friction.
+    They keep sliding under an undeclared load, or if the compensation still contains friction of the motion.
 
     Args:
         spring: (n,) Nm/rad, SPRING^2 times the joint's inertia. most: (n,) Nm, bound of the compensation.

@@ -137,7 +137,7 @@ class DriverBatch:
 
     @property
     def decides_contact(self) -> bool:
-        """Whether a stop holds, releases or retreats from a contact: with a `push_limit`."""
+        """Whether a stop decides about contact (hold, release, retreat): only with a `push_limit`."""
         return bool(len(self._push))
 
     @property

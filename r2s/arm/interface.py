@@ -44,7 +44,7 @@ class ArmState:
         tau_J: (n,) Nm, link-side torque sensor: includes gravity, excludes most motor friction.
         tau_J_d: (n,) Nm, the last command, without gravity.
         tau_ext_hat_filtered: (n,) Nm, what the joints exert beyond the arm's own model: tau_J minus gravity, declared
-            load and dynamics. As in the rest, None: this arm does not know it.
+            load and dynamics. Here and below None means that this arm does not report it.
         O_F_ext_hat_K: (6,) N, Nm, the same at the end effector in the base frame, positive on what the arm pushes.
         joint_contact, joint_collision, cartesian_contact, cartesian_collision: (n,), (6,), above 0 where the external
             torque or force exceeds the thresholds set.
@@ -71,13 +71,13 @@ class ArmState:
 
     @property
     def in_contact(self) -> bool:
-        """Whether the arm reports a contact or a collision; False if it does not know."""
+        """Whether the arm reports a contact or a collision."""
         flags = self.joint_contact, self.cartesian_contact, self.joint_collision, self.cartesian_collision
         return any(flag is not None and flag.any() for flag in flags)
 
     @property
     def signals(self) -> np.ndarray:
-        """(sum of `signal_sizes`,), what the arm knows of `SIGNALS`; nan where it does not."""
+        """(sum of `signal_sizes`,), values of `SIGNALS`; nan: not reported."""
         sizes = signal_sizes(len(self.q)).items()
         values = ((getattr(self, name), size) for name, size in sizes)
         return np.concatenate([np.full(size, np.nan) if x is None else np.reshape(x, size) for x, size in values])
@@ -90,7 +90,7 @@ def signal_sizes(n: int) -> dict[str, int]:
 
 
 def named_signals(values: np.ndarray, n: int) -> dict[str, Any]:
-    """Return what the arm knows in values (..., k) of `ArmState.signals`, by name: (..., size), or (...) of one."""
+    """Return values (..., k) of `ArmState.signals` by name: (..., size), or (...) for size 1."""
     sizes = signal_sizes(n)
     parts = zip(sizes, np.split(values, np.cumsum([*sizes.values()])[:-1], axis=-1), strict=True)
     return {name: x[..., 0] if x.shape[-1] == 1 else x for name, x in parts if not np.isnan(x).all()}

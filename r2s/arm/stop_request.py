@@ -20,7 +20,7 @@ GRACE_S = 2.0  # s for a motion to end by itself: driver and `rest` take at most
 
 
 class _Request:
-    """The request of this process: reason of the first one, and whether a motion ends or has ended because of it."""
+    """The first stop request of this process: its reason, and whether it ends or has ended a motion."""
 
     def __init__(self) -> None:
         self.sources: list[Callable[[], str | None]] = []

@@ -67,7 +67,7 @@ class TrackingController:
 
     @property
     def offset(self) -> np.ndarray:
-        """(n,) Nm, the estimated offset, which a payload that gravity compensation does not know needs at rest."""
+        """(n,) Nm, the estimated offset; at rest it carries an undeclared payload."""
         return self._theta[0]
 
     def deviation(self, k: int, state: ArmState) -> str | None:

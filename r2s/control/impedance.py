@@ -1,6 +1,6 @@
 """`control=joint_impedance`, `cartesian_impedance`, `hybrid`: springs about a target, which actions move or stiffen.
 
-The laws are in r2s/physics/impedance_laws.py; this module makes their parameters of arm, task and identified model.
+The laws are in r2s/physics/impedance_laws.py; this module computes their parameters from arm, task and model.
 Defaults scale with the arm: forces are torques over the lever at home, stiffnesses are forces over a distance, and no
 spring is faster than the latency of the loop allows.
 """
@@ -171,8 +171,9 @@ def cartesian_impedance(
             every direction at home; None: CLIP times that. moment_clip: Nm, likewise.
         null_stiffness: 1/rad, stiffness towards home in the null space, per torque limit of each joint.
         hybrid: whether a force acts along a normal, and the impedance across it only. A displacement against the
-            normal then adds its stiffness times as much force. Of a task that `approaches` a surface, the force is at
-            most that of a spring to the target, which moves into the surface; so the approach is as slow as it.
+            normal then adds its stiffness times as much force. If the task `approaches` a surface, its target moves
+            into the surface, and the spring to the target bounds the force. So the tip approaches no faster than the
+            target.
         normal: (3,) in the base frame, out of the surface. force: N, against it. None: the task's contact.
         integral_rate: 1/s, of the force error, where a force is measured. integral_max: its share of force_clip.
 
@@ -301,7 +302,7 @@ def _action(
 def _parameters(
     robot: Robot, task: ControlledTask, dynamics: Dynamics, damping: float, tank: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters (p,) with all but springs and action, and a view (n, ROW) of the joints' rows."""
+    """Return the parameters (p,) without springs and action, and a view (n, ROW) of the joints' rows."""
     check_number("damping", damping, "(0, 10]")
     if np.shape(tank) != (2,) or not 0 <= tank[0] <= tank[1] < np.inf:
         raise UserError(f"tank: expected first level and size in J, 0 <= level <= size, got {tank}")

@@ -31,9 +31,9 @@ class Engine(Protocol):
 class FrictionTorque:
     """The joint torque of r2s/physics/friction.py and contact.py, for engines whose only input is torque.
 
-    That friction is implicit: with P its torque and D its slope at the present velocity, MuJoCo solves
-    (M + h D) a = tau + P - bias. An engine that solves M a = tau + F - bias gives the same with F = P - h D a, where
-    a is the result of the implicit step. Without that term real wrist joints chatter at 1 ms.
+    This friction is implicit: with its torque P and its slope D at the present velocity, MuJoCo solves (M + h D) a =
+    tau + P - bias. An engine that solves M a = tau + F - bias gives the same with F = P - h D a, where a is the
+    result of the implicit step. Without that term real wrist joints chatter at 1 ms.
 
     Args:
         robot, dynamics: the arm.

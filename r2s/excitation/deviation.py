@@ -27,7 +27,7 @@ class DeviationLimits:
 
     @classmethod
     def along(cls, space: Space, motion: Motion, most: float) -> "DeviationLimits":
-        """Return what `deviation_weights` allows in both postures between which a cycle of the motion lies."""
+        """Return the deviation that `deviation_weights` allows at both ends of a cycle of the motion."""
         rows = geometry_rows(motion)
         weights = deviation_weights(space, motion.q[rows], most)
         return cls(np.maximum(weights[:-1], weights[1:]), int(rows[1] - rows[0]))

@@ -134,7 +134,7 @@ class Candidates:
     def found(
         self, rng: np.random.Generator, effort: int, report: Callable[[float], None] = lambda share: None
     ) -> Excitation:
-        """Return the best motion of `effort` tries; `report` gets the share of them that is done.
+        """Return the best motion of `effort` tries; `report` gets the share of tries that are done.
 
         Raises:
             UserError: no draw is safe.

@@ -178,7 +178,7 @@ class Space:
     """Distances of an arm's links from table, obstacles and each other; see `collision` for the geoms that count.
 
     An arm is not exactly where it was planned to be. If joint j deviates by e_j rad, a distance shrinks by at most
-    sum_j lever_j |e_j|, to first order: the lever is how far a rad of that joint moves the link, from the Jacobian at
+    sum_j lever_j |e_j|, to first order. The lever is the link's motion per rad of that joint, from the Jacobian at
     that posture. A planned posture must leave room for DEVIATION of all joints, and a plan is followed only as long
     as the arm is within its `DeviationLimits`, which are larger where there is room. So no plan is refused for a
     deviation that the arm never has, and an arm that deviates stops before it comes near.
@@ -296,7 +296,7 @@ class Space:
         return mujoco.mj_geomDistance(self.model, self.data, a, b, 1.0, None)
 
     def _apart(self) -> np.ndarray:
-        """Return the distance of each pair (K,) m; beyond FAR_M that of their bounding spheres."""
+        """Return the distance of each pair (K,) m; beyond FAR_M the distance of the bounding spheres."""
         a, b = np.array(self.pairs, dtype=int).reshape(-1, 2).T
         radius, place = self.model.geom_rbound, self.data.geom_xpos
         out = np.linalg.norm(place[a] - place[b], axis=1) - radius[a] - radius[b]

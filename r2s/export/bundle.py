@@ -106,7 +106,7 @@ def check_with_own_runtime(folder: Path) -> None:
 
 
 def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str, Any]) -> None:
-    """Copy policy.onnx; its actions have to equal those of policy.pt, and its metadata the contract."""
+    """Copy policy.onnx; its actions have to equal policy.pt's, and its metadata the contract."""
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -166,7 +166,7 @@ def one_file(control: Controller) -> str:
 def law_source(law: Any) -> tuple[str, str]:
     """Return name and source of a control law as plain Python, without decorators.
 
-    Functions and numbers that it uses lie beside it in a function that returns the law: so their names are its own.
+    A function that returns the law contains the functions and numbers that the law uses, so their names stay local.
 
     Raises:
         UserError: it uses names other than functions, numbers, NumPy's `np` and builtins.

@@ -88,7 +88,7 @@ def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
 
 
 def plans(contract: Mapping[str, Any]) -> list[Item]:
-    """Return what a plan is, and how to make one."""
+    """Return the text that says how to make a plan."""
     goal, n = contract["goal"], len(contract["joints"])
     rows, columns = goal["shape"]
     words = [

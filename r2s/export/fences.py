@@ -90,7 +90,7 @@ class PolicyThread:
         self._seen.append((motion, seen, setpoint))
 
     def newest(self, motion: int) -> np.ndarray | None:
-        """Return the command that was not taken yet, None if there is none of this motion."""
+        """Return this motion's newest command, None if it was taken already."""
         try:
             of, command = self._made.pop()
         except IndexError:

@@ -29,7 +29,7 @@ def is_number(value: Any) -> bool:
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:
-    """Return (n,) of a list of a contract, whose null stands for `none`: JSON has no infinity."""
+    """Return a list of a contract as (n,); null becomes `none`, because JSON has no infinity."""
     return np.array([none if v is None else v for v in values], dtype=float)
 
 
@@ -247,7 +247,7 @@ class Driver:
         return out + self._push(mobility, ddq, low, high), True
 
     def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
-        """Return the speed (n,) rad/s that the safety filter allows at q (n,) rad, up or down."""
+        """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad, in one direction."""
         return self._allowed(self._j["q_high"] - q if up else q - self._j["q_low"])
 
     def _allowed(self, way: np.ndarray) -> np.ndarray:

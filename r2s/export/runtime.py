@@ -67,7 +67,7 @@ def load(folder: str | Path) -> dict[str, Any]:
     """Return the contract of a bundle that is whole.
 
     Raises:
-        BundleError: a file is missing or was changed, or the contract says what cannot be.
+        BundleError: a file is missing or was changed, or the contract contradicts itself.
     """
     path = Path(folder) / "contract.json"
     try:
@@ -266,8 +266,8 @@ class Runtime:
         A goal outside the region of the training's goals brings a moving arm to rest.
 
         Raises:
-            BundleError: one of them is of another size, there is no plan, the motion is over, or, in its first cycle,
-                the goal is outside the region of the training's goals, or the arm not at rest where motions begin.
+            BundleError: an argument has another size, there is no plan, or the motion is over. In its first cycle
+                also: the goal is outside the training's region, or the arm is not at rest where motions begin.
         """
         if self.done:
             raise BundleError(f"the motion is over, {self.driver.stopping}: call reset before the next one")
@@ -303,7 +303,7 @@ class Runtime:
             return self.driver(q, dq, tau_J_d, command, placed=True)
 
     def _admit(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> None:
-        """Refuse a start or goal that the training did not have; stop at such a goal in a motion."""
+        """Refuse a start or goal outside the training's region; during a motion, stop at such a goal."""
         if self._cycle == 0:
             home = self.contract["start"].get("q_rad") if self._follower is None else self._follower.start
             check_start(self.contract["start"], np.array(home), q, dq)

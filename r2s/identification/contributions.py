@@ -1,7 +1,8 @@
 """What each of several recordings adds to an identification, and whether one contradicts the others.
 
-Each is left out in turn, and fitted alone, by a few steps on torque that start at the fit to all. Rows are weighted
-by what a recording's own fit leaves: the residual of a fit to contradicting recordings is no noise.
+For each recording there are two more fits: one without it, and one to it alone. Both take a few steps on torque from
+the fit to all. The residual of a recording's own fit weights its rows, because a fit to contradicting recordings
+leaves more than noise.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,7 @@
 """The 95 % widths that an identification of a recording will have, before it runs.
 
 A few steps of least squares on torque with all terms give the noise and the point at which the model is linearized.
-The widths are those of the identification's own posterior there. What takes an identification its time is left out:
+The identification's own posterior at this point gives the widths. The slow parts of an identification are left out:
 families, selection of terms, convergence, replays, breakaway.
 """
 

@@ -231,7 +231,7 @@ def formulate(s: State) -> State:
 
 
 def known_values(space: ParameterSpace, how: Settings, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return what the user states of a space's values and what an earlier identification knows of the others."""
+    """Return the prior of a space's values: stated by the user, or else from an earlier identification."""
     stated = stated_prior(space, how.stated, prior)
     if how.known is None:
         return stated
@@ -346,8 +346,8 @@ def _run(
 def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     """Return whether v (P,) explains torque clearly worse than u (P,), the fit to torque.
 
-    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. The
-    relative error of that sum is ALIKE, that of the number of independent rows.
+    Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. The sum
+    itself has the relative error ALIKE, because the number of independent rows is uncertain.
     """
     fitted = (problem.torque_residual(u[None])[0] ** 2).sum()
     rise = (problem.torque_residual(v[None])[0] ** 2).sum() - fitted

@@ -1,9 +1,9 @@
 """What is known of an arm's parameters before its data: a normal distribution of named values.
 
 It comes from an earlier identification, from recordings of another kind of torque, or from the user (stated.py).
-Between two dates friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2), so the earlier posterior is
-widened by the drift before it is a prior (the prediction of a Kalman filter; Kalman 1960), and the drift itself is
-what the data leave of w.
+Between two dates friction and offsets drift: x_now = x_then + w with w ~ N(0, drift^2), so the drift widens the
+earlier posterior before it becomes a prior (the prediction of a Kalman filter; Kalman 1960). The reported drift is w
+given the data of both dates.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -38,7 +38,7 @@ class Known:
 
     @staticmethod
     def of(space: ParameterSpace, x: np.ndarray, samples: np.ndarray, drift: float = 0.0) -> "Known":
-        """Return what an identification knows: values x (P,) and draws (S, P) of its posterior.
+        """Return the result of an identification: values x (P,) and draws (S, P) of its posterior.
 
         drift: standard deviation of the change since of friction, relative; of offsets and of what may be 0, relative
             to the deviation among arms, if the value is smaller.
@@ -113,8 +113,8 @@ def coordinates(names: Sequence[str], x: np.ndarray) -> np.ndarray:
 def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.ndarray) -> pd.DataFrame:
     """Return a row per value that may drift: then, now, and the difference with its 95 % interval, SI units.
 
-    The difference is w of x_now = x_then + w given both dates' data. With then ~ N(m, P), Q = diag(drift^2),
-    S = P + Q, and now ~ N(x, V) after the data: w ~ N(G (x - m), G V G^T + P - P S^-1 P), G = Q S^-1 (the
+    The difference is w in x_now = x_then + w, given the data of both dates. With then ~ N(m, P), Q = diag(drift^2), S
+    = P + Q, and now ~ N(x, V) after the data: w ~ N(G (x - m), G V G^T + P - P S^-1 P), G = Q S^-1 (the
     Rauch-Tung-Striebel smoother, AIAA Journal 3(8), 1965).
 
     Args:

@@ -1,6 +1,6 @@
 """The 95 % widths that a recording of a planned motion will give, for choosing the motion.
 
-The parameters, their bounds and their prior are those of an identification, linearized at the nominal arm.
+Parameters, bounds and prior are the same as in an identification, linearized at the nominal arm.
 """
 
 from collections.abc import Sequence

@@ -21,7 +21,7 @@ class Linearized(Protocol):
         ...
 
     def linearize(self, u: np.ndarray) -> Iterable[tuple[np.ndarray, np.ndarray]]:
-        """Yield residual and Jacobian at u (P,) in parts: in all R rows of data, then those of the prior."""
+        """Yield residual and Jacobian at u (P,) in parts: first R rows of data, then the rows of the prior."""
         ...
 
 

@@ -58,7 +58,7 @@ class Problem:
         prior: Mapping[str, ArrayLike],
         extra: Sequence[ExtraResidual] = (),
     ) -> "Problem":
-        """Return the problem with prior {"offset": sigma or (n,), ...}, SI units; that of other blocks is flat."""
+        """Return the problem with prior {"offset": sigma or (n,), ...}, SI units; others get a flat one."""
         return cls(data, torque_data, data.space.expand(prior, np.inf).astype(float), tuple(extra))
 
     @property
@@ -103,7 +103,7 @@ class Problem:
         return replace(self, sigma=sigma)
 
     def without_prior(self, names: Sequence[str]) -> "Problem":
-        """Return the problem with a flat prior of these values, of which an extra residual knows more."""
+        """Return the problem with a flat prior of these values, because an extra residual determines them."""
         return replace(self, sigma=np.where(np.isin(self.space.names, names), np.inf, self.sigma))
 
     def with_torque_data(self, torque_data: TorqueResidual) -> "Problem":

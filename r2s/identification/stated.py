@@ -89,7 +89,7 @@ def fixed_in(space: ParameterSpace, stated: Stated) -> ParameterSpace:
 
 
 def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, ArrayLike]) -> Known | None:
-    """Return what is stated of the values in a space by mean and width, or None.
+    """Return the prior that the user states for values of a space by mean and width, or None.
 
     A mean without a width has the width of `prior`, a width without a mean is about the nominal value. The width, a
     standard deviation, of a logarithmic parameter is relative to its mean.
@@ -129,7 +129,7 @@ def stated_prior(space: ParameterSpace, stated: Stated, prior: Mapping[str, Arra
 
 
 def with_terms_of(stated: Stated, terms: Sequence[str], blocks_of: Any, every: Sequence[str]) -> list[str]:
-    """Return the terms and those of the stated parameters; one parametrization of the tensors replaces the other."""
+    """Return the terms and the stated parameters' terms; one parametrization of the tensors replaces the other."""
     out = list(terms)
     for block in stated:
         own = [t for t in every if block in blocks_of(t)]

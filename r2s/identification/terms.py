@@ -1,4 +1,4 @@
-"""Terms of the model beside friction: which parameters they estimate, with which bounds and prior."""
+"""Terms of the model besides friction: which parameters they estimate, with which bounds and prior."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -96,7 +96,7 @@ def search_space(
 def scaled_bounds(
     bounds: Mapping[str, Sequence[ArrayLike]], robot: Robot, recording: Recording
 ) -> dict[str, Sequence[ArrayLike]]:
-    """Return bounds in SI units; those of torque-like parameters are given as shares of the largest torque.
+    """Return bounds in SI units; torque-like parameters are given as shares of the largest torque.
 
     Motor torque contains all gear friction: 0.5 Nm in a small wrist, 50 Nm in an axis of an industrial arm. For it
     they reach at least up to that torque.
@@ -116,8 +116,8 @@ def scaled_prior(
 ) -> dict[str, ArrayLike]:
     """Return standard deviations in SI units, without the flat priors (None).
 
-    Those of torque-like parameters are given as shares of the largest torque; logarithmic ones have no unit. A
-    viscous coefficient of the arm's file is a guess: the prior is at least as wide as the nominal value.
+    Torque-like parameters are given as shares of the largest torque; logarithmic ones have no unit. A viscous
+    coefficient of the arm's file is a guess: the prior is at least as wide as the nominal value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():

@@ -55,12 +55,12 @@ class Unexplained:
         return mujoco_inverse_dynamics(model, self.m.q, self.m.dq, self.m.ddq)
 
     def fit(self, parts: np.ndarray) -> np.ndarray:
-        """Return the factors (K,) of torques (K, T, n) Nm that all joints share, beside their own friction."""
+        """Return the factors (K,) of torques (K, T, n) Nm that all joints share, besides their own friction."""
         rows = np.concatenate(self._apart([*parts, self.m.tau - self.need]))
         return np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0]
 
     def misfit(self) -> float:
-        """Return the square of tau minus the nominal torque over that of tau, beside each joint's own friction."""
+        """Return sum (tau - nominal torque)^2 / sum tau^2, after each joint's own friction is removed."""
         left, whole = np.square(np.concatenate(self._apart([self.m.tau - self.need, self.m.tau]))).sum(0)
         return float(left / max(whole, 1e-12))
 

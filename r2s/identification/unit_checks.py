@@ -1,7 +1,7 @@
 """Units, signs and joint order of a recording, judged by the arm's model.
 
-dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with that of the nominal
-arm for the same motion. The judgement is coarse on purpose: a nominal arm that is wrong by a factor of 3, an
+dq is compared with the slope of q, its integral with q (r2s/recordings/clock.py), and torque with the nominal arm's
+torque for the same motion. The judgement is coarse on purpose: a nominal arm that is wrong by a factor of 3, an
 undeclared payload, any friction and sensor offsets pass; a factor of 1000, of 57.3 or of -1, another joint order or
 mounting do not. r2s refuses a recording only if a correction leaves at most a quarter of what is unexplained.
 """
@@ -157,7 +157,7 @@ def _swapped(pairs: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _check_torque(
     robot: Robot, m: Moments, recording: Recording, moved: np.ndarray
 ) -> tuple[float | None, np.ndarray | None]:
-    """Compare the torque with that of the nominal arm for the same motion; return misfit and shares of `Judged`."""
+    """Compare the torque with the nominal arm's for the same motion; return misfit and shares of `Judged`."""
     gravity = recording.torque != "commanded"
     most = np.quantile(np.abs(recording.tau), 0.99, axis=0) / robot.tau_max
     left = Unexplained(robot, m, gravity)

@@ -1,6 +1,7 @@
 """A verdict on a recording before it is fitted: a line per check, pass, warn or fail, and the widths to expect.
 
-A fail is what the checks of an identification refuse (checks.py, unit_checks.py); the lines show what they measured.
+A recording fails if the checks of an identification refuse it (checks.py, unit_checks.py); the lines show what they
+measured.
 """
 
 from collections.abc import Mapping, Sequence

@@ -182,7 +182,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; seed: of it and of those that follow."""
+        """Start a new episode; `seed` sets the random numbers of this and all later episodes."""
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()

@@ -16,7 +16,7 @@ from r2s.learning.learner import EntropyLearner, sample_tanh
 
 
 class TQC(EntropyLearner):
-    """Learner of a stochastic policy with quantile critics, whose highest atoms are dropped from the target.
+    """Learner of a stochastic policy with quantile critics; the target drops their highest atoms.
 
     Args:
         scale, action_scale, shared: see `EntropyLearner`.

@@ -233,7 +233,7 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 @njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
-    """Make the velocities found, coming (n,) rad/s, the guess; return whether the old one was right."""
+    """Set the guess to the velocities found, coming (n,) rad/s; return whether the old guess was right."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
     guess[LINEAR] = force + guess[SLOPE] * (rate - guess[NEXT])

@@ -1,17 +1,17 @@
 """What the driver does with a force when it stops an arm whose tip presses: hold, release or retreat.
 
-Without a decision the command falls to zero and the surface does the rest: it gives back F^2 / 2k, throws the tip off
-by up to F / k, and joint friction keeps up to `hidden` of the force (push_limit.py). So the target of a stop is
+If a stop only removed the command, the surface would give back F^2 / 2k and throw the tip off by up to F / k, and
+joint friction would keep up to `hidden` of the force (push_limit.py). So the target of a stop is
 
 - hold: the force that the limit of pushes estimated as the stop began, J^T R. Nothing moves.
-- release: the tip moves outwards at LEAVE until the force is gone, by a velocity loop on the joint speeds of least
-  kinetic energy, -LEAVE m M^-1 J^T, with what resists and joint friction fed forward, and an integral of up to the
-  same friction for an arm that has more. The friction h of joints that
-  move outwards pushes inwards, so R = F - h. The motion ends at R = RELEASED - SLIDES h of the modelled h, that is at
-  F <= RELEASED + (1 - SLIDES) h if friction is at most the modelled one; with SLIDES of it the tip is in the air.
+- release: the tip moves outwards at LEAVE until the force is gone. A velocity loop follows the joint speeds of least
+  kinetic energy, -LEAVE m M^-1 J^T. Resistance and joint friction are fed forward, and an integral adds up to the
+  same friction for an arm that has more. The friction h of joints that move outwards pushes inwards, so R = F - h.
+  The motion ends at R = RELEASED - SLIDES h of the modelled h, that is at F <= RELEASED + (1 - SLIDES) h if friction
+  is at most the modelled one; with SLIDES of it the tip is in the air.
 - retreat: release, and RETREAT_M farther.
 
-All of it goes through the limits of pushes, speeds and accelerations, and is over after LEAVES_S.
+The limits of pushes, speeds and accelerations apply to every stop, and it ends after LEAVES_S.
 """
 
 import numpy as np

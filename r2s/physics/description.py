@@ -1,7 +1,7 @@
 """Robot descriptions in three formats: MJCF, URDF and SDF with the same links, limits and friction.
 
 All values come from the robot's file, except identified masses, centres, tensors and rotors. The frame of a link in
-URDF and SDF is that of its joint at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo Fortress
+URDF and SDF is its joint's frame at angle zero, so tensors need no rotation (ignition-physics 5.1 of Gazebo Fortress
 misreads a rotated inertial frame).
 """
 
@@ -99,7 +99,7 @@ def coulomb_viscous(robot: Robot, dynamics: Dynamics) -> tuple[np.ndarray, np.nd
 def write_description(folder: Path, robot: Robot, dynamics: Dynamics) -> list[str]:
     """Write arm.xml (MJCF), arm.urdf and arm.sdf into `folder`; return a line for each format that cannot hold it.
 
-    An arm.sdf of an arm with armature is left out without a line: SDF has no rotors, and most arms have some.
+    An arm with armature gets no arm.sdf, without a message: SDF has no rotors, and most arms have some.
     """
     folder.mkdir(exist_ok=True)
     write_mjcf(folder / "arm.xml", robot, dynamics)

@@ -291,7 +291,7 @@ def family(name: str) -> Family:
     """Return a built-in family by its name, or import one by its dotted path.
 
     Raises:
-        UserError: no such family, or a parameter of it has another unit or scale in another family.
+        UserError: the family is unknown, or another family has one of its parameters with another unit or scale.
     """
     name, names = str(name), [f.name for f in FAMILIES]
     if name in names:

@@ -110,7 +110,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
 
 @njit(cache=True, error_model="numpy")
 def task_stiffness(command, error, tilt, begins, parameters, memory):
-    """Set the stiffness (4,) in memory to the one asked for, as far as the tank pays for it."""
+    """Set the stiffness (4,) in memory to the requested one, as far as the tank has energy for it."""
     K, asked, new = memory[STIFFNESS : STIFFNESS + SPRINGS], np.empty(SPRINGS), np.empty(SPRINGS)
     at, given = int(parameters[STIFFNESS_AT]), 4 if parameters[TASK_AXES] == 6.0 else 3
     for k in range(SPRINGS):
@@ -271,7 +271,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
     command: displacement of the target (3) m and, with six axes, (3) rad as a rotation vector, then stiffness (3) N/m
     and, with six axes, (1) Nm/rad, where the action has them. Then the task's target: position (3), and where it has
     them velocity (3) m/s and rotation vector from home (3) rad. For hybrid: see `normal_force`; with APPROACH the
-    force grows with the distance to a target that moves into a surface, until it is the one asked for. A target that
+    force grows with the distance to a target that moves into a surface, until it is the requested one. A target that
     SLIDES is that of the middle of a period, and behind the contact the command has what pulls at the tip (3) N.
     """
     n, begins, a, at = len(q), memory[BEGUN] == 0.0, int(parameters[TASK_AXES]), STIFFNESS + SPRINGS

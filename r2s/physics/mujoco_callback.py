@@ -275,7 +275,7 @@ def _friction(sizes, user, q, dq, forces, places):
 
 @njit(error_model="numpy")
 def _control(n, user, fields):
-    """Replace the applied torques by those of the law; n varies, for a constant one it would compile a minute."""
+    """Replace the applied torques by the law's. n is a variable: a constant one would compile for a minute."""
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
     q, dq = carray(_as_doubles(fields[0]), (n,)), carray(_as_doubles(fields[1]), (n,))
     applied, kept = carray(_as_doubles(fields[2]), (n,)), carray(_as_doubles(fields[5]), (KEPT, n))

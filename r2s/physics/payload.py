@@ -117,9 +117,9 @@ def _of_file(name: str, path: Path) -> Any:
 
 
 def _tensor(name: str, value: Any, mass: float, most: tuple[float, float]) -> np.ndarray:
-    """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is that of a sphere of water.
+    """Return the tensor (3, 3) kg m^2 of 3 moments or 6 elements; the default is a sphere of water's.
 
-    No moment is larger than that of the largest payload with its mass twice as far away as its centre may be.
+    The largest moment allowed is that of the largest mass, twice as far away as a centre may be.
     """
     if value is None:
         return sphere_inertia(np.array(mass))

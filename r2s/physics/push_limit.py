@@ -22,8 +22,8 @@ surface pushes a sliding tip inwards with up to mu c F, c = m |T J M^-1 J^T n| w
 mu c) F takes the place of F: see `PushLimit.bound`.
 
 Both rules are half-spaces of torques with the same normal J M^-1. The limit sends the nearest torque by Gauss'
-principle, so it subtracts J^T f. The acceleration bounds of the joints (safety_filter.py) hold as well: the force f
-is the one with which their law sends a torque within the limit, found by regula falsi.
+principle, so it subtracts J^T f. The acceleration bounds of the joints (safety_filter.py) hold as well: regula falsi
+finds the force f with which their law sends a torque within the limit.
 """
 
 from dataclasses import dataclass
@@ -120,8 +120,8 @@ def push_limit(
     Args:
         robot: with a tool. friction: (n,) Nm, level of each joint's friction.
         force_max: N. speed_near: m/s; null: what lets a rigid surface of 1e5 N/m add force_max.
-        plane: point and normal; None: a table below the tip at home. asked: N, largest force that the task asks for.
-        stop: of STOPS; None: release, whose derivation docs/explanation/safety.md has.
+        plane: point and normal; None: a table below the tip at home. asked: N, largest force of the task.
+        stop: of STOPS; None: release (contact_stop.py).
 
     Raises:
         UserError: a value out of range, the robot has no tool, or the force is below what joint friction may hide
@@ -231,7 +231,7 @@ def push_bound(limit, arm, kinematics, last, friction, work):
 
 @njit(cache=True, error_model="numpy")
 def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
-    """Change the torques `out` (n,) Nm by the bounds of the joints, which see the contact, and by those of pushes.
+    """Limit the torques `out` (n,) Nm: joint accelerations, with the contact as a load, and pushes.
 
     Args as for `push_bound`, and share and limits as for `filter_torque`. Returns whether `out` changed.
     """

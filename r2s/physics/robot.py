@@ -2,8 +2,8 @@
 
 r2s commands joint torques, so it uses a file's joints and links, and drops actuators, sensors, keyframes, free
 objects, gravity compensation and contacts. The file's damping and frictionloss are nominal values of the friction law
-(dynamics.py), as its armature is that of the rotors; the rigid model has neither. Any serial arm of hinge joints
-works: `robot.mjcf=FILE`.
+(dynamics.py), its armature of the rotors; the rigid model has none of them. Any serial arm of hinge joints works:
+`robot.mjcf=FILE`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -248,7 +248,7 @@ def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, 
 def _payload_max(
     model: mujoco.MjModel, ee: str, torque: np.ndarray, mass: float | None, far: float | None
 ) -> tuple[float, float]:
-    """Return `Robot.payload_max`: what is given, the rest in proportion to the reach from the second joint."""
+    """Return `Robot.payload_max`: the given value, or one in proportion to the reach from the second joint."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     sites = [model.site(i).name for i in range(model.nsite)]

@@ -48,7 +48,7 @@ def read_spec(path: Path, lock: Mapping[str, float] | None = None) -> tuple[mujo
 
 
 def strip(spec: mujoco.MjSpec) -> None:
-    """Leave out what a file says of a simulation, not of the arm: motors, sensors, keyframes, switches of physics.
+    """Remove what describes a simulation and not the arm: motors, sensors, keyframes, switches of physics.
 
     The damping of a motor stays, at its joint; for its rotor see `rotors`. The file must have passed `check_arm`.
     """

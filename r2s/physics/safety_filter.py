@@ -40,7 +40,7 @@ FADED = 0.82  # share of dq_max at which the policy's torque has faded out; it f
 Q_MARGIN, Q_FADE_SHARE = 0.1, 0.6
 ENVELOPE_SHARE = 0.55  # share of the position-dependent velocity limit of an FR3 that the filter uses
 # s, duration of a braking ramp of the allowed speed. With 0.1 s the torque of the base reached 60 Nm, fell at 1 Nm/ms
-# too late, and threw a stretched elbow forward (docs/explanation/safety.md).
+# too late, and threw a stretched elbow forward.
 BRAKE_S = 0.15
 TOLERANCE = 1e-9  # rad/s^2, tolerance of the acceleration bounds
 PIVOTS = 5  # block pivoting rounds before single pivots, which always terminate (Murty 1974)

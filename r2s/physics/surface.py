@@ -1,4 +1,4 @@
-"""A tool's tip and the surface it touches: what a contact needs to be computed, simulated or identified.
+"""A tool's tip and the surface that it touches: parameters of a contact, for simulation and identification.
 
 Normal force (Hunt and Crossley, ASME J. Appl. Mech. 1975): F = K d^e (1 + c d') >= 0, of the penetration d of the
 tip, with K = k / (1 mm)^(e - 1), so that k d is the force at 1 mm for every exponent. Tangential force: mu F in

@@ -13,9 +13,9 @@ DT = 1e-3  # s, grid on which recordings of different rates meet, and on which r
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """Return recordings one after another; those of different rates are resampled to 1 kHz first.
+    """Return recordings one after another; recordings of different rates are resampled to 1 kHz first.
 
-    Signals that not all of them have are dropped, and so is the period: `Recording.in_phase` finds that of the whole.
+    Signals that not all recordings have are dropped, and so is the period; `Recording.in_phase` finds the common one.
 
     Raises:
         UserError: different kinds of torque or numbers of joints.

@@ -20,8 +20,8 @@ class Lateness:
     """Lateness of dq against the derivative of q.
 
     Attributes:
-        s: (n,) s; nan: dq is no such derivative, or the joint does not move. sigma: (n,) s, its standard deviation.
-        filtered: whether dq is behind a first-order filter of that time constant; otherwise it is delayed.
+        s: (n,) s; nan: dq is not the derivative of q, or the joint does not move. sigma: (n,) s, its standard
+        deviation. filtered: whether s is the time constant of a first-order filter of dq; otherwise it is a delay.
     """
 
     s: np.ndarray
@@ -47,8 +47,8 @@ def from_q(joints: int) -> Lateness:
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
     """Return the lateness of dq, by least squares below `cutoff_hz`, where a filter acts like a delay.
 
-    A dq is often smoother than q: it is worth more with its lateness corrected than a derivative. Whether a filter
-    or a delay made it late is what leaves less between them.
+    A dq is often smoother than q: it is worth more with its lateness corrected than a derivative. Of a filter and a
+    delay, the one that leaves the smaller difference counts.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints

@@ -361,7 +361,7 @@ def save_npz(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def declared_torque(torque: str | None) -> str:
-    """Return `torque` if it is one of `TORQUES`, else raise a UserError that explains them."""
+    """Return `torque`, or raise a UserError that explains `TORQUES` if it is none of them."""
     if torque in TORQUES:
         return str(torque)
     meaning = (

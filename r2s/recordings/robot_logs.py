@@ -99,7 +99,7 @@ def bag_table(
 
     t counts from the first message, by header stamps, or by bag time if all stamps are zero. Messages without one of
     the joints (a gripper on the same topic) are ignored, late ones sorted, repeated ones dropped. The scalar
-    `reader_note` counts messages that were left out for a stamp of 0, or at the start for a lack of values.
+    `reader_note` counts messages that were left out: with a stamp of 0, or without values at the start.
 
     Args:
         path: .bag (ROS 1), .db3 or .mcap, or the folder of a ROS 2 bag.

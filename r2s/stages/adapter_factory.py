@@ -29,7 +29,7 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings without contact that an identification was made from, as far as they still exist."""
+    """Return the recordings without contact that an identification was made from, if they still exist."""
     from r2s.recordings.readers import read
 
     folder = run_folder(calibration)

@@ -81,7 +81,7 @@ def dynamics_of(robot, friction, inertia):
 def make_task(cfg, robot, dynamics, safety=None):
     """Return the task of conf/task with the model of the arm, the controller of conf/control and `safety`.
 
-    safety: of a later run, whose values replace those of the config.
+    safety: settings of a later run, which replace the config's.
     """
     if "control" not in cfg:
         raise UserError("control: an earlier r2s wrote this config, without control=; train the policy again")
@@ -268,7 +268,7 @@ def make_controller(cfg, robot, task, dynamics):
 def open_run(cfg, overrides, inputs=(), parents=()):
     """Return the open run folder of this job, with its trackers started; a resumed run keeps its group.
 
-    inputs: files that it reads. parents: run folders that it starts from; both beside those that the config names.
+    inputs: files that it reads. parents: run folders that it starts from. Both are in addition to the config's.
     """
     from omegaconf import OmegaConf
 

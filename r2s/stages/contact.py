@@ -28,7 +28,7 @@ def contact_data(cfg, robot, file):
     file: `FileData` of the config, for the columns.
 
     Raises:
-        UserError: no tool, no commanded torque, no free motion that says what the arm is, or a wrong file.
+        UserError: no tool, no commanded torque, no free motion to identify the arm, or a wrong file.
     """
     from r2s.identification.checks import check_recording
 

@@ -309,7 +309,7 @@ def record_ramps(cfg, robot, timing):
 def record_arm(cfg, robot, run, motion):
     """Return training motion, validation motion and ramps of an arm; a resumed run reads the files that it has.
 
-    The cycles' durations are in timing.csv, also those of a motion that was stopped.
+    timing.csv gets the durations of the cycles, also of a stopped motion.
 
     Args:
         run: the run folder of the files. motion: the first excitation; None: it is optimized.

@@ -1,4 +1,4 @@
-"""Files that a job reads, whose SHA-256 its meta.json keeps, and the run folders that it starts from."""
+"""Files that a job reads and run folders that it starts from; meta.json keeps the files' SHA-256."""
 
 from collections.abc import Iterable
 from pathlib import Path

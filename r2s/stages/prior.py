@@ -1,4 +1,4 @@
-"""What stage=identify knows beforehand: identify.prior.PARAMETER.mean= and an earlier run, identify.from=RUN."""
+"""The prior of stage=identify: identify.prior.PARAMETER.mean=, and an earlier run, identify.from=RUN."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,9 +62,9 @@ def make_settings(cfg, torque, earlier=(), last=True):
     """Return the `Settings` of an identification with this kind of torque.
 
     Args:
-        earlier: each an `Earlier`. Of another kind of torque it gives the links; of the same kind all values, and
-            friction family and terms, because then and now are values of one model.
-        last: whether it is the last of several kinds, which what is stated of friction and sensors is about.
+        earlier: each an `Earlier`. If its kind of torque is another, it gives the links. If it is the same, it gives
+            all values, the friction family and the terms, so that then and now are values of one model.
+        last: whether it is the last of several kinds of torque; stated friction and sensors belong to the last.
     """
     from r2s.identification.known import BODY, Known, block_of
     from r2s.identification.settings import Settings
@@ -104,7 +104,7 @@ def make_settings(cfg, torque, earlier=(), last=True):
 
 
 def check_known(robot, nominal, recording, settings):
-    """Raise UserError if what is stated does not fit the arm, or is of no value that a recording shows."""
+    """Raise UserError if a stated value does not fit the arm, or no recording shows it."""
     from r2s.identification.stated import check_stated, stated_prior
     from r2s.identification.terms import scaled_prior, search_space
     from r2s.physics.dynamics import with_family
@@ -117,7 +117,7 @@ def check_known(robot, nominal, recording, settings):
 
 
 def start_of(nominal, earlier, torque):
-    """Return the dynamics from which an identification starts: those of an earlier run, or only its links."""
+    """Return the dynamics from which an identification starts: all of an earlier run's, or only its links."""
     arm = earlier.arm
     if earlier.torque == torque:
         return arm

@@ -1,4 +1,4 @@
-"""config.yaml of a run folder, which may be anybody's: r2s calls its own parts only, and those of `trust=`."""
+"""config.yaml of a run folder. It may be anybody's, so r2s calls only its own parts and the parts of `trust=`."""
 
 import os
 import re

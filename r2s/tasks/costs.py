@@ -24,7 +24,7 @@ MOST = 50.0  # largest multiplier: a cost that no policy holds may not silence t
 
 
 def excess_force(robot: Robot, task: Any, state: State, goals: np.ndarray) -> np.ndarray:
-    """Return (m,) N, the force on the surface beyond the one asked for."""
+    """Return (m,) N, the force on the surface beyond the requested one."""
     exerted = task.forces(state, goals)
     return (exerted[:, 0] - exerted[:, 1]).clip(0.0)
 

@@ -81,15 +81,16 @@ class PressTask(SurfaceTask):
         """Return the target (m, 6) of an impedance, m and m/s: place, and direction of friction.
 
         The place moves from the start along the normal through the nominal plane, until the spring to a surface at
-        the farthest allowed place has the larger force. Its velocity is so small that the feedforward of friction is
-        that of joints about to move: against the normal while the force rises, with it after a step down.
+        the farthest allowed place has the larger force. Its velocity only gives the direction in which joints are
+        about to move, for the feedforward of friction: against the normal while the force rises, along it after a
+        step down.
         """
         share = np.where(goals[:, 7] < goals[:, 6], ((t - self.step_s) / REVERSAL_S).clip(0.0, 1.0), 0.0)
         place = self.at(t, goals) - self.depth(t, goals)[:, None] * goals[:, NORMAL]
         return np.concatenate([place, (self.creep * (2.0 * share - 1.0))[:, None] * goals[:, NORMAL]], axis=1)
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the one asked for (a step)."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested one (a step)."""
         before = state.t < self.step_s + 0.5 / self.ctrl_hz
         return self.pressed(state, goals, np.where(before, goals[:, 6], goals[:, 7]))
 
@@ -99,7 +100,7 @@ class PressTask(SurfaceTask):
         """Return the force error (m,) N, and the reward terms (m, 5).
 
         force -tanh(error / 5 N); precision 1 - tanh(error / 5 N) / 2 - tanh(error / 0.5 N) / 2; excess: -tanh of the
-        force beyond the one asked for / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        force beyond the requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond = -np.diff(self.forces(state, goals))[:, 0]
         error, excess = np.abs(beyond), np.tanh(beyond.clip(0.0) / HARD_N)

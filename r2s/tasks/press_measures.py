@@ -1,4 +1,4 @@
-"""The measures of task press, from the force against the surface and the one asked for."""
+"""The measures of task press, from the force against the surface and the requested force."""
 
 import numpy as np
 
@@ -44,7 +44,8 @@ def press_measures(episodes: Episodes, step: int, ctrl_hz: int) -> dict[str, flo
     force_rmse_x_N: RMS over episodes of the force error in the second before the step, and in the last one.
     overshoot_N: largest force beyond the new one, in the direction of the step, mean over episodes;
     overshoot_share: the same over the step. impact_N: mean of the largest force within IMPACT_S of the first
-    touch. contact: share of the time after it. success: see GOOD_N. Stopped episodes count in none but success.
+    touch. contact: share of the time after it. success: see GOOD_N. Stopped episodes count only in success, as
+    failures.
     """
     ended = ~np.isfinite(episodes.distance[:, -1])
     runs = episodes.force[~ended]  # type: ignore[index]

@@ -146,7 +146,7 @@ class Curriculum(Reward):
         return TERMS
 
     def weights(self, task: Any, progress: float, factor: float = 1.0) -> np.ndarray:
-        """Return the (5,) weights; `factor` multiplies that of the filter penalty."""
+        """Return the (5,) weights; `factor` multiplies the weight of the filter penalty."""
         start, end = self.anneal
         at = float(np.clip((progress - start) / max(end - start, 1e-9), 0.0, 1.0))
         pairs = (getattr(self, name) for name in TERMS[1:])

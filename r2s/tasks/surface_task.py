@@ -1,8 +1,8 @@
 """What tasks on a surface share: a nominal plane, a way down to it, an estimate of the force, its reward terms.
 
 The arm knows a nominal plane. The true one, its stiffness and its friction are part of the dynamics (`dr=contact`,
-`arm.surface`). Neither observation nor controller knows the true force: the estimate that a policy observes is made
-of q, dq and the commanded torque.
+`arm.surface`). Neither observation nor controller contains the true force. The policy observes an estimate from q, dq
+and the commanded torque.
 """
 
 from dataclasses import dataclass, field, replace
@@ -228,7 +228,7 @@ class SurfaceTask(BaseTask):
         return np.array(rows)
 
     def rest_of(self, path: np.ndarray) -> np.ndarray:
-        """Return what a goal has of its path (k, 3) m behind the start posture."""
+        """Return the part of `path` (k, 3) m that a goal stores after its start posture."""
         return np.empty(0)
 
     def at(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:

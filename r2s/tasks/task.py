@@ -219,7 +219,7 @@ class Task(Protocol):
         ...
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
-        """Return (m, 2) N, the force against a surface and the one asked for; None: the task asks for none."""
+        """Return (m, 2) N, the force against a surface and the requested one; None: the task requests none."""
         ...
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:

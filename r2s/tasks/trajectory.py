@@ -155,8 +155,8 @@ class Paths:
     def strain(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
         """Return the largest ratio of a path's torque or acceleration to its limit.
 
-        The torque is that of the nominal model. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq),
-        where v is the speed allowed at q.
+        The torque is the nominal model's. The safety filter allows -RATE (v + dq) <= ddq <= RATE (v - dq), where v is
+        the speed allowed at q.
         """
         limits = self._limits  # type: ignore[attr-defined]
         shares = [np.abs(self._model.rigid(q, dq, ddq)) / (TORQUE * self.torque)]  # type: ignore[attr-defined]

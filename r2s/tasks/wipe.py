@@ -145,7 +145,7 @@ class WipeTask(SurfaceTask):
         return np.concatenate([goals[:, NORMAL], force[:, None]], axis=1)
 
     def target(self, t: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the target (m, 6) of an impedance, m and m/s: that of the middle of the period that begins at t."""
+        """Return the target (m, 6) of an impedance, m and m/s, in the middle of the period that begins at t."""
         middle, normal = t + 0.5 / self.ctrl_hz, goals[:, NORMAL]
         now, down = self.now(middle, goals), self.depth(middle, goals)[:, None] * normal
         return np.concatenate([now[:, X] - down, now[:, V]], axis=1)
@@ -178,7 +178,7 @@ class WipeTask(SurfaceTask):
         ]
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m, 2) N, the force against the nominal normal, and the one asked for."""
+        """Return (m, 2) N, the force against the nominal normal, and the requested one."""
         return self.pressed(state, goals, self.contact(state.t, goals)[:, 3])
 
     def judge(
@@ -188,7 +188,7 @@ class WipeTask(SurfaceTask):
 
         force -tanh(error / 5 N); path -tanh(distance / 1 cm); precision: product of 1 - tanh(error / 5 N) / 2 -
         tanh(error / 2 N) / 2 and the same of the distance with 1 cm and 3 mm; excess: -tanh of the force beyond the
-        one asked for / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
+        requested one / 10 N; smoothness -0.03 sum tanh(|ddq| / 10 rad/s^2); filter_penalty -limited.
         """
         beyond, normal = -np.diff(self.forces(state, goals))[:, 0], goals[:, NORMAL]
         offset = self.tip(state.q)[0] - self.at(state.t, goals)

@@ -38,10 +38,10 @@ WIPE = MeasureTable(
 
 
 def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, float]:
-    """Return one row of evaluations.csv; all but impact_N are of the steps from `begin` on, when the path runs.
+    """Return one row of evaluations.csv; only impact_N counts steps before `begin`, when the path starts.
 
     wiped, within_2N, within_3mm: share of the steps with a force and a path error that small; contact: share with
-    more than TOUCH_N. Steps of stopped episodes count in none of them. success: share of episodes wiped to SUCCESS.
+    more than TOUCH_N. Steps of stopped episodes count as misses. success: share of episodes wiped to SUCCESS.
     force_rmse_N, path_rmse_mm: RMS over the steps of the episodes that were not stopped. impact_N: mean over them of
     the largest force within IMPACT_S of the first touch.
     """

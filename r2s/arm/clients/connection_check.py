@@ -40,7 +40,7 @@ class ArmType:
     dtau_max: float = 1000.0
 
     def within(self, robot: Robot) -> Robot:
-        """Return the robot with limits of position and velocity inside the arm's as well as its own."""
+        """Return the robot with its position and velocity limits clipped to the arm's."""
         q_min, q_max = np.maximum(robot.q_min, self.q_min), np.minimum(robot.q_max, self.q_max)
         return replace(robot, q_min=q_min, q_max=q_max, dq_max=np.minimum(robot.dq_max, self.dq_max))
 

@@ -22,7 +22,7 @@ STOP_DISTANCE = 0.02  # rad, of a joint that brakes from 0.2 rad/s, the speed th
 
 
 def within_fr3(robot: Robot) -> Robot:
-    """Return the robot with limits inside an FR3's as well as its own, slowing down before them as an FR3 does.
+    """Return the robot with its limits clipped to an FR3's; it slows down before them as an FR3 does.
 
     An FR3 allows no speed in the last hundredths of a radian. The limits exclude that range and a stopping distance.
     """
@@ -37,7 +37,7 @@ def within_fr3(robot: Robot) -> Robot:
 
 
 def as_driven(robot: Robot) -> Robot:
-    """Return the robot with the limits under which its arm runs: those of `within_fr3` if they fit an FR3."""
+    """Return `within_fr3(robot)` if the robot's limits fit an FR3, else the robot."""
     limits = fr3_limits
     if robot.n != len(limits.Q_MIN) or robot.velocity_envelope is not None:
         return robot

@@ -73,7 +73,7 @@ class Control:
         stopped_by: why the last motion was aborted; None if it was not.
 
     Args:
-        arm: behind the box. Its state may carry the true external torque; otherwise that is zero.
+        arm: behind the box. Its state may carry the true external torque; otherwise it reports zero.
         version: of the FCI. faults, max_missed: see `Emulator`.
         desk: settings of `DESK` by name, such as {"m_ee": 0.73}, right or wrong; the arm itself does not change.
     """

@@ -7,7 +7,7 @@ Any `Arm` of r2s can be behind it. In lock-step, the default, the arm's clock ad
 commands give the same motion, bit for bit, however slow either side is. In real time it runs at 1 kHz, and an answer
 that arrives after its millisecond counts as missed. Manual start: `python -m r2s.arm.emulator --help`.
 
-It does not emulate a network's jitter, brakes, or what makes a motion safe beside a person.
+It emulates no network jitter, no brakes, and nothing that makes a motion safe beside a person.
 """
 
 import argparse

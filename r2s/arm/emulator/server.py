@@ -25,8 +25,8 @@ class Server:
     """Serves one client at a time, in one thread.
 
     A motion begins when the client has answered the newest state. Until then the arm stands still and the server
-    repeats states, because a client may skip some while it starts. That answer is not executed: a motion's first
-    command is the answer to the first state whose control_command_success_rate is above zero.
+    repeats states, because a client may skip some while it starts. The first answer is not executed. The first
+    command of a motion answers the first state with a control_command_success_rate above zero.
     """
 
     def __init__(self, server: socket.socket, control: Control, urdf: str, version: int, *, realtime: bool):

@@ -1,10 +1,10 @@
-"""The elastic variant of hidden twin: none of its difficulties is in the identification's model.
+"""The elastic variant of the hidden twin, with effects that the identification's models lack.
 
 Elastic gears that oscillate; friction with exact rest, a Stribeck curve of its own shape, warming, and ripple with
 the gears (elastic_joints.py); a control box that compensates a part of the friction from the measured speed; a clock
 that jitters and occasionally loses a packet; another delay and lag for each joint. Wrong masses, centres and tensors,
-offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot, whose parameters only
-this file reads. Seeds 0-9 are for development; seeds of 200 and above are for judging.
+offsets, cable drag, noise and quantisation are as in the rigid variant. `seed` draws a robot. Only this file reads
+its parameters. Seeds 0-9 are for development; seeds of 200 and above are for judging.
 
 One cycle of 1 ms: the control box adds its compensations to the command; elastic_joints.py integrates rotors and
 links in steps of at most 0.05 ms; the sensors read the motors up to half a millisecond before the end.

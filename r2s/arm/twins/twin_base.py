@@ -145,7 +145,7 @@ class TwinBase:
 
     @property
     def _link_q(self) -> np.ndarray:
-        """(n,) rad, of the links; with elastic gears it is not that of the motors."""
+        """(n,) rad, angles of the links; with elastic gears they differ from the motors' angles."""
         return self._q
 
     @property
@@ -182,7 +182,7 @@ class TwinBase:
 
 
 def _delay_cycles(extra_delay_s: float) -> int:
-    """Return the delay in cycles; raises UserError unless it is a whole number of them within the limit."""
+    """Return the delay in cycles; raise UserError unless it is a whole number within the limit."""
     check_number("arm.extra_delay_s", extra_delay_s, f"[0, {MAX_EXTRA_DELAY_S}]")
     cycles = round(extra_delay_s / SIM_DT)
     if abs(extra_delay_s / SIM_DT - cycles) > 1e-6:

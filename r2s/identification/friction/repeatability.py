@@ -1,10 +1,10 @@
 """Standard error of breakaway commands from repeated ramps.
 
 Friction scatters from ramp to ramp, with posture, load and cable. Two ramps per joint and direction give next to no
-variance estimate (Student's t with one degree of freedom: 12.7 deviations). So each variance is averaged with that of
-joints of the same size, which weighs as `PRIOR_REPEATS` repeats (Smyth, Stat. Appl. Genet. Mol. Biol. 3(1), 2004).
-That weight is small because the scatter of like joints differs, on twins by factors of 3 and more. If nothing was
-repeated, the scatter is `REPEATS`.
+variance estimate (Student's t with one degree of freedom: 12.7 deviations). So each variance is averaged with the
+variance of joints of the same size, which counts as `PRIOR_REPEATS` repeats (Smyth, Stat. Appl. Genet. Mol. Biol.
+3(1), 2004). These are few, because joints of the same size differ in scatter, on twins by factors of 3 and more. If
+nothing was repeated, the scatter is `REPEATS`.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Certainty(NamedTuple):
 
 
 def certainty(found: Breakaway, tau_max: np.ndarray) -> Certainty:
-    """Return the certainty of the mean commands; joints with the same torque limit, tau_max (n,) Nm, are alike.
+    """Return the certainty of the mean commands; joints with the same torque limit tau_max (n,) Nm share a scatter.
 
     If no like joint has a repeat, the scatter of all other joints is used, in proportion to tau_max.
     """

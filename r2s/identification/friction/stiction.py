@@ -66,7 +66,7 @@ def scan_breakaway(
     nthread: int,
     report: Report,
 ) -> np.ndarray:
-    """Return the breakaway torques (n, 2) Nm that replay the recording best; all else is that of `dynamics`.
+    """Return the breakaway torques (n, 2) Nm that replay the recording best; `dynamics` gives all else.
 
     The error jumps when a joint is released one step sooner. So all torques are scanned at once, each judged by its
     own joint: first over [0, largest], (n,) Nm, then ever finer about the best value. The coarse scan runs twice,

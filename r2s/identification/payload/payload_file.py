@@ -16,7 +16,7 @@ UNITS = {"mass": "kg", "centre": "m", "inertia": "kg m^2"}
 
 
 def save_payload(path: Path, robot: Robot, found: PayloadEstimate, source: Mapping[str, Any]) -> None:
-    """Write payload.yaml, payload_posterior.npz beside it, and of a robot with a tool its file with the mass.
+    """Write payload.yaml, payload_posterior.npz beside it, and the tool's file with its mass if the robot has one.
 
     `arm.payload`, `arm.declared_payload` and `data.declared_payload` read the file; tool.json is for `robot.tool`.
 

@@ -57,7 +57,7 @@ class Rows:
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 10), (K,) whose sum of squares of `slope @ phi + constant` is that of all rows with the best w."""
+        """Slope (K, 10), constant (K,): sum((slope @ phi + constant)^2) is all rows' at the best w."""
         gain, constant = self._eliminated
         h = self.body.T @ (self.body + self.arm @ gain)
         b = self.body.T @ (self.error + self.arm @ constant)
@@ -108,7 +108,7 @@ class LoadedTorque:
         return own.reweighted(self.arm.x, fitted=True)
 
     def body_torque(self, torque: TorqueResidual, payload: Payload | None) -> np.ndarray:
-        """Return (T, n, 10) Nm per standard parameter of a body beside `payload` at the end effector."""
+        """Return (T, n, 10) Nm per standard parameter of a body at the end effector, besides `payload`."""
         d, robot = self.arm.space.dynamics(self.arm.x), self.arm.robot
         d = dynamics_with_payload(robot, d, payload)
         # ten bodies of 1 kg, points and tensors, whose standard parameters are independent

@@ -230,7 +230,7 @@ class TorqueResidual:
 
         Per joint this is the RMS at a `fitted` x, else half of it, times the square root of the correlation length.
         If the encoder noise is known, the RMS is that noise, larger for short windows, plus a constant. At a `fitted`
-        x, the residual also decides what is an independent block.
+        x, the residual also sets the length of independent blocks.
         """
         r = self._seen_errors(x)
         own = {"block": blocks_of(self.motion.t, self._rigid.q, self._period, r)} if fitted else {}
@@ -261,7 +261,7 @@ class TorqueResidual:
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:
-    """Return the motion of a recording, `of` each piece in turn, and its rigid-body torque."""
+    """Return the motion of a recording, made by `of` piece by piece, and its rigid-body torque."""
     motions = [of(piece) for piece in pieces(recording, PIECE_S, 2 * EDGE_S - 1 / of.keywords["rate_hz"])]
     rigid = RigidBodyRows.joined([RigidBodyRows.of(robot, m, recording.torque) for m in motions])
     joined = type(motions[0]).joined(motions)

@@ -1,1 +1,1 @@
-"""Model structure, selected by cross-validation: the friction family and the terms beside it."""
+"""Model structure, selected by cross-validation: the friction family and the other terms."""

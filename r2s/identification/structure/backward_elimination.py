@@ -1,4 +1,4 @@
-"""Backward elimination: remove terms without which held-out torque is predicted as well.
+"""Backward elimination: remove a term if held-out torque is predicted as well without it.
 
 Gravity hardly distinguishes links from a payload, and fewer parameters generalize better: an arm with correct
 published links needs only a payload term, an arm without payload only link terms.

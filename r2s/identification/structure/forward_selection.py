@@ -36,7 +36,7 @@ def select_terms(
     usual = np.sqrt(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
-        """Return (blocks,) the mean square over joints that count alike."""
+        """Return (blocks,) the mean square over joints, each with the same weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ (1.0 / usual**2)
 
     chosen: list[str] = []

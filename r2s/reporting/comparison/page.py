@@ -96,7 +96,7 @@ def _sections(
 
 
 def reasons(parts: Mapping[str, Mapping[str, str]]) -> dict[str, Sequence[Item]]:
-    """Return a section per {heading: {run: reason}}, without the empty ones."""
+    """Return a section per heading of {heading: {run: reason}}; a heading without runs has none."""
     return {heading: [[f"{k}: {v}" for k, v in why.items()]] for heading, why in parts.items() if why}
 
 

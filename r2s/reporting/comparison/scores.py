@@ -94,7 +94,7 @@ def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.nd
 
 
 def at_edges(grouped: Grouped) -> list[str]:
-    """Return a line per number of algo= or reward= whose best value is the least or largest of three or more."""
+    """Return a line per setting of algo= or reward= whose best value is at an edge of three or more tried."""
     table, lines = measures_in(grouped), []
     by = table[table.selection[-1]]
     for algo in dict.fromkeys(group[0].algo for group in grouped.values()):

@@ -41,7 +41,7 @@ def interval(
 
 
 def paired(each: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return the means (DRAWS, A) of a paired bootstrap: it draws arms, and episodes of each arm, for all A alike.
+    """Return the means (DRAWS, A) of a paired bootstrap: it draws arms, and episodes of each arm, the same for all A.
 
     Args:
         each: per arm (E, A), a row per episode. rng: of the draws.

@@ -29,7 +29,7 @@ def torque_figure(
 ) -> Path:
     """Draw measured (T, n) and predicted {label: (T, n)} torque, Nm, over t (T,) s (figure 4 of the paper).
 
-    The figure has the first `LONGEST` seconds with pauses cut short; the RMSE is that of all rows.
+    The figure has the first `LONGEST` seconds with pauses cut short; the RMSE is over all rows.
     """
     colour, (clock, pauses) = colours(["measured", *predicted]), without_pauses(t)
     rows = np.flatnonzero(clock <= LONGEST)
@@ -136,7 +136,7 @@ def _band(
 
 
 def convergence_figure(path: Path, history: pd.DataFrame) -> Path:
-    """Draw the cost of each search over seconds, relative to its start; steps without such a cost are shaded.
+    """Draw the cost of each search over seconds, relative to its start; steps without a cost are shaded.
 
     Costs are comparable within one search only, because residuals are reweighted between searches.
     """

@@ -32,7 +32,7 @@ def identifiability(found: IdentificationResult) -> list[Item]:
 
 
 def _null_directions(found: IdentificationResult) -> list[Item]:
-    """Return the combinations that the prior decides; those of parameters kept nominal are only counted."""
+    """Return the combinations that the prior decides; combinations of parameters kept nominal are only counted."""
 
     def kept(parts: Mapping[str, float]) -> float:
         square = {name: part**2 for name, part in parts.items()}

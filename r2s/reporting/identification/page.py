@@ -53,7 +53,7 @@ FIGURE_WINDOW_S = 0.5  # s, at least: open-loop windows of the position figure
 
 
 class Evidence(NamedTuple):
-    """What a page shows beside the result.
+    """What a page shows besides the result.
 
     Attributes:
         pictures: {"torque": PNG, ...}. fastest: (n,) rad/s, speeds of the validation motion.

@@ -36,7 +36,7 @@ def verdict_table(verdict: Verdict) -> pd.DataFrame:
 
 
 def width_table(expected: Widths, n: int) -> pd.DataFrame:
-    """Return a row per parameter and a column per joint or link; those of the whole arm are in the first column."""
+    """Return a row per parameter and a column per joint or link; the first column also has the whole arm's."""
     space, unit, rows = expected.space, units(), {}
     for block in space.blocks:
         parts = (space.block(x, block) for x in (expected.width, expected.share, expected.identifiable))
