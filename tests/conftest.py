@@ -5,6 +5,8 @@ Also here: at the end of a session nothing that it started may still run.
 
 import os
 import re
+import subprocess
+import sys
 import time
 import uuid
 from copy import copy
@@ -23,7 +25,18 @@ from r2s.physics.robot import OF_TASKS, Robot, load_robot
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
 # What takes seconds to make: tests that share one of a group run on one worker, so that it is made once.
-TOGETHER = {"runs": ("trained", "identified", "stopped"), "identified": ("found", "directly", "linked")}
+TOGETHER = {
+    "runs": ("trained", "identified", "stopped"),
+    "identified": ("found", "directly", "linked"),
+    "own_law": ("own_law",),
+    "own_family": ("own_family",),
+}
+# What most tests call is compiled before the workers start, in two processes: each worker would compile it all.
+SHARED = (
+    "from r2s.physics.mujoco_callback import install; install()",
+    "import test_adapters as t; from r2s.arm.warm_up import warm_up; from r2s.tasks.reach import ReachTask\n"
+    "for make in t.MAKES: warm_up(t.PANDA, ReachTask(), make(t.context()))",
+)
 SESSION = "R2S_TEST_SESSION"  # every process that a session starts inherits this variable, whoever its parent is
 SERVERS = ("from multiprocessing.forkserver ", "from multiprocessing.resource_tracker ")
 NAME = pytest.StashKey[str]()
@@ -87,6 +100,18 @@ def pytest_configure(config):
     """Name the session, unless this is a worker of one or a run of pytest within a test."""
     if SESSION not in os.environ:
         os.environ[SESSION] = config.stash[NAME] = uuid.uuid4().hex
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session):
+    """Compile SHARED, if workers are about to run the whole suite."""
+    config = session.config
+    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if whole and getattr(config.option, "numprocesses", None):
+        here = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+        halves = [subprocess.Popen([sys.executable, "-c", code], env=here) for code in SHARED]
+        for half in halves:
+            half.wait()  # what fails here fails in a test as well
 
 
 def left_running(name: str) -> dict[psutil.Process, str]:

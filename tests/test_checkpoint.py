@@ -9,7 +9,7 @@ import pytest
 import torch
 from conftest import conf
 from tensordict import TensorDict
-from test_cli import r2s, server, started, succeed  # noqa: F401
+from test_cli import r2s, started, succeed
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 

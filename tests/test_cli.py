@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 import traceback
+from functools import cache
 from importlib.util import find_spec
 from multiprocessing import forkserver
 from pathlib import Path
@@ -50,17 +51,18 @@ FORKS.set_forkserver_preload(
         "r2s.learning.tqc",
         "r2s.learning.train",
         "torch.export",
+        "test_cli",
         "warm",
     ]
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def server():
-    """Start the server, where it finds tests/warm.py."""
+@cache
+def serve() -> None:
+    """Start the server, where it finds tests/warm.py: what it does not find it leaves out without a word."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-        forkserver.ensure_running()
+        forkserver._forkserver.ensure_running()
 
 
 def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
@@ -86,6 +88,7 @@ def front_door(words: tuple[str, ...], at: Path, out: str, err: str) -> None:
 
 def started(*words: str, at: Path, out: str = os.devnull, err: str = os.devnull) -> multiprocessing.Process:
     """Start `python run.py WORDS` in the folder `at`."""
+    serve()
     child = FORKS.Process(target=front_door, args=(words, at, out, err))
     child.start()
     return child

@@ -2,8 +2,6 @@
 
 import contextlib
 import json
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from omegaconf import OmegaConf
+from test_cli import succeed
 
 from r2s.errors import UserError
 from r2s.reporting.comparison.grouping import LONGEST, group
@@ -250,13 +249,11 @@ def test_trainings_of_a_task_from_outside_r2s_are_compared_by_its_measures(tmp_p
 
 def test_the_stage_is_read_in_a_terminal_of_110_columns(user_folder, tmp_path):
     """Table, key, and the runs that were not compared; the legend leaves the figures room."""
-    command = [sys.executable, "run.py", "stage=compare", f"runs={user_folder}/*", f"root={tmp_path}", "name=all"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    *lines, written = done.stdout.splitlines()
+    printed = succeed("stage=compare", f"runs={user_folder}/*", f"root={tmp_path}", "name=all")
+    *lines, written = printed.splitlines()
     assert max(map(len, lines)) <= 110
     assert "last evaluation" in lines[0]
-    text = " ".join(done.stdout.split())
+    text = " ".join(printed.split())
     for expected in (
         "tqc #1 = tqc, minutes=3.0, calibration=2026-01-01_12-00-00",
         "not comparable with these: toy, toy2 (+experiment=toy)",

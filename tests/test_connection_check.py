@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import conf
-from test_emulator import Bare, client  # noqa: F401  (a fixture)
+from served_arms import Bare
+from test_emulator import CLIENTS, client  # noqa: F401  (a fixture)
 
 from r2s.arm.clients import computer_check
 from r2s.arm.clients.computer_check import computer_findings, network_findings
@@ -198,9 +199,11 @@ def test_r2s_check_prints_a_page_and_moves_nothing(client, robot, monkeypatch, c
         assert error.count("\n") == bool(status)
 
 
-def test_r2s_check_reads_states(client, robot, monkeypatch, capsys):  # noqa: F811
+@pytest.mark.parametrize("name", ["panda", pytest.param("fr3", marks=pytest.mark.slow)])
+def test_r2s_check_reads_states(name, robot, monkeypatch, capsys):
     """In real time it counts the states of an idle arm; a loaded machine may lose some."""
-    name, _, version = client
+    package, _, version = CLIENTS[name]
+    pytest.importorskip(package)
     with Emulator(partial(Bare, robot), version=version, realtime=True) as address:
         words = [f"arm={name}", f"arm.address={address}", "arm.realtime=false", "--seconds", "1"]
         _, page, _ = checked(words, monkeypatch, capsys)

@@ -23,6 +23,7 @@ import psutil
 import pytest
 import torch
 from conftest import ROOT, conf
+from served_arms import Bare, holdable, loaded
 
 from r2s.arm.clients import fci, fr3_limits, libfranka
 from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
@@ -33,9 +34,8 @@ from r2s.arm.emulator.control import CUTOFF_HZ, Control, Fault
 from r2s.arm.emulator.process import Emulator, _read_robot, main
 from r2s.arm.emulator.robot_model import urdf
 from r2s.arm.emulator.server import Server, open_port
-from r2s.arm.interface import ArmState, ArmStopped, NotCleared, Reflexes, named_signals, signal_sizes
+from r2s.arm.interface import ArmStopped, NotCleared, named_signals, signal_sizes
 from r2s.arm.policy_runner import PolicyRunner
-from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError
 from r2s.learning.evaluate import fixed_episodes
@@ -51,6 +51,7 @@ CLIENTS = {"panda": ("panda_py.libfranka", Panda, 5), "fr3": ("pylibfranka", FR3
 CYCLES = 300
 BARE = 1e-4  # of tau_max: what moves an arm without friction
 SEED = 3
+PANDA_YAML = ROOT / "conf" / "robot" / "panda.yaml"
 FAULTS = (  # in the order of motions
     Fault("late", 5, motion=0, cycles=6),
     Fault("drop", 20, motion=0, cycles=6),
@@ -60,37 +61,6 @@ FAULTS = (  # in the order of motions
     Fault("joint_limit", 10, motion=4),
     Fault("estop", 10, motion=5),
 )
-
-
-class Bare:
-    """A minimal `Arm`: the nominal model in MuJoCo, which starts at once."""
-
-    # ruff: noqa: D102
-
-    def __init__(self, robot):
-        self.robot, self._reflexes = robot, Reflexes(robot)
-        self._model = robot.model(gravity=False)
-        self._data = mujoco.MjData(self._model)
-        self.commands = []
-        self.move_to(robot.q_home)
-
-    def move_to(self, q):
-        mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos, self._last = q, np.zeros(7)
-        return self.read()
-
-    def read(self):
-        return ArmState(0.0, self._data.qpos.copy(), self._data.qvel.copy(), self._last, self._last)
-
-    def command(self, tau):
-        self._reflexes.command(tau, self._last)
-        self.commands.append(tau)
-        self._last = self._data.qfrc_applied[:] = tau
-        mujoco.mj_step(self._model, self._data)
-        self._reflexes.state(self._data.qpos, self._data.qvel)
-
-    def stop(self):
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -194,9 +164,14 @@ def test_every_fault_stops_with_libfrankas_reason(client, faulty, panda):
     ("fault", "reason"),
     [
         (Fault("late", 40, cycles=20), "communication_constraints_violation"),
-        (Fault("drop", 40, cycles=20), "communication_constraints_violation"),
-        (Fault("discontinuity", 40), "controller_torque_discontinuity"),
-        (Fault("joint_limit", 40), "joint_position_limits_violation"),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)  # that each stops with its reason: above
+            for row in (
+                (Fault("drop", 40, cycles=20), "communication_constraints_violation"),
+                (Fault("discontinuity", 40), "controller_torque_discontinuity"),
+                (Fault("joint_limit", 40), "joint_position_limits_violation"),
+            )
+        ),
     ],
     ids=lambda x: x.kind if isinstance(x, Fault) else "",
 )
@@ -283,11 +258,6 @@ def test_a_released_stop_button_still_needs_consent(client, panda):
         drive(arm, 20, BARE)
         assert len(questions) == 2
         arm.close()
-
-
-def holdable(robot):
-    """Return a simulated arm, which supports the fault 'hold'."""
-    return SimulatedArm(robot, nominal_dynamics(robot, **conf("friction/paper")), position_noise=0, velocity_noise=0)
 
 
 @pytest.mark.slow
@@ -441,11 +411,15 @@ def test_the_process_dies_with_its_parent(tmp_path):
     """A killed parent leaves no server behind."""
     script = tmp_path / "parent.py"
     script.write_text(
-        "import os, sys, time\n"
+        "import time\n"
         "from functools import partial\n"
-        "from test_emulator import Bare, Emulator, conf, load_robot\n"
+        "from pathlib import Path\n"
+        "from served_arms import Bare\n"
+        "from r2s.arm.emulator.process import Emulator, _read_robot\n"
+        "from r2s.physics.robot import load_robot\n"
         "if __name__ == '__main__':\n"
-        "    emulator = Emulator(partial(Bare, load_robot(**conf('robot/panda'))), version=5)\n"
+        f"    robot = load_robot(**_read_robot(Path({str(PANDA_YAML)!r})))\n"
+        "    emulator = Emulator(partial(Bare, robot), version=5)\n"
         "    emulator.__enter__()\n"
         "    print(emulator._process.pid, flush=True)\n"
         "    time.sleep(60)\n"
@@ -505,7 +479,7 @@ def test_a_wrong_command_line_is_one_line(arguments, line, capsys):
 
 def test_the_emulator_reads_robot_configs(panda):
     """Keys of tasks are ignored."""
-    found = load_robot(**_read_robot(ROOT / "conf" / "robot" / "panda.yaml"))
+    found = load_robot(**_read_robot(PANDA_YAML))
     assert found.name == panda.name
     assert np.array_equal(found.q_max, panda.q_max)
 
@@ -616,14 +590,6 @@ def test_a_missed_answer_repeats_the_last_torque(panda):
         control.cycle(None)
     assert not control.running
     assert "20 consecutive cycles" in control.stopped_by
-
-
-def loaded(robot, payload=None, declared=None):
-    """Return a simulated arm with a payload, which its gravity compensation may know."""
-    friction = nominal_dynamics(robot, **conf("friction/paper"))
-    still = {"position_noise": 0, "velocity_noise": 0}
-    carried, declared = (payload_of(x, (3.0, 0.15)) for x in (payload, declared))
-    return SimulatedArm(robot, friction, payload=carried, declared_payload=declared, **still)
 
 
 def field(control, name):

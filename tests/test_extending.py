@@ -15,7 +15,11 @@ EXAMPLES = {part.split("\n")[0]: part for part in re.split(r"^## ", PAGE, flags=
 LINES = 60  # about a screen
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
+# their laws are compiled anew; the fast tests have laws of one's own in test_control.py and test_family_plugin.py
+COMPILED = ("A controller", "A friction family")
+
+
+@pytest.mark.parametrize("example", [pytest.param(e, marks=[pytest.mark.slow] * (e in COMPILED)) for e in EXAMPLES])
 def test_a_part_is_one_file_one_yaml_and_one_command(example, tmp_path, monkeypatch):
     """The files of an example, in an empty folder, and its command in that folder: the run ends well.
 

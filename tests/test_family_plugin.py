@@ -82,8 +82,8 @@ PHI = np.array([[1.6, 0.08], [0.7, 0.03]])  # Nm, rad/s
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    """The dotted path of the family in a file of one's own."""
+def own_family(tmp_path_factory):
+    """The dotted path of a family in a file; its tests share a worker, because each process compiles the law."""
     folder = tmp_path_factory.mktemp("mine")
     (folder / "my_friction.py").write_text(MINE)
     sys.path.insert(0, str(folder))
@@ -99,36 +99,38 @@ def arm(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def result(path, arm):
+def result(own_family, arm):
     """Return the identification of a short recording of an arm with that friction, started from the paper's law."""
-    truth = replace(Dynamics.of(arm, PHI, family(path)), delay=2e-3)
+    truth = replace(Dynamics.of(arm, PHI, family(own_family)), delay=2e-3)
     noise = {k: conf("data/simulated")[k] for k in ("position_noise", "velocity_noise")}
     motion = record(SimulatedArm(arm, truth, **noise, seed=0), fourier(arm, duration=8.0, seed=0, effort=0))
     return identify(
         arm,
-        nominal_dynamics(arm, **conf("friction/uniform") | {"family": path}),
+        nominal_dynamics(arm, **conf("friction/uniform") | {"family": own_family}),
         motion,
         [LeastSquares(level="torque", max_evaluations=12), LeastSquares(max_evaluations=12, ftol=1e-3)],
-        Settings(BOUNDS, SETTINGS["prior"]["commanded"], ["offset", "delay"], family=path, breakaway=None, nthread=1),
+        Settings(
+            BOUNDS, SETTINGS["prior"]["commanded"], ["offset", "delay"], family=own_family, breakaway=None, nthread=1
+        ),
     )
 
 
-def test_a_family_is_found_by_its_dotted_path(path):
+def test_a_family_is_found_by_its_dotted_path(own_family):
     """The same record each time; built-in ones keep their names, and only they are what auto compares."""
-    own = family(path)
+    own = family(own_family)
     assert isinstance(own, Family)
-    assert family(path) is own
-    assert family_path(own) == path
+    assert family(own_family) is own
+    assert family_path(own) == own_family
     assert [family_path(f) for f in FAMILIES] == [f.name for f in FAMILIES]
     assert own not in FAMILIES
-    Settings(BOUNDS, {}, ["viscous", "offset"], family=path)
+    Settings(BOUNDS, {}, ["viscous", "offset"], family=own_family)
 
 
-def test_its_native_form_is_its_numpy_form(path, arm):
+def test_its_native_form_is_its_numpy_form(own_family, arm):
     """One step from any state takes the torque and the slope of the law in NumPy, beside arms of other families."""
     rng = np.random.default_rng(0)
     phi = np.concatenate([PHI * rng.uniform(0.5, 2.0, (20, 2, 2)), rng.uniform(0, 1, (20, 2, 1))], -1)
-    dynamics = Dynamics.of(arm, phi, family(path))
+    dynamics = Dynamics.of(arm, phi, family(own_family))
     q, dq = rng.uniform(-1, 1, (20, 2)), rng.uniform(-1, 1, (20, 2)) * 10.0 ** rng.uniform(-3, 0, (20, 2))
     sim = Simulator(arm, Dynamics.of(arm, np.array([[1.0, 10.0, 0.0]] * 2)), 21, 1)
     sim.set_dynamics(dynamics, np.arange(20))
@@ -139,7 +141,7 @@ def test_its_native_form_is_its_numpy_form(path, arm):
     frictionless.reset(q, dq)
     free = frictionless.rollout(np.zeros((21, 1, 2)), record=("qvel",))["qvel"][:, 0]
     for k in range(21):
-        law, own = (family(path), phi[k]) if k < 20 else (SIGMOID, np.array([[1.0, 10.0, 0.0]] * 2))
+        law, own = (family(own_family), phi[k]) if k < 20 else (SIGMOID, np.array([[1.0, 10.0, 0.0]] * 2))
         mass = np.linalg.inv(InverseInertia(arm)(q[k : k + 1])[0])
         torque, slope = law.torque(dq[k], own), compiled_slope(law, dq[k], own)
         step = np.linalg.solve(mass + 1e-3 * np.diag(slope), mass @ (free[k] - dq[k]) - 1e-3 * torque)
@@ -158,20 +160,20 @@ def test_it_is_identified(result):
     np.testing.assert_allclose(found.friction(dq), truth, rtol=0.05)
 
 
-def test_it_goes_through_the_file(result, path, arm, tmp_path):
+def test_it_goes_through_the_file(result, own_family, arm, tmp_path):
     """parameters.yaml names the dotted path and the record's units, and loads again as the same arm."""
     save_parameters(tmp_path / "parameters.yaml", *result.saved, {})
     document = yaml.safe_load((tmp_path / "parameters.yaml").read_text())
-    assert document["friction_family"] == path
+    assert document["friction_family"] == own_family
     assert document["parameters"]["width"]["unit"] == "rad/s"
     space, x = load_parameters(tmp_path, arm)
-    assert space.nominal.family is family(path)
+    assert space.nominal.family is family(own_family)
     np.testing.assert_allclose(space.dynamics(x).phi, result.dynamics.phi, rtol=1e-5)
 
 
-def test_scales_and_optional_parameters_are_the_records(path, arm):
+def test_scales_and_optional_parameters_are_the_records(own_family, arm):
     """Logarithmic ones have their geometric mean in the middle of the cube; a term brings the optional one in."""
-    own = with_family(nominal_dynamics(arm, **conf("friction/uniform")), path)
+    own = with_family(nominal_dynamics(arm, **conf("friction/uniform")), own_family)
     motion = SimpleNamespace(torque="commanded", tau=np.zeros((1, arm.n)))
     space = search_space(arm, own, BOUNDS, ["viscous"], motion)
     middle = space.from_unit(np.full(6, 0.5))
@@ -207,19 +209,19 @@ def test_scales_and_optional_parameters_are_the_records(path, arm):
         ),
     ],
 )
-def test_a_wrong_path_is_one_line(path, name, words):
+def test_a_wrong_path_is_one_line(own_family, name, words):
     """A failed import, another type and a name with another unit are errors."""
-    family(path)
-    sys.modules["my_friction"].OTHER = replace(family(path), units=("Nm", "rad/s", "Nm"))
+    family(own_family)
+    sys.modules["my_friction"].OTHER = replace(family(own_family), units=("Nm", "rad/s", "Nm"))
     with pytest.raises(UserError) as error:
         family(name)
     assert str(error.value).startswith(f"friction.family: {words}")
     assert "\n" not in str(error.value)
 
 
-def test_a_record_that_does_not_fit_itself_is_one_line(path):
+def test_a_record_that_does_not_fit_itself_is_one_line(own_family):
     """Units for every parameter, names that exist, optional ones last, and not more than the step has room for."""
-    own = family(path)
+    own = family(own_family)
     for change in (
         {"units": ("Nm",)},
         {"logarithmic": ("levle",)},

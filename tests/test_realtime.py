@@ -12,40 +12,20 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, conf
+from served_arms import Paced
 
 from r2s.arm.command_loop import REST_S
 from r2s.arm.driver import DAMP_S, DEADLINE_S
 from r2s.arm.realtime_process import RealtimeRunner, Slot
-from r2s.arm.simulated import SimulatedArm
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
-from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.tasks.reach import ReachTask
 from r2s.tasks.rollout import rollout
 
-PACE_S = 4e-3  # s per millisecond of the arm, so that a loaded machine does not look like a stalled policy
 DEADLINE = round(DEADLINE_S / SIM_DT)
 TASK = ReachTask(episode_s=0.2)
 LEVEL = np.ones(7)  # Nm
-
-
-class Paced(SimulatedArm):
-    """An arm whose clock does not wait; it writes t, q, dq and tau of every cycle to a file."""
-
-    def __init__(self, robot, path):
-        friction = conf("friction/paper")
-        super().__init__(robot, nominal_dynamics(robot, **friction), position_noise=0.0, velocity_noise=0.0)
-        self._file = open(path, "ab", buffering=0)  # noqa: SIM115 (as long as the arm)
-        self._due = 0.0
-
-    def command(self, tau):
-        """Advance one millisecond in PACE_S."""
-        state = self.read()
-        self._file.write(np.concatenate([[state.t], state.q, state.dq, tau]).tobytes())
-        self._due = max(self._due, time.perf_counter() - PACE_S) + PACE_S
-        time.sleep(max(0.0, self._due - time.perf_counter()))
-        super().command(tau)
 
 
 def commands(path):

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import pytest
 from conftest import ROOT, conf
-from test_emulator import Bare
+from served_arms import Bare
 
 from r2s.arm.clients.fr3 import FR3
 from r2s.arm.clients.panda import Panda

@@ -283,7 +283,7 @@ def test_row_k_holds_the_command_of_cycle_k():
     assert np.array_equal(recording.tau, [tau for _, tau in sent])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_excitation_keeps_the_limits(seed):
     """Inside every limit, at rest at both ends, with consistent derivatives, slow and fast parts."""
     r, e = panda(), fourier(panda(), duration=20.0, seed=seed)

@@ -14,8 +14,8 @@ import pytest
 from conftest import ROOT
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
+from served_arms import Paced
 from test_adapters import MAKES, PANDA, PAYLOAD, context, swing, truth
-from test_realtime import Paced
 
 from r2s.arm.clients.fr3 import FR3
 from r2s.arm.clients.panda import Panda
@@ -123,9 +123,13 @@ def run(tmp_path, what, how, **env):
 
 @pytest.mark.parametrize("what", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("panda", "fr3")), "jump"])
 def test_a_cycle_loads_nothing(what, tmp_path):
-    """In a fresh process, recordings, ramps, approaches, episodes and jumps; without `warm_up` they load."""
+    """In a fresh process, recordings, ramps, approaches, episodes and jumps."""
     assert run(tmp_path, what, "warm") == "0 []"
-    assert "update" in run(tmp_path, what, "cold")
+
+
+@pytest.mark.slow
+def test_without_warm_up_a_cycle_loads(tmp_path):
+    assert "update" in run(tmp_path, "jump", "cold")
 
 
 @pytest.mark.slow  # compiles everything

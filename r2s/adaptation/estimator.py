@@ -89,7 +89,8 @@ class Estimator:
         if not (np.isfinite(q).all() and np.isfinite(dq).all() and np.isfinite(tau).all()):
             self.begin()
             return False
-        if not update_residual(self._arm, self._state, q, dq, tau, self._residual) or self.held:
+        cycle = np.array(q), np.array(dq), np.array(tau)  # one type of arrays, so that numba compiles once
+        if not update_residual(self._arm, self._state, *cycle, self._residual) or self.held:
             return False
         update(self._filter, self._noise, self._residual)
         jumped, replaced = bool(self._filter.log_odds[MEAN] > THRESHOLD), self._replaced_at_rest()

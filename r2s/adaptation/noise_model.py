@@ -62,10 +62,11 @@ def default_noise(arm: ArmModel, prior: Prior | None = None) -> Noise:
 def momentum_residuals(arm: ArmModel, recording: Recording) -> list[MomentumResidual]:
     """Return the residuals of all spans of a recording of commanded torque."""
     n, out = recording.n_joints, []
+    q, dq, tau = (np.array(x) for x in (recording.q, recording.dq, recording.tau))  # of the type of live signals
     for stretch in recording.stretches:
         state, r = ResidualState.fresh(n), MomentumResidual.empty(n)
         for k in range(stretch.start, stretch.stop):
-            if update_residual(arm, state, recording.q[k], recording.dq[k], recording.tau[k], r):
+            if update_residual(arm, state, q[k], dq[k], tau[k], r):
                 out.append(MomentumResidual(*(a.copy() for a in r)))
     return out
 

@@ -129,6 +129,7 @@ def _run_built_in(number, q, dq, command, parameters, memory, out):
 def run_law(law: Callable, q: np.ndarray, dq: np.ndarray, command: np.ndarray, parameters: np.ndarray, memory: int):
     """Return the torques (m, n) Nm of m arms in the first cycle of a motion: q, dq (m, n), command (m, c)."""
     out = np.empty(q.shape)
+    q, dq = np.ascontiguousarray(q), np.ascontiguousarray(dq)  # one type of arrays, so that numba compiles once
     if law in BUILT_IN:
         _run_built_in(BUILT_IN.index(law), q, dq, command, parameters, np.zeros(memory), out)
         return out

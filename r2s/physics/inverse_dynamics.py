@@ -37,7 +37,8 @@ class InverseDynamics:
         """
         own, nominal = self._links
         out = np.empty_like(q)
-        _rigid(own, nominal, self.robot.gravity, self.dynamics.armature, (q, dq, ddq), out)
+        motion = np.array(q), np.array(dq), np.array(ddq)  # one type of arrays, so that numba compiles once
+        _rigid(own, nominal, self.robot.gravity, np.array(self.dynamics.armature), motion, out, False)
         return out
 
     def mass(self, q: np.ndarray) -> np.ndarray:
@@ -53,15 +54,17 @@ class InverseDynamics:
         if d.drag.any():
             out -= d.drag[:, 0] * np.sin(q) + d.drag[:, 1] * np.cos(q)
         if d.load.any():
-            gravity = np.empty_like(q)
-            none = np.zeros_like(q)
-            _rigid(self._links[1], self._links[1], self.robot.gravity, none[0], (q, none, none), gravity, True)
+            gravity = np.empty(q.shape)
+            none = np.zeros(q.shape)
+            _rigid(
+                self._links[1], self._links[1], self.robot.gravity, none[0], (np.array(q), none, none), gravity, True
+            )
             out += d.load * np.abs(gravity) * np.tanh(sliding / SLIDES)
         return out
 
 
 @njit(cache=True, error_model="numpy")
-def _rigid(links, nominal, gravity, armature, motion, out, full_gravity=False):
+def _rigid(links, nominal, gravity, armature, motion, out, full_gravity):
     """Write the torque (m, n) Nm of a motion (q, dq, ddq); `full_gravity`: without gravity compensation."""
     q, dq, ddq = motion
     m, n = q.shape

@@ -205,7 +205,7 @@ def _force_at(at: dict[str, int]) -> Callable:
     return friction_force
 
 
-@njit(error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _friction(sizes, user, q, dq, forces, places):
     """Add friction, offsets and errors of the gravity compensation to the passive force of a step.
 
@@ -273,7 +273,7 @@ def _friction(sizes, user, q, dq, forces, places):
             _hold(loads, dq, user, joint, work, (contact, jacobian), touch)
 
 
-@njit(error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _control(n, user, fields):
     """Replace the applied torques by the law's. n is a variable: a constant one would compile for a minute."""
     user = carray(_as_doubles(user), (n, WIDTH))  # type: ignore[call-arg]
@@ -287,7 +287,7 @@ def _control(n, user, fields):
     control_law(user[0, CONTROL], q, speed, rest[:c], rest[c + k :], rest[c : c + k], applied)
 
 
-@njit(error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(n, user, fields, places):
     """Replace the applied torques by those behind conditioning, safety filter and motors.
 
