@@ -16,6 +16,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from common import RESULTS, ROOT, markdown, write_page
+from scipy.interpolate import CubicSpline
 
 from r2s.physics.rigid_body import LinkInertia, rigid_body
 from r2s.physics.robot import load_robot
@@ -35,6 +36,7 @@ DELAY_ROWS = 3  # ms, of the arm's response to a command
 COULOMB, VISCOUS = np.array([12.0, 9.0, 4.0]), np.array([6.0, 4.0, 2.0])  # Nm, Nm s/rad
 NOISE = 1e-5, 3e-3, 2e-3  # rad, rad/s, and of tau_max: standard deviations
 CHUNK = 60_000  # rows written at once
+COARSE_S = 0.01  # s between the moments at which rigid-body torque is computed
 
 
 def write_log(robot, torque: str, minutes: float, path: Path) -> None:
@@ -44,14 +46,20 @@ def write_log(robot, torque: str, minutes: float, path: Path) -> None:
     w = 2 * np.pi * rng.uniform(0.03, 0.4, (6, 3))
     amplitude, phase = 0.2 * rng.uniform(0.5, 1.0, (6, 3)) / (1 + 0.3 * w), rng.uniform(0, 2 * np.pi, (6, 3))
     q, dq, tau = (np.empty((rows, 3)) for _ in range(3))
+
+    def motion(t: np.ndarray) -> list[np.ndarray]:
+        x = w * t[:, None, None] + phase
+        return [(amplitude * y).sum(1) for y in (np.sin(x), w * np.cos(x), -(w**2) * np.sin(x))]
+
     for k in range(0, rows, CHUNK):
         part = slice(k, min(k + CHUNK, rows))
         # a commanded arm answers late: its motion is that of an earlier command
         for at, late in ((part, 0), *([(part, DELAY_ROWS)] if torque == "commanded" else [])):
-            x = w * ((np.arange(at.start, at.stop) + late) * 1e-3)[:, None, None] + phase
-            move = [(amplitude * y).sum(1) for y in (np.sin(x), w * np.cos(x), -(w**2) * np.sin(x))]
-            rest, y = rigid_body(robot, *move, robot.gravity if torque != "commanded" else None)
-            tau[at] = rest + y.reshape(len(rest), 3, -1) @ inertia
+            t = (np.arange(at.start, at.stop) + late) * 1e-3
+            move = motion(t)
+            coarse = np.arange(t[0], t[-1] + COARSE_S, COARSE_S)  # the fastest sine lasts 2.5 s: off by 1e-8 of it
+            rest, y = rigid_body(robot, *motion(coarse), robot.gravity if torque != "commanded" else None)
+            tau[at] = CubicSpline(coarse, rest + y.reshape(len(rest), 3, -1) @ inertia)(t)
             tau[at] += np.sign(move[1]) * COULOMB + move[1] * VISCOUS
             tau[at] -= robot.armature * move[2] if torque == "measured" else 0.0
             if not late:

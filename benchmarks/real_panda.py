@@ -42,8 +42,8 @@ def main() -> None:
     text = (
         f"The recording of Gaz et al. 2019: link-side torque, period {period:.2f} s. Each row holds out a part of "
         f"the period in every repetition, {GUARD_S:g} s apart, and identifies with the settings of `stage=identify` "
-        "on the rest. RMSE in Nm after a 10 Hz zero-phase filter, published model → identified. Presliding and "
-        "priors were chosen on similar splits, so this is not a clean test."
+        "on the rest. RMSE in Nm after a 10 Hz zero-phase filter, published model → identified. Presliding, "
+        "priors and the rule for late signals were settled with similar splits in view, so this is not a clean test."
     )
     title = "A physical Panda: torque on held-out motion"
     parts = [text, markdown_rows(rows, "held out")]

@@ -1,5 +1,7 @@
 """Late signals of link-side torque: what was injected is identified, and a log without lateness keeps its result."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import conf
@@ -7,6 +9,8 @@ from test_identify import TORQUE, run
 from test_motor import late, recorded
 from test_scaling import NOISE, arm, truth_of  # noqa: F401 (a fixture)
 
+from r2s.identification.parameter_file import load_parameters, save_parameters
+from r2s.identification.prediction import prediction_errors
 from r2s.physics.dynamics import nominal_dynamics
 
 LINKS = [f"link_{name}" for name in ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")]
@@ -54,3 +58,22 @@ def test_a_log_without_lateness_keeps_its_result(robot, motion):
         ours, theirs = (f.x[f.space.where(name)] for f in (with_term, without))
         half = 0.5 * (without.found.high - without.found.low)[without.space.where(name)]
         assert np.all(np.abs(ours - theirs) <= 0.1 * half + 1e-9)
+
+
+def test_equal_lateness_that_no_fit_is_sure_of_stays(robot, motion, tmp_path):
+    """With dq and torque 2 ms late, dq is used as logged; links are the true ones, and the file keeps the choice.
+
+    With dq alone corrected, the inertia of link 1 about its axis is 0.9 times the true one.
+    """
+    recording = late(motion, dq_s=0.0025, tau_rows=2)
+    found = found_in(robot, recording, "signal_delay")
+    assert found.dynamics.late_alike
+    assert found.dynamics.signal_delay == 0.0
+    assert np.all(np.abs(found.x[found.space.where("link_alpha")]) < 0.02)
+    how = {"window_s": 0.2, "cutoff_hz": 10.0}
+    other = replace(found.dynamics, late_alike=False)
+    own, corrected = (prediction_errors(robot, other, d, recording, **how) for d in (found.dynamics, other))
+    assert np.sum(own["torque_rmse_Nm"]) < np.sum(corrected["torque_rmse_Nm"])
+    save_parameters(tmp_path / "parameters.yaml", *found.saved, {})
+    space, x = load_parameters(tmp_path, robot)
+    assert space.dynamics(x).late_alike

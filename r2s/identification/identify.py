@@ -36,6 +36,7 @@ from r2s.identification.structure.backward_elimination import eliminate_terms
 from r2s.identification.structure.cross_validation import CrossValidation
 from r2s.identification.structure.family_selection import compare_families
 from r2s.identification.structure.forward_selection import select_terms
+from r2s.identification.structure.late_signals import DELAY, late_signals
 from r2s.identification.terms import add_terms, optional_friction, scaled_prior, search_space
 from r2s.physics.actuation import EARLY
 from r2s.physics.dynamics import STICTION_MODELS, Dynamics, with_family
@@ -50,7 +51,6 @@ CLEAR = 1.5  # times dq_min, below which a replayed joint may stick
 MAX_BATCH = 64  # candidates replayed at once
 SELECTED_S = 240.0  # s of a longer recording in which terms are selected
 REWEIGHTS = 2  # further fits of a local search, each with weights from the residual before
-DOUBTED = {"commanded": "lag", "measured": "signal_delay"}  # by torque: estimated only if the data clearly need it
 ALIKE = 0.2  # relative error of the number of independent rows
 Memo = Callable[[str, Callable[[], dict[str, Any]]], dict[str, Any]]
 
@@ -184,6 +184,18 @@ def select_family(s: State) -> State:
     return replace(s, nominal=with_family(s.nominal, family), families=families)
 
 
+def settle_lateness(s: State) -> State:
+    """Choose which lateness of link-side torque and of dq is corrected; a delay that is not stays at 0."""
+    nominal = replace(s.nominal, late_alike=False)
+    if s.recording.torque != "measured" or DELAY in s.settings.stated:
+        return replace(s, nominal=nominal)
+    found = s.history.step("lateness", lambda: late_signals(s.cross_validation, s.terms))
+    if found["delayed"]:
+        return replace(s, nominal=nominal)
+    nominal = replace(nominal, signal_delay=0.0, late_alike=bool(found["alike"]))
+    return replace(s, nominal=nominal, terms=[name for name in s.terms if name != DELAY])
+
+
 def add_candidate_terms(s: State) -> State:
     """Add the candidate terms that improve held-out prediction."""
     absent = {*optional_friction()} - {*s.nominal.family.optional}  # friction terms of other families
@@ -208,7 +220,8 @@ def prune_terms(s: State) -> State:
 def formulate(s: State) -> State:
     """Set up the parameter space, the residuals and the problem."""
     how, memory = s.settings, s.nominal.family.has_memory
-    space = search_space(s.robot, s.nominal, how.bounds, s.terms, s.recording, how.stated)
+    settled = [DELAY] if DELAY in how.terms and DELAY not in s.terms else []  # at 0, see `settle_lateness`
+    space = search_space(s.robot, s.nominal, how.bounds, [*s.terms, *settled], s.recording, how.stated)
     s = s if s.recording.period else replace(s, recording=s.recording.in_phase())  # repetitions are one block
     torque_data = TorqueResidual(space, s.recording, cutoff_hz=how.cutoff_hz, slowest=s.slowest)
     data: ReplayResidual | TorqueResidual = torque_data
@@ -227,6 +240,7 @@ def formulate(s: State) -> State:
     known = known_values(space, how, s.prior)
     problem = Problem.of(data, torque_data, s.prior, [x for x in (static, known) if x is not None])
     problem = problem if known is None else problem.without_prior(known.names)
+    problem = problem.fixed(space.where(DELAY)) if settled else problem
     return replace(s, space=space, problem=problem, u=problem.start, edges=edges, static_friction=static)
 
 
@@ -281,23 +295,22 @@ def fit_presliding(s: State) -> State:
 
 
 def reweight(s: State) -> State:
-    """Repeat a local search with weights from its residual; the last one decides whether a lateness is needed."""
+    """Repeat a local search with weights from its residual; the last one decides whether a lag is needed."""
     search = s.searches[-1]
     if not search.local:
         return s
     problem, u = s.problem, s.u
-    name = DOUBTED.get(s.recording.torque)
-    late = s.space.where(name) if name in s.space.blocks else None
+    lag = s.space.where("lag") if "lag" in s.space.blocks else None
 
     def report(row: dict) -> None:
         s.history.add(row | {"search": f"{row['search']}, reweighted"})
 
     for k in range(REWEIGHTS):
-        local = search if late is None or k < REWEIGHTS - 1 else partial(without, late, search)
+        local = search if lag is None or k < REWEIGHTS - 1 else partial(without, lag, search)
         u, problem = _run(s, f"reweighted {k + 1}", local, problem, u, report)  # type: ignore[arg-type]
         problem = problem.reweighted(u, fitted=True)
-    if late is not None and np.array_equal(u[late], problem.start[late]):
-        problem = problem.fixed(late)
+    if lag is not None and np.array_equal(u[lag], problem.start[lag]):
+        problem = problem.fixed(lag)
     return replace(s, problem=problem, u=u)
 
 
@@ -330,7 +343,7 @@ def fit_stiction(s: State) -> State:
 
 
 STEPS: tuple[Callable[[State], State], ...] = (
-    *(select_family, add_candidate_terms, prune_terms, formulate, fit),
+    *(select_family, settle_lateness, add_candidate_terms, prune_terms, formulate, fit),
     *(reread_ramps, fit_presliding, reweight, fit_breakaway, fit_stiction),
 )
 
@@ -355,11 +368,11 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def without(at: np.ndarray, search: Search, problem: Problem, start: np.ndarray, report: Report) -> np.ndarray:
-    """Return u (P,) of a local search without the lateness `at`, or with it if the data clearly need it.
+    """Return u (P,) of a local search without the lag `at`, or with it if the data clearly need it.
 
-    With slow torques a short lag acts like a delay, and a misfit acts like late torque. The data need it if it lowers
-    the cost by more than the logarithm of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block
-    that favours it most does not count, because rows of a block are correlated.
+    With slow torques a short lag acts like a delay. The data need it if it lowers the cost by more than the logarithm
+    of the number of rows (Schwarz, Annals of Statistics 6(2), 1978). The block that favours it most does not count,
+    because rows of a block are correlated.
     """
     having, fixed = problem.residual(start[None])[0] ** 2, problem.fixed(at)
     u = start.copy()

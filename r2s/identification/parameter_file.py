@@ -61,7 +61,7 @@ def save_parameters(
         seen = space.block(found.identifiable, name).tolist()
         document["parameters"][name] = entry | {"identifiable": seen[0] if name in WHOLE_ARM else seen}
     document["fixed"] = {f"breakaway_{side}": fixed.breakaway[:, i].tolist() for i, side in enumerate(SIDES)}
-    document["fixed"] |= {"stiction_model": fixed.stiction_model}
+    document["fixed"] |= {"stiction_model": fixed.stiction_model, "late_alike": fixed.late_alike}
     document["fixed"] |= {k: getattr(fixed, k).tolist() for k in FIXED}
     document["fixed"] |= {k: float(getattr(fixed, k)) for k in ("dq_min", *TIMING)}
     d = space.dynamics(found.x)
@@ -119,7 +119,7 @@ def _parse(document: dict[str, Any], robot: Robot) -> tuple[ParameterSpace, np.n
     own: dict[str, Any] = {k: numbers(k, fixed[k], robot.n) for k in FIXED}
     own["breakaway"] = np.stack([numbers(k, fixed[k], robot.n) for k in map("breakaway_{}".format, SIDES)], -1)
     own |= {k: float(fixed[k]) for k in TIMING}
-    own["stiction_model"] = fixed["stiction_model"]
+    own["stiction_model"], own["late_alike"] = fixed["stiction_model"], bool(fixed.get("late_alike", False))
     family = friction_family(document["friction_family"])
     nominal = replace(Dynamics.of(robot, own["phi"], family, float(fixed["dq_min"])), **own)
     everything = {k: [1e-12 if k in logarithmic() else -np.inf, np.inf] for k in found}

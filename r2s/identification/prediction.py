@@ -13,7 +13,7 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HORIZONS = (0.1, 0.5, 2.0)  # s, open-loop prediction
-SCORED_S, SCORED_EACH_S = 600.0, 30.0  # s of a longer recording whose torque is scored, and of each part
+SCORED_S, SCORED_EACH_S = 300.0, 30.0  # s of a longer recording whose torque is scored, and of each part
 REPLAYED_S = 240.0  # s of a longer recording that are replayed
 MAX_WINDOWS = 100  # per horizon
 
@@ -33,7 +33,7 @@ def prediction_errors(
     position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after each of the
     HORIZONS that the trajectories reach. Of a long recording, parts that are spread over it count.
     """
-    space = parameter_space(robot, nominal, {"offset": [-1.0, 1.0]})
+    space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
     torque = TorqueResidual(space, scored, cutoff_hz=cutoff_hz)
     out: dict = {"rows": len(recording.t), "seconds": recording.duration}

@@ -34,6 +34,8 @@ class Dynamics:
         gain: (..., n) relative error of the link-side torque sensor or of the motor's torque constant; a property of
             the recording, not of the arm's motion.
         signal_delay: (...) s, by which measured or motor torque is logged later than the angles; of the recording.
+        late_alike: whether measured torque counts as late as the logged dq, which is used as logged; of the
+            recording.
         speed_noise: (..., n) rad/s, standard deviation of the velocity noise in a policy's observation.
         family: of the friction.
         stiction_model: the torque that the breakaway edges limit. "command" is eq. (6) of the paper: command and
@@ -63,6 +65,7 @@ class Dynamics:
     delay: np.ndarray | float = 0.0
     lag: np.ndarray | float = 0.0
     signal_delay: np.ndarray | float = 0.0
+    late_alike: bool = False
     declared_payload: np.ndarray = field(default_factory=lambda: np.zeros(4))
     surface: Surface | None = None
 

@@ -1,6 +1,6 @@
 """How much later the logged dq of a recording is than its q."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,11 @@ class Lateness:
         """(n,) s, 0 where it is too small or uncertain to be corrected."""
         seen = (np.abs(self.s) > LATE_S) & (np.abs(self.s) > SURE * self.sigma)
         return np.where(np.isnan(self.s), np.nan, np.where(seen, self.s, 0.0))
+
+    @property
+    def as_logged(self) -> "Lateness":
+        """The same without a correction of dq where it is a derivative of q."""
+        return replace(self, s=0.0 * self.s)
 
     def corrected(self, smooth: Recording) -> np.ndarray:
         """Return (T, n) rad/s: the velocity without the lateness, from dq or, where that is nan, from q."""

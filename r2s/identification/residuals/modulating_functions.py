@@ -115,12 +115,13 @@ class SlidingMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SlidingMotion]") -> "SlidingMotion":
-        """Return consecutive parts of a recording as one."""
+        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
         if len(parts) == 1:
             return parts[0]
         names = [f.name for f in fields(SlidingMotion) if f.name not in ("means", "encoder")]
-        arrays = {name: np.concatenate([getattr(m, name) for m in parts]) for name in names}
-        means = [_block_diagonal(own) for own in zip(*(m.means for m in parts), strict=True)]
+        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
+        joints = list(zip(*(vars(m).pop("means") for m in parts), strict=True))
+        means = [_block_diagonal(joints.pop(0)) for _ in range(len(joints))]
         return SlidingMotion(means=tuple(means), encoder=np.median([m.encoder for m in parts], axis=0), **arrays)
 
     @property

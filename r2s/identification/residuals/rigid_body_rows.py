@@ -48,7 +48,7 @@ class RigidBodyRows:
             q=m.rows(m.q),
             rest=rest,
             y=m.rows(y.reshape(shape)),
-            compensation=weight if commanded else weight[:0],
+            compensation=weight if commanded else weight[:0].copy(),  # a view would keep all of it
             load=np.abs(weight @ nominal),
             # a link-side sensor does not measure the torque that accelerates the rotors
             rotors=np.zeros_like(rest) if torque == "measured" else m.rows(m.ddq),
@@ -57,6 +57,6 @@ class RigidBodyRows:
 
     @staticmethod
     def joined(parts: "Sequence[RigidBodyRows]") -> "RigidBodyRows":
-        """Return consecutive parts of a recording as one."""
+        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
         names = [f.name for f in fields(RigidBodyRows)]
-        return RigidBodyRows(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+        return RigidBodyRows(**{name: np.concatenate([vars(p).pop(name) for p in parts]) for name in names})

@@ -7,7 +7,7 @@ commanded torque it is the fast start of a fit. Rows are in units of their own s
 from collections.abc import Iterator
 from copy import copy
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,6 @@ MIN_SIGMA = 1e-9  # Nm
 MOST_ROWS = 60_000  # moments: from ten minutes on they are farther apart, and below the cutoff lose little
 PIECE_S = 60.0  # s of a recording that are filtered at once
 PART = 2048  # moments whose Jacobian is in memory at once
-FRICTION_PART = 32_768  # rows at which friction is evaluated at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
 
 
@@ -71,6 +70,7 @@ class TorqueResidual:
             else:
                 # with commands the delay is estimated, and logged velocities lag by a filter or a step
                 late = from_q(robot.n) if self.commanded else lateness(recording, cutoff_hz)
+                late = late.as_logged if space.nominal.late_alike else late
                 of = partial(SmoothMotion.of, cutoff_hz=cutoff_hz, late=late)
             m, self._rigid = _joined(robot, recording, partial(of, rate_hz=rate_hz, presliding_rad=presliding_rad))
         else:
@@ -116,42 +116,53 @@ class TorqueResidual:
         """Return this residual for an arm on which its environment exerts the joint torque tau (T, n) Nm."""
         return self._with(_external=tau)
 
-    def predict(self, dynamics: Dynamics) -> np.ndarray:
-        """Return (T, n) Nm: torque of rigid bodies, rotors and friction minus offset, at the measured motion."""
-        d, m, rigid = dynamics, self.motion, self._rigid
-        standard = _standard(d).ravel()
-        out = rigid.rest + rigid.y @ standard + d.armature * rigid.rotors
-        if not self.commanded and not self.at_motor:  # a link-side sensor sits before friction
-            out = out * (1.0 + d.gain)
-        out += m.filtered(self._friction(d)) - d.offset
+    def predict(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
+        """Return (T, n) Nm: torque of rigid bodies, rotors and friction minus offset, at the measured motion.
+
+        known: of an arm like this one, to which only what differs is added.
+        """
+        d, own = dynamics, self._known(dynamics, known)
+        # a link-side sensor sits before friction
+        out = own.rigid.copy() if self.commanded or self.at_motor else own.rigid * (1.0 + d.gain)
+        out += own.friction - d.offset
         if self.commanded:  # error of the gravity compensation
-            out += rigid.compensation @ (standard - self._nominal)
+            out += own.compensation
         out -= d.drag[:, 0] * self._sin + d.drag[:, 1] * self._cos
-        out += d.load * rigid.load * self._mean_sign[d.family.has_memory]
+        out += d.load * self._rigid.load * self._mean_sign[d.family.has_memory]
         return out * (1.0 + d.gain) if self.at_motor else out
 
-    def _friction(self, d: Dynamics) -> np.ndarray:
-        """Return (F, n) Nm, friction before filtering.
+    def _known(self, d: Dynamics, like: "_Known | None" = None) -> "_Known":
+        """Return the costly parts of a prediction, from `like` where links and rotors, or friction, are the same."""
+        m, rigid, standard = self.motion, self._rigid, _standard(d).ravel()
+        if like and np.array_equal(standard, like.standard) and np.array_equal(d.armature, like.armature):
+            torque, compensation = like.rigid, like.compensation
+        else:
+            torque = rigid.rest + rigid.y @ standard + d.armature * rigid.rotors
+            compensation = rigid.compensation @ (standard - self._nominal) if self.commanded else torque[:0]
+        if like and np.array_equal(d.phi, like.phi):
+            friction = like.friction
+        else:
+            of = partial(self._friction, d)
+            friction = m.filtered(of) if isinstance(m, SmoothMotion) else m.filtered(of(slice(None)))
+        return _Known(standard, d.armature, torque, compensation, d.phi, friction)
+
+    def _friction(self, d: Dynamics, rows: slice) -> np.ndarray:
+        """Return friction before filtering, Nm, in some rows of F.
 
         A simulator that integrates friction implicitly uses the velocity of the step before, `lead_s` too old, and
         corrects it where friction rises.
         """
-        out = np.empty_like(self.motion.friction_dq)
-        for first in range(0, len(out), FRICTION_PART):
-            rows = slice(first, first + FRICTION_PART)
-            dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
-            if not self.lead_s:
-                out[rows] = d.friction(dq, sign)
-                continue
-            ddq, way = self.motion.ddq[rows], np.sign(dq)
-            old, coming = (dq + s * self.lead_s * ddq for s in (-1.0, 1.0))
-            rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(ddq)
-            out[rows] = d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
-        return out
+        dq, sign = self.motion.friction_dq[rows], self._sign[d.family.has_memory][rows]
+        if not self.lead_s:
+            return d.friction(dq, sign)
+        ddq, way = self.motion.ddq[rows], np.sign(dq)
+        old, coming = (dq + s * self.lead_s * ddq for s in (-1.0, 1.0))
+        rises = (d.friction(coming, way) - d.friction(old, way)) * np.sign(ddq)
+        return d.friction(old, sign) + np.maximum(rises, 0.0) * np.sign(ddq)
 
-    def error(self, dynamics: Dynamics) -> np.ndarray:
+    def error(self, dynamics: Dynamics, known: "_Known | None" = None) -> np.ndarray:
         """Return (T, n) Nm, predicted minus recorded torque; a command is shifted to when it acts on the joints."""
-        m, free = self.motion, self.predict(dynamics) - self._external
+        m, free = self.motion, self.predict(dynamics, known) - self._external
         if self.commanded:
             return free - m.command(float(dynamics.delay), float(dynamics.lag))
         late = float(dynamics.signal_delay)
@@ -193,7 +204,8 @@ class TorqueResidual:
         """
         space, n = self.space, self.space.n
         d, places = space.dynamics(x), [space.where(block) for block in space.blocks]
-        base, before, out = self.error(d), _standard(d).ravel(), []
+        known = self._known(d)
+        base, before, out = self.error(d, known), known.standard, []
         gain = np.zeros(n) if self.commanded else d.gain
         links = [at for block, at in zip(space.blocks, places, strict=True) if block in OF_LINKS]
         if links:
@@ -207,7 +219,7 @@ class TorqueResidual:
         for trial, (_, at) in zip(trials, rest, strict=True):
             trial[at] = stepped[at]
         moved = space.dynamics(trials)
-        out += [(block, at, self.error(moved.one(k)) - base) for k, (block, at) in enumerate(rest)]
+        out += [(block, at, self.error(moved.one(k), known) - base) for k, (block, at) in enumerate(rest)]
         return out
 
     def _assembled(self, changes: list, rows: slice, count: int) -> np.ndarray:
@@ -258,6 +270,17 @@ class TorqueResidual:
         """(T, n) Nm, standard deviation of an independent row."""
         factor, constant = self._weights
         return factor * np.sqrt(constant**2 + self._noise**2)
+
+
+class _Known(NamedTuple):
+    """Parts of a prediction: (T, n) Nm of links and rotors, of compensation and of friction, and what they are of."""
+
+    standard: np.ndarray
+    armature: np.ndarray
+    rigid: np.ndarray
+    compensation: np.ndarray
+    phi: np.ndarray
+    friction: np.ndarray
 
 
 def _joined(robot: Robot, recording: Recording, of: "partial[Any]") -> tuple[Any, RigidBodyRows]:

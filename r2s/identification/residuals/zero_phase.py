@@ -1,6 +1,6 @@
 """A recording low-pass filtered without phase lag, for differentiation; friction passes the same filter."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,19 +96,25 @@ class SmoothMotion:
 
     @staticmethod
     def joined(parts: "Sequence[SmoothMotion]") -> "SmoothMotion":
-        """Return consecutive parts of a recording as one."""
+        """Return consecutive parts of a recording as one; they lose their arrays, so that no two copies are kept."""
         if len(parts) == 1:
             return parts[0]
         names = ("t", "q", "dq", "ddq", "tau", "friction_dq", "bristle", "delayed")
-        arrays = {name: np.concatenate([getattr(m, name) for m in parts]) for name in names}
         base = np.cumsum([0, *(len(m.friction_dq) for m in parts)]).tolist()
+        arrays = {name: np.concatenate([vars(m).pop(name) for m in parts]) for name in names}
         spans = [range(b + s.start, b + s.stop, s.step) for b, m in zip(base, parts, strict=False) for s in m.spans]
         return SmoothMotion(kernel=parts[0].kernel, spans=tuple(spans), shift_s=parts[0].shift_s, **arrays)
 
-    def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return (T, n): the low-pass of x (F, n) at the moments."""
-        windows = sliding_window_view(x, len(self.kernel), axis=0)
-        parts = [windows[s.start : s.stop : s.step] @ self.kernel for s in self.spans]
+    def filtered(self, x: "np.ndarray | Callable[[slice], np.ndarray]") -> np.ndarray:
+        """Return (T, n): the low-pass of x at the moments; x is (F, n), or a function that returns some of its rows.
+
+        Rows are evaluated where they are needed, span by span: those of an hour would be written and read again.
+        """
+        parts = []
+        for s in self.spans:
+            rows = slice(s[0], s[-1] + len(self.kernel))
+            own = x(rows) if callable(x) else x[rows]
+            parts.append(sliding_window_view(own, len(self.kernel), axis=0)[:: s.step] @ self.kernel)
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def rows(self, x: np.ndarray) -> np.ndarray:

@@ -13,8 +13,7 @@ import pandas as pd
 
 from r2s.identification.base_parameters import base_table
 from r2s.identification.blocks import BLOCK_S
-from r2s.identification.parameters import parameter_space
-from r2s.identification.prediction import REPLAYED_S
+from r2s.identification.prediction import REPLAYED_S, SCORED_EACH_S, SCORED_S
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.identification.residuals.windows import cut_windows, replay
 from r2s.identification.residuals.zero_phase import FRICTION_CUTOFF
@@ -87,8 +86,8 @@ def identification_page(
         summary: summary.json. window_s: of replays. cutoff_hz: of the low-pass.
         more: further sections {heading: items}, after the prediction errors.
     """
-    robot = found.space.robot
-    torque = TorqueResidual(parameter_space(robot, nominal, {"offset": [-1.0, 1.0]}), validation, cutoff_hz=cutoff_hz)
+    robot, shown = found.space.robot, spread(validation, SCORED_S, SCORED_EACH_S)
+    torque = TorqueResidual(found.space, shown, cutoff_hz=cutoff_hz)
     motion, both = torque.motion, {"nominal": nominal, "identified": found.dynamics}
     error = {label: torque.error(d) for label, d in both.items()}
     overlay = Overlay(motion.t, motion.tau, {label: motion.tau + e for label, e in error.items()})
