@@ -238,6 +238,7 @@ def test_the_command_writes_a_surface_that_calibration_can_be(files, capsys, fou
     summary = json.loads((folder / "summary.json").read_text())["contact"]
     assert summary["validation"]["force_rmse_N"] < 1.0
     assert (folder / "figures" / "contact.png").stat().st_size > 10_000
+    assert 'name="surface"' in (folder / "model" / "arm.xml").read_text()
     assert (folder / "parameters.yaml").read_text() == (files / "run" / "parameters.yaml").read_text()
 
 

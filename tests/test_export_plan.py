@@ -98,7 +98,7 @@ def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
         q, dq, t = *rng.normal(size=(2, n)), np.array([step / task.ctrl_hz])
         command = control.command(np.zeros((1, n)), task, t, plan[None])
         wanted = control.torque(q[None], dq[None], command)[0]
-        made = follow(step, q, dq, np.zeros(3), 0.0)["control"]
+        made = follow(step, {"q": q, "dq": dq, "ee": np.zeros(3)}, 0.0)["control"]
         assert np.abs(made - wanted).max() < BASE * np.abs(wanted).max()
 
 

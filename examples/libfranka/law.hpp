@@ -2,127 +2,14 @@
 // contract.hpp lies in the bundle. This is a third implementation of r2s/physics/safety_filter.py; a test compares them.
 // Compile it without -ffast-math, which breaks the tests for NaN.
 #pragma once
-#include <algorithm>
-#include <array>
-#include <cmath>
 #include <string>
 
-#include "contract.hpp"
+#include "model.hpp"
+#include "push.hpp"
 
 namespace law {
 
-namespace c = contract;
-constexpr int n = contract::n;
-using Vec = std::array<double, 3>;
-using Mat = std::array<double, 9>;  // row by row
-using Joints = std::array<double, n>;
-using Square = std::array<Joints, n>;
-using Command = std::array<double, c::actions + c::setpoints>;  // action, then the goal where the law needs it
-
-inline Vec operator+(const Vec& a, const Vec& b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
-inline Vec operator-(const Vec& a, const Vec& b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
-inline Vec operator*(double s, const Vec& a) { return {s * a[0], s * a[1], s * a[2]}; }
-inline double dot(const Vec& a, const Vec& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-inline Vec cross(const Vec& a, const Vec& b) {
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-inline Vec operator*(const Mat& m, const Vec& a) {
-  return {m[0] * a[0] + m[1] * a[1] + m[2] * a[2], m[3] * a[0] + m[4] * a[1] + m[5] * a[2],
-          m[6] * a[0] + m[7] * a[1] + m[8] * a[2]};
-}
-inline Mat operator*(const Mat& a, const Mat& b) {
-  Mat out{};
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-      for (int k = 0; k < 3; ++k) out[3 * i + j] += a[3 * i + k] * b[3 * k + j];
-  return out;
-}
-inline Mat transposed(const Mat& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
-inline Mat turned(const double* axis, double angle) {  // Rodrigues
-  const double s = std::sin(angle), d = 1.0 - std::cos(angle), x = axis[0], y = axis[1], z = axis[2];
-  return {1 - d * (y * y + z * z), d * x * y - s * z,         d * x * z + s * y,
-          d * x * y + s * z,       1 - d * (x * x + z * z),   d * y * z - s * x,
-          d * x * z - s * y,       d * y * z + s * x,         1 - d * (x * x + y * y)};
-}
-template <std::size_t size>
-bool finite(const std::array<double, size>& x) {
-  return std::all_of(x.begin(), x.end(), [](double v) { return std::isfinite(v); });
-}
-
-// Kinematics and dynamics without gravity.
-struct Model {
-  std::array<Mat, n> frame;
-  std::array<Vec, n> origin, axis;
-  Vec ee;
-
-  void place(const Joints& q) {
-    Mat r{1, 0, 0, 0, 1, 0, 0, 0, 1};
-    Vec p{};
-    for (int i = 0; i < n; ++i) {
-      p = p + r * Vec{c::place[i][0], c::place[i][1], c::place[i][2]};
-      Mat f;
-      std::copy(c::frame[i], c::frame[i] + 9, f.begin());
-      r = r * f * turned(c::axis[i], q[i]);
-      frame[i] = r, origin[i] = p, axis[i] = r * Vec{c::axis[i][0], c::axis[i][1], c::axis[i][2]};
-    }
-    ee = p + r * Vec{c::hand[0], c::hand[1], c::hand[2]};
-  }
-
-  // The Jacobian's transpose times a force at the end effector.
-  Joints pull(const Vec& force) const {
-    Joints out;
-    for (int j = 0; j < n; ++j) out[j] = dot(cross(axis[j], ee - origin[j]), force);
-    return out;
-  }
-
-  // Mass matrix and Coriolis torque: Newton and Euler for the torque, the links' own energies for the matrix.
-  void equations(const Joints& dq, Square& mass, Joints& bias) const {
-    Vec omega{}, alpha{}, a{}, before{};
-    mass = {}, bias = {};
-    for (int k = 0; k < n; ++k) {
-      if (k > 0) {
-        const Vec way = origin[k] - before;
-        a = a + cross(alpha, way) + cross(omega, cross(omega, way));
-      }
-      before = origin[k];
-      const Vec spin = dq[k] * axis[k];
-      alpha = alpha + cross(omega, spin);
-      omega = omega + spin;
-      const Vec own = frame[k] * Vec{c::com[k][0], c::com[k][1], c::com[k][2]};
-      const Vec centre = origin[k] + own;
-      const double* t = c::tensor[k];
-      const Mat tensor = frame[k] * Mat{t[0], t[3], t[4], t[3], t[1], t[5], t[4], t[5], t[2]} * transposed(frame[k]);
-      const Vec force = c::mass[k] * (a + cross(alpha, own) + cross(omega, cross(omega, own)));
-      const Vec moment = tensor * alpha + cross(omega, tensor * omega);
-      for (int j = 0; j <= k; ++j) {
-        const Vec arm = centre - origin[j], moves = cross(axis[j], arm), turns = tensor * axis[j];
-        bias[j] += dot(moves, force) + dot(axis[j], moment);
-        for (int i = 0; i <= j; ++i) {
-          const double m = c::mass[k] * dot(cross(axis[i], centre - origin[i]), moves) + dot(axis[i], turns);
-          mass[i][j] += m;
-          if (i != j) mass[j][i] += m;
-        }
-      }
-    }
-    for (int j = 0; j < n; ++j) mass[j][j] += c::rotors[j];
-  }
-};
-
-// Solve the first k rows of a x = b in place, a symmetric and positive definite (Cholesky); a is lost.
-inline void solve(Square& a, Joints& b, int k) {
-  for (int i = 0; i < k; ++i) {
-    for (int j = 0; j <= i; ++j) {
-      for (int m = 0; m < j; ++m) a[i][j] -= a[i][m] * a[j][m];
-      a[i][j] = i == j ? std::sqrt(a[i][i]) : a[i][j] / a[j][j];
-    }
-    for (int m = 0; m < i; ++m) b[i] -= a[i][m] * b[m];
-    b[i] /= a[i][i];
-  }
-  for (int i = k - 1; i >= 0; --i) {
-    for (int m = i + 1; m < k; ++m) b[i] -= a[m][i] * b[m];
-    b[i] /= a[i][i];
-  }
-}
+using Command = std::array<double, c::actions + c::setpoints>;  // action, then what else the law needs
 
 class Driver {
  public:
@@ -130,6 +17,7 @@ class Driver {
   Model model;
   Joints effort{};  // Nm, the target torque after the low-pass
   Why why = runs;   // why the arm is being brought to rest
+  long limited = 0;  // cycles in which the safety filter changed the command
 
   explicit Driver(double soft_start_s = 0.0) : fade_(std::lround(soft_start_s / c::cycle_s)) {}
 
@@ -139,7 +27,7 @@ class Driver {
   }
 
   // Whether a motion that is being stopped is at rest, or its time is over.
-  bool done() const { return why != runs && (rests_ || damped_ * c::cycle_s >= c::damp_s); }
+  bool done() const { return why != runs && damped_ > 0 && (rests_ || damped_ * c::cycle_s >= c::damp_s); }
 
   // The torque of this cycle; command: null without a new one. The model must be at q already.
   Joints operator()(const Joints& q, const Joints& dq, const Joints& tau_J_d, const Command* command) {
@@ -155,10 +43,20 @@ class Driver {
       rests_ = rests_ && std::abs(dq[j]) < c::still;
       fastest = std::max(fastest, std::abs(dq[j]) / c::most[j]);
     }
+    Square mass{};
+    Joints bias{};
+    if (seen) model.equations(dq, mass, bias);
+    if (seen && c::limits_pushes) push_.see(model, dq, mass, bias);
     if (stops) {  // brake from the present speed, at once
+      double needs = 0.0;
       target_ = {};
       if (seen && damped_ == 1) share_ = std::min(1.0, fastest);
-      share_ = std::max(0.0, share_ - c::cycle_s / c::brake_s);
+      if (seen && c::limits_pushes && why != not_finite && why != outside) {
+        needs = push_.stop(held_, damped_, target_);
+        for (int j = 0; j < n; ++j) target_[j] = std::clamp(target_[j], -c::asked[j], c::asked[j]);
+        rests_ = rests_ && push_.phase == Push::over;
+      }
+      share_ = std::max(needs, share_ - c::cycle_s / c::brake_s);
       for (int j = 0; j < n && seen && share_ == 0.0; ++j)  // a spring against joints that a load moves on
         if (std::abs(dq[j]) > c::still) {
           if (dq[j] * held_[j] > 0.0) held_[j] -= std::copysign(std::min(c::release[j], std::abs(held_[j])), dq[j]);
@@ -180,7 +78,7 @@ class Driver {
     }
     const Joints last = finite(tau_J_d) ? tau_J_d : sent_;
     Joints out{};
-    if (seen) out = guard(q, dq);
+    if (seen) out = guard(q, dq, last, mass, bias);
     double part = 1.0;  // of the way from `last`, the same in all joints: the safe torques are a convex set
     for (int j = 0; j < n && seen; ++j) {
       out[j] = std::clamp(out[j], -c::tau_max[j], c::tau_max[j]);
@@ -194,6 +92,7 @@ class Driver {
   Command command_{};
   std::array<double, c::memories + 1> memory_{};  // C++ has no empty array
   Joints target_{}, filtered_{}, sent_{}, held_{};
+  Push push_;
   double share_ = 1.0;
   long fade_, cycle_ = 0, silent_ = 0, damped_ = 0;
   bool rests_ = false, commanded_ = false;
@@ -217,20 +116,17 @@ class Driver {
     return speed;
   }
 
-  Joints guard(const Joints& q, const Joints& dq) const {
+  Joints guard(const Joints& q, const Joints& dq, const Joints& last, Square& mass, const Joints& bias) {
     double near = 0.0;
     for (int j = 0; j < n; ++j) {
       near = std::max(near, (std::abs(dq[j]) / c::dq_max[j] - c::allowed) / (c::nothing - c::allowed));
       near = std::max(near, std::max(q[j] - c::q_high[j], c::q_low[j] - q[j]) / c::q_fade[j]);
     }
-    Square mass, mobility;
-    Joints bias, out, ddq, low, high, eaten{};
-    model.equations(dq, mass, bias);
+    Square mobility;
+    Joints out, low, high;
     for (int j = 0; j < n; ++j) {
       mass[j][j] += c::added[j];
       out[j] = (1.0 - std::min(near, 1.0)) * (effort[j] + held_[j]);
-      if (c::friction[j] > 0.0 && c::added[j] > 0.0)
-        eaten[j] = c::sure * c::friction[j] * std::abs(std::tanh(dq[j] / c::dry + out[j] / c::friction[j]));
       high[j] = c::rate * (allowed(c::q_high[j] - q[j], j) - dq[j]);
       low[j] = -c::rate * (allowed(q[j] - c::q_low[j], j) + dq[j]);
     }
@@ -240,26 +136,39 @@ class Driver {
       mobility[j][j] = 1.0;
       solve(root, mobility[j], n);
     }
+    const auto joints = [&](Joints& tau, const Joints& of) { return bounded(tau, dq, of, mobility, low, high); };
+    const bool changed = c::limits_pushes ? push_.limit(out, last, joints) : joints(out, bias);
+    limited += changed || 1.0 - std::min(near, 1.0) < 1.0;
+    return out;
+  }
+
+  // Change a torque to the nearest under which no joint accelerates beyond its bounds; return whether it is another.
+  static bool bounded(Joints& tau, const Joints& dq, const Joints& bias, const Square& mobility, Joints low,
+                      Joints high) {
+    Joints ddq, eaten{};
+    for (int j = 0; j < n; ++j)
+      if (c::friction[j] > 0.0 && c::added[j] > 0.0)
+        eaten[j] = c::sure * c::friction[j] * std::abs(std::tanh(dq[j] / c::dry + tau[j] / c::friction[j]));
     bool within = true, still_within = true;
     for (int k = 0; k < n; ++k) {
       ddq[k] = 0.0;
       double wider = 0.0;
       for (int j = 0; j < n; ++j) {
-        ddq[k] += mobility[k][j] * (out[j] - bias[j]);
+        ddq[k] += mobility[k][j] * (tau[j] - bias[j]);
         wider += std::abs(mobility[k][j]) * eaten[j];
       }
       within = within && low[k] <= ddq[k] && ddq[k] <= high[k];
       low[k] -= wider, high[k] += wider;  // by what friction may do to the joint
       still_within = still_within && low[k] <= ddq[k] && ddq[k] <= high[k];
     }
-    if (within || still_within) return out;
-    const Joints push = pushed(mobility, ddq, low, high);
-    for (int j = 0; j < n; ++j) out[j] += push[j];
-    return out;
+    if (within || still_within) return false;
+    const Joints push = stops(mobility, ddq, low, high);
+    for (int j = 0; j < n; ++j) tau[j] += push[j];
+    return true;
   }
 
   // The torques that stops at the joints would add: block principal pivoting.
-  static Joints pushed(const Square& mobility, const Joints& ddq, const Joints& low, const Joints& high) {
+  static Joints stops(const Square& mobility, const Joints& ddq, const Joints& low, const Joints& high) {
     std::array<int, n> side, other, at;
     Joints push{};
     for (int j = 0; j < n; ++j) side[j] = ddq[j] > high[j] ? 1 : ddq[j] < low[j] ? -1 : 0;
@@ -311,19 +220,24 @@ inline std::string refused(const Vec& goal) {
   return "";
 }
 
-// Why no motion of the training began in this state; empty: one did.
-inline std::string refused(const Joints& q, const Joints& dq) {
-  for (int j = 0; j < n; ++j) {
-    const std::string joint = "joint " + std::to_string(j + 1);
+// Why no motion of the training began at these angles; empty: one did.
+inline std::string refused(const Joints& q) {
+  for (int j = 0; j < n; ++j)
     if (!(std::abs(q[j] - c::start[j]) <= c::start_within))
-      return joint + " is at " + std::to_string(q[j]) + " rad; motions begin within " +
+      return "joint " + std::to_string(j + 1) + " is at " + std::to_string(q[j]) + " rad; motions begin within " +
              std::to_string(c::start_within) + " rad of " + std::to_string(c::start[j]);
-    if (!(std::abs(dq[j]) <= c::start_fastest))
-      return joint + " moves at " + std::to_string(dq[j]) + " rad/s; motions begin at rest";
-  }
   return "";
 }
 
+// Why no motion of the training began at these speeds; empty: one did.
+inline std::string moves(const Joints& dq) {
+  for (int j = 0; j < n; ++j)
+    if (!(std::abs(dq[j]) <= c::start_fastest))
+      return "joint " + std::to_string(j + 1) + " moves at " + std::to_string(dq[j]) + " rad/s; motions begin at rest";
+  return "";
+}
+
+#ifndef CONTRACT_ON_SURFACE
 // The policy's observation; the model must be at q already.
 inline std::array<float, c::observations> observe(const Driver& driver, const Joints& q, const Joints& dq,
                                                   const Vec& goal) {
@@ -340,5 +254,6 @@ inline std::array<float, c::observations> observe(const Driver& driver, const Jo
     }
   return out;
 }
+#endif
 
 }  // namespace law

@@ -4,6 +4,8 @@
 //   g++ -std=c++17 -O2 -pthread -I BUNDLE loop.cpp -lfranka -lonnxruntime -o loop
 //   python BUNDLE/r2s_runtime.py BUNDLE && ./loop 172.16.0.2 BUNDLE/policy.onnx 0.5 0.1 0.4
 //
+// A policy that presses or wipes takes a plan: ./loop 172.16.0.2 BUNDLE/policy.onnx BUNDLE/plan.npy
+//
 // The contract is compiled in (contract.hpp), so a program is of one bundle and one policy.onnx. r2s_runtime.py says
 // whether the files of the bundle are what was exported. Exit status: 0 at the end of the time, 3 if the arm was brought
 // to rest before, 2 if nothing moved, 1 after an error of the arm. Read docs/explanation/safety.md before the first
@@ -27,12 +29,14 @@
 #include "law.hpp"
 #include "mailbox.hpp"
 #include "sha256.hpp"
+#ifdef CONTRACT_ON_SURFACE
+#include "surface.hpp"
+#endif
 
 static_assert(law::n == 7, "libfranka's arms have seven joints");
 static_assert(contract::cycle_hz == 1000, "libfranka's cycle is of 1 kHz");
 static_assert(std::string_view(contract::torque) == "without gravity", "libfranka's arms compensate it themselves");
 
-constexpr double seconds = 10.0;
 constexpr double agree = 5e-3;    // m, between the end effector of the arm and that of the bundle
 constexpr int first_of_fr3 = 6;   // server version; FR3s slow down before their limits, and so has the bundle's law to
 using Observation = std::array<float, contract::observations>;
@@ -131,7 +135,7 @@ void check(franka::Robot& robot, const franka::RobotState& now) {
   if (robot.serverVersion() >= first_of_fr3 && !slows)
     throw std::runtime_error(std::string("this arm is an FR3, the bundle is of '") + contract::robot +
                              "' and does not slow down before an FR3's limits");
-  if (const std::string why = law::refused(now.q, now.dq); !why.empty()) throw std::runtime_error(why);
+  if (const std::string why = law::moves(now.dq); !why.empty()) throw std::runtime_error(why);
   law::Model model;
   model.place(now.q);
   // O_T_EE and F_T_EE are columns of a frame; the bundle's end effector may be the flange or the tool
@@ -152,33 +156,91 @@ void check(franka::Robot& robot, const franka::RobotState& now) {
                              " mm from the bundle's: another arm or tool");
 }
 
+// What the policy shall do: a point to reach, or a plan on a surface.
+#ifdef CONTRACT_ON_SURFACE
+constexpr int words = 4;
+constexpr const char* usage = "PLAN.npy";
+constexpr double seconds = static_cast<double>(contract::plan_rows - 1) / contract::policy_hz;
+struct Goal {
+  law::Plan plan;
+  long limited = 0;
+  explicit Goal(char** argv) : plan(argv[3]) {}
+  void check_start(const franka::RobotState& now) const {
+    for (int j = 0; j < law::n; ++j)
+      if (!(std::abs(now.q[j] - plan.start()[j]) <= contract::start_within))
+        throw std::runtime_error("joint " + std::to_string(j + 1) + " is at " + std::to_string(now.q[j]) +
+                                 " rad; the plan begins at " + std::to_string(plan.start()[j]));
+  }
+  const double* setpoint(long step) const { return plan.row(step) + contract::column_setpoint; }
+  Observation observe(const law::Driver& driver, const franka::RobotState& state, long step) {
+    constexpr double every = contract::cycle_hz / contract::policy_hz;
+    const double share = static_cast<double>(driver.limited - limited) / every;
+    limited = driver.limited;
+    return law::observe(driver, state.q, state.dq, state.tau_J_d, plan.row(step), share);
+  }
+  law::Vec left(const law::Driver& driver, long step) const {
+    using law::operator-;
+    const double* x = plan.row(step);
+    return law::Vec{x[0], x[1], x[2]} - driver.model.point(contract::tip);
+  }
+};
+#else
+constexpr int words = 6;
+constexpr const char* usage = "X Y Z   (goal in m, in the base frame)";
+constexpr double seconds = 10.0;
+struct Goal {
+  law::Vec point;
+  explicit Goal(char** argv) : point{number(argv[3]), number(argv[4]), number(argv[5])} {
+    if (const std::string why = law::refused(point); !why.empty()) throw std::runtime_error(why);
+  }
+  void check_start(const franka::RobotState& now) const {
+    if (const std::string why = law::refused(now.q); !why.empty()) throw std::runtime_error(why);
+  }
+  const double* setpoint(long) const { return point.data(); }
+  Observation observe(const law::Driver& driver, const franka::RobotState& state, long) const {
+    return law::observe(driver, state.q, state.dq, point);
+  }
+  law::Vec left(const law::Driver& driver, long) const {
+    using law::operator-;
+    return point - driver.model.ee;
+  }
+};
+#endif
+
 int run(char** argv) {
-  using law::operator-;
-  const law::Vec goal{number(argv[3]), number(argv[4]), number(argv[5])};
-  if (const std::string why = law::refused(goal); !why.empty()) throw std::runtime_error(why);
+  Goal goal(argv);
   Policy policy(argv[2]);
   law::Driver driver(0.5);  // the torque fades in over half a second
   franka::Robot robot(argv[1]);
-  robot.setCollisionBehavior({{20, 20, 18, 18, 16, 14, 12}}, {{20, 20, 18, 18, 16, 14, 12}},
-                             {{20, 20, 20, 25, 25, 25}}, {{20, 20, 20, 25, 25, 25}});
-  check(robot, robot.readOnce());
+  std::array<double, 7> torque;
+  std::array<double, 6> force;
+  std::copy_n(contract::collision_torque, 7, torque.begin());
+  std::copy_n(contract::collision_force, 6, force.begin());
+  robot.setCollisionBehavior(torque, torque, force, force);
+  const franka::RobotState now = robot.readOnce();
+  goal.check_start(now);
+  check(robot, now);
   constexpr long every = contract::cycle_hz / contract::policy_hz;
   constexpr long last = static_cast<long>(seconds * contract::cycle_hz);
   long cycle = 0;
   law::Command command{};
+  std::array<double, contract::setpoints + 1> setpoint{};  // of the observation that the newest action answers
   const auto callback = [&](const franka::RobotState& state, franka::Duration) -> franka::Torques {
     driver.model.place(state.q);
     if (signalled || cycle >= last) driver.stop();
-    if (cycle % every == 0) policy.give(law::observe(driver, state.q, state.dq, goal));
+    if (cycle % every == 0) {
+      policy.give(goal.observe(driver, state, cycle / every));
+      std::copy_n(goal.setpoint(cycle / every), contract::setpoints, setpoint.begin());
+    }
     ++cycle;
     const bool asked = policy.newest(command);
-    std::copy_n(goal.begin(), contract::setpoints, command.begin() + contract::actions);
+    std::copy_n(setpoint.begin(), contract::setpoints, command.begin() + contract::actions);
     const law::Joints tau = driver(state.q, state.dq, state.tau_J_d, asked ? &command : nullptr);
     return driver.done() ? franka::MotionFinished(franka::Torques(tau)) : franka::Torques(tau);
   };
   // the driver has its own rate limit and low-pass, so libfranka's are off
   robot.control(callback, false, franka::kMaxCutoffFrequency);
-  const law::Vec left = goal - driver.model.ee;
+  const law::Vec left = goal.left(driver, cycle / every);
   std::printf("at rest after %.2f s, %.1f mm from the goal\n", 1e-3 * cycle, 1e3 * std::sqrt(law::dot(left, left)));
   if (driver.why == law::Driver::requested && !signalled) return 0;
   const char* whys[] = {"", "no finite action of the policy in time", "the arm's state is not finite",
@@ -188,8 +250,8 @@ int run(char** argv) {
 }
 
 int main(int argc, char** argv) {
-  if (argc != 6) {
-    std::fprintf(stderr, "usage: %s ROBOT_ADDRESS POLICY.onnx X Y Z   (goal in m, in the base frame)\n", argv[0]);
+  if (argc != words) {
+    std::fprintf(stderr, "usage: %s ROBOT_ADDRESS POLICY.onnx %s\n", argv[0], usage);
     return 2;
   }
   struct sigaction action {};

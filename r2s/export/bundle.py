@@ -24,19 +24,25 @@ from r2s.export.contract import make_contract
 from r2s.export.control import LAWS
 from r2s.export.header import header
 from r2s.export.runtime import BundleError, agree, seal_of
+from r2s.export.surface_contract import surface_plans
+from r2s.identification.contact.contact_file import load_contact
+from r2s.identification.contact.exchange import write_surface
 from r2s.learning.networks import Policy
 from r2s.physics.description import write_description
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface
 from r2s.provenance import packages, sha256
 from r2s.reporting.document import report_markdown
 from r2s.runs import read_meta
+from r2s.tasks.surface_task import SurfaceTask
 from r2s.tasks.task import Task
 
 IDENTIFIED = ("parameters.yaml", "posterior.npz")
 # modules that the one file of a bundle contains beside runtime.py, in this order
-HERE, PARTS = "r2s.export.", ("law", "control", "inverse_dynamics", "plan", "fences")
+HERE, PARTS = "r2s.export.", ("law", "arm", "push", "control", "inverse_dynamics", "plan", "surface", "fences")
 EXAMPLES = 4  # plans in a bundle
+PLAN = "plan.npy"  # the first of them on a surface, for the C++ loop
 SAME = 1e-4  # of action_scale, largest difference between policy.onnx and policy.pt
 
 
@@ -73,11 +79,16 @@ def write_bundle(
                 shutil.copyfile(source / name, part / name)
         for line in write_description(part / "model", robot, dynamics):
             print(line)
+        if (surface := surface_of(source, robot, task, dynamics)) is not None:
+            write_surface(part / "model", robot, surface)
         (part / "r2s_runtime.py").write_text(one_file(task.control(robot)))
-        if contract["goal"]["kind"] == "plan":
+        if contract["goal"]["kind"] != "point":
             plans = task.goals(robot, np.random.default_rng(0), EXAMPLES)
+            if isinstance(task, SurfaceTask):
+                plans = surface_plans(robot, task, plans)
+                np.save(part / PLAN, plans[0])
             np.savez_compressed(part / contract["goal"]["examples"], plans=plans)
-        elif task.control(robot).cpp:
+        if contract["goal"]["kind"] != "plan" and task.control(robot).cpp:
             (part / "contract.hpp").write_text(
                 header(contract, sha256(part / "policy.onnx"), task.control(robot).cpp)
             )
@@ -95,6 +106,15 @@ def write_bundle(
         raise UserError(f"export: {error}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def surface_of(source: Path, robot: Robot, task: Task, dynamics: Dynamics) -> Surface | None:
+    """Return the surface that a task touches: identified, of the training's run folder, or the expected one."""
+    if not task.touches:
+        return None
+    if (source / "contact.yaml").is_file():
+        return load_contact(source, "dr.surface").surface
+    return task.expected(robot, dynamics).surface
 
 
 def check_with_own_runtime(folder: Path) -> None:

@@ -64,13 +64,30 @@ def card(
         "Trained on": trained,
         "Measured": [table, *([stops] if stops else [])],
         "Not tried": not_tried(measured, places),
-        **({"Plans": plans(contract)} if contract["goal"]["kind"] == "plan" else {}),
+        **({} if contract["goal"]["kind"] == "point" else {"Plans": plans(contract)}),
         "Limits": [
-            "The training had no goals outside `goal.trained` of contract.json, no payload, no contact and no other "
-            "end effector. The safety filter keeps torque, speed and position within the arm's limits; it does not "
-            "make a motion sensible."
+            f"The training had no goals outside `goal.trained` of contract.json, no payload, {contacts(contract)} "
+            "and no other end effector. The safety filter keeps torque, speed and position within the arm's limits; "
+            "it does not make a motion sensible.",
+            *pushing(contract),
         ],
     }
+
+
+def contacts(contract: Mapping[str, Any]) -> str:
+    """Return what contact the training did not have."""
+    return "no contact but of the tip" if contract["goal"]["kind"] == "surface" else "no contact"
+
+
+def pushing(contract: Mapping[str, Any]) -> list[str]:
+    """Return the limit of pushes in words."""
+    push, on_surface = contract["law"]["push"], contract["goal"]["kind"] == "surface"
+    if push is None:
+        return ["Nothing but the torque limit bounds a force: safety.force_max was null."] if on_surface else []
+    return [
+        f"The command builds up at most {push['force_max']:g} N against the nominal plane, and the tip meets it at "
+        f"{push['overshoot'] * push['speed_near']:.3g} m/s at most; a stop does this with a force: {push['stop']}."
+    ]
 
 
 def not_tried(measured: Mapping[str, Any], places: Sequence[str]) -> list[Item]:
@@ -91,6 +108,12 @@ def plans(contract: Mapping[str, Any]) -> list[Item]:
     """Return the text that says how to make a plan."""
     goal, n = contract["goal"], len(contract["joints"])
     rows, columns = goal["shape"]
+    if goal["kind"] == "surface":
+        row = (
+            f"A goal is a plan, {rows} rows of {columns} numbers, one per {1e3 / goal['row_hz']:g} ms: "
+            f"{', '.join(goal['columns'])}; `goal.columns` of contract.json says where. The arm starts at its q."
+        )
+        return [[row, f"{goal['examples']} has plans of the training's family, plan.npy the first of them."]]
     words = [
         f"A goal is a plan, {rows} rows of {columns} numbers, one per {1e3 / goal['row_hz']:g} ms: position and "
         "velocity of the end effector, m and m/s in the arm's base, then positions, velocities and accelerations of "

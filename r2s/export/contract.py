@@ -17,20 +17,23 @@ from r2s.control.impedance import Impedance
 from r2s.errors import UserError
 from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import LAW_JOINT, Model
-from r2s.export.plan import COLUMNS, OF_PLAN, width
-from r2s.export.runtime import CONVENTION, FORMAT, MADE_OF
+from r2s.export.plan import COLUMNS, width
+from r2s.export.runtime import CONVENTION, FORMAT, MADE_OF, MORE_OF
+from r2s.export.surface_contract import pushes, surface_goal, surface_start
 from r2s.learning.policy import observation_words
 from r2s.physics import safety_filter as law
 from r2s.physics.actuation import low_pass_factor
 from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import WIDTH_DQ
-from r2s.physics.inverse_dynamics import SLIDES
+from r2s.physics.inverse_dynamics import SLIDES, InverseDynamics
 from r2s.physics.robot import SIM_DT, Robot
+from r2s.tasks.surface_task import SurfaceTask
 from r2s.tasks.task import ObservationTerm, Task, observation_scale
 from r2s.tasks.track import TrackTask
 
 NEAR_RAD = 0.05  # rad, of an arm that was moved to a start posture; half of what a move_to may be off its path
+FIRST_ROW = "at rest, at the joint angles of a plan's first row"
 RESTING = 0.1  # rad/s, of a joint at rest: five times the driver's STILL, for noise of slower sensors
 UNITS = {"q_low": "rad", "q_high": "rad", "q_fade": "rad", "most": "rad/s", "slowing": "rad/s^2", "offset": "rad/s"}
 UNITS |= {"dq_max": "rad/s", "added": "kg m^2", "tau_max": "Nm", "step": "Nm per cycle", "friction": "Nm"}
@@ -67,6 +70,10 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
         "rotors": listed(robot.armature if rotors is None else rotors),
     }
     place = shoulder(model, robot)
+    if isinstance(task, SurfaceTask):
+        form = surface_goal(robot, task)
+    else:
+        form = plans(robot, task, place) if isinstance(task, TrackTask) else goal(robot, task, place)
     return {
         "format": FORMAT,
         "robot": robot.name,
@@ -80,7 +87,7 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
             "max_rate_Nm_per_s": listed(robot.dtau_max),
             "limit_Nm": listed(task.torque_limit(robot)),
         },
-        "control": controller(control),
+        "control": controller(control, task),
         "limits": {
             "q_min_rad": listed(robot.q_min),
             "q_max_rad": listed(robot.q_max),
@@ -88,10 +95,20 @@ def make_contract(robot: Robot, task: Task, friction: np.ndarray, rotors: np.nda
         },
         "observation": observation(robot, task),
         "start": start(robot, task),
-        "goal": plans(robot, task, place) if isinstance(task, TrackTask) else goal(robot, task, place),
+        "goal": form,
         "model": model,
-        "law": {"units": UNITS, "joint": of_joints(as_driven(robot), task, friction), "number": numbers(task)},
+        "law": {
+            "units": UNITS,
+            "joint": of_joints(as_driven(robot), task, friction),
+            "number": numbers(task),
+            "push": pushes(robot, task.push_limit),
+        },
     }
+
+
+def kind_of(task: Task) -> str:
+    """Return the kind of a task's goals: plan, surface (a plan on one) or point."""
+    return "plan" if isinstance(task, TrackTask) else "surface" if isinstance(task, SurfaceTask) else "point"
 
 
 def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
@@ -102,36 +119,45 @@ def shoulder(model: dict[str, Any], robot: Robot) -> list[float]:
 
 
 def check_exportable(robot: Robot, task: Task) -> None:
-    """Raise UserError if a runtime, which takes a point or a plan of `TrackTask`, cannot run a task."""
-    control = task.control(robot)
-    if task.push_limit is not None:
+    """Raise UserError if a runtime, which takes a point, a plan of `TrackTask` or of a surface, cannot run a task."""
+    control, kind = task.control(robot), kind_of(task)
+    model = model_of(control, task)
+    if model is not None and model.dynamics.family.name not in FRICTION:
         raise UserError(
-            "export: the runtime of a bundle does not limit pushes (safety.force_max); stage=transfer runs it"
-        )
-    if isinstance(control, ComputedTorque) and control.model.dynamics.family.name not in FRICTION:
-        raise UserError(
-            f"export: the runtime of a bundle has no friction of family '{control.model.dynamics.family.name}'; "
+            f"export: the runtime of a bundle has no friction of family '{model.dynamics.family.name}'; "
             f"allowed: {', '.join(FRICTION)}"
         )
-    follows = isinstance(control, ComputedTorque) and isinstance(task, TrackTask)
-    to_goal = isinstance(control, Impedance) and control.setpoint_size == 3 and not isinstance(task, TrackTask)
-    if control.setpoint_size and not (follows or to_goal):
+    if isinstance(task, SurfaceTask) and model is None:
+        raise UserError(f"export: {type(task).__name__} needs a model of the arm; call with_model first")
+    follows = isinstance(control, ComputedTorque) and kind == "plan"
+    impedes = isinstance(control, Impedance) and (
+        kind == "surface" or (control.setpoint_size == 3 and kind == "point")
+    )
+    if control.setpoint_size and not (follows or impedes):
         raise UserError(
             f"export: control={control.name} takes setpoints, which the runtime of a bundle has for task=track under "
-            "control=computed_torque, and for goals that are points under control=cartesian_impedance; "
-            "stage=transfer runs it"
+            "control=computed_torque, for goals that are points under control=cartesian_impedance, and for "
+            "impedances of tasks on a surface; stage=transfer runs it"
         )
     goals = task.goals(robot, np.random.default_rng(0), 1)
-    if not isinstance(task, TrackTask) and goals.shape != (1, 3):
+    if kind == "point" and goals.shape != (1, 3):
         numbers = " x ".join(map(str, goals.shape[1:]))
         raise UserError(
             f"export: goals of {type(task).__name__} have {numbers} numbers; the runtime of a bundle takes points, "
-            "and the plans of r2s.tasks.track.TrackTask; stage=transfer runs it"
+            "and the plans of r2s.tasks.track.TrackTask and of tasks on a surface; stage=transfer runs it"
         )
 
 
-def controller(control: Controller) -> dict[str, Any]:
-    """Return the controller: action space, parameters of its law, and the model that its setpoints need."""
+def model_of(control: Controller, task: Task) -> InverseDynamics | None:
+    """Return the identified arm of the setpoints of computed torque, or of the force that a task observes."""
+    if isinstance(control, ComputedTorque):
+        return control.model
+    return task.model if isinstance(task, SurfaceTask) else None
+
+
+def controller(control: Controller, task: Task) -> dict[str, Any]:
+    """Return the controller: action space, parameters of its law, and the model of `model_of`."""
+    kind, model = kind_of(task), model_of(control, task)
     return {
         "name": control.name,
         "action": control.action,
@@ -140,8 +166,8 @@ def controller(control: Controller) -> dict[str, Any]:
         "action_offset": listed(control.action_offset),
         "parameters": listed(control.parameters),
         "memory_size": control.memory_size,
-        "setpoint": None if not control.setpoint_size else "plan" if isinstance(control, ComputedTorque) else "goal",
-        "model": computed_torque_model(control) if isinstance(control, ComputedTorque) else None,
+        "setpoint": {"point": "goal"}.get(kind, kind) if control.setpoint_size else None,
+        "model": None if model is None else identified(model, getattr(control, "ahead_s", 0.0), kind),
     }
 
 
@@ -163,7 +189,7 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
             "observation_terms(robot) -> list of r2s.tasks.task.ObservationTerm"
         )
     control, describes = task.control(robot), cast(DescribesObservation, task)
-    preview, known = (task.preview, (*MADE_OF, *OF_PLAN)) if isinstance(task, TrackTask) else (0, MADE_OF)
+    preview, known = task.preview if isinstance(task, TrackTask) else 0, (*MADE_OF, *MORE_OF[kind_of(task)])
     terms = describes.observation_terms(robot)
     if control.observes_torque:
         limit = tuple(task.torque_limit(robot).tolist())
@@ -219,23 +245,35 @@ def start(robot: Robot, task: Task) -> dict[str, Any]:
     """Return the posture at which motions begin, at rest, and how far from it an arm may be."""
     rest = {"within_rad": NEAR_RAD, "fastest_rad_per_s": RESTING}
     if isinstance(task, TrackTask):
-        return {"words": "at rest, at the joint angles of a plan's first row"} | rest
+        return {"words": FIRST_ROW} | rest
+    if isinstance(task, SurfaceTask):
+        return {"words": FIRST_ROW + "; q_rad: of plan.npy"} | rest | surface_start(robot, task)
     spread = getattr(task, "start_spread", None)
     return {"q_rad": listed(robot.q_home)} | rest | {"within_rad": None if spread is None else spread + NEAR_RAD}
 
 
-def computed_torque_model(control: ComputedTorque) -> dict[str, Any]:
-    """Return the model of computed torque, and its numbers."""
-    robot, d = control.model.robot, control.model.dynamics
+WORDS = {
+    "plan": (
+        "command torque + M (ddq + w^2 (q - q_arm) + 2 w (dq - dq_arm)) + C(q, dq) + g(q) - g_nominal(q) "
+        "+ friction(dq) - offset - drag_sin sin q - drag_cos cos q + load |g_nominal(q)| tanh(dq / load_sign); "
+        "q, dq, ddq of the plan `ahead_s` later; w multiplies the errors of now; M, C, g of these links; w and "
+        "the cycles between two updates of the feedback are `parameters`"
+    ),
+    "surface": (
+        "observe the force F of the tip, the least squares of J^T F = tau_J_d - (C(q, dq) + g(q) - g_nominal(q) "
+        "+ friction(dq) - offset - drag_sin sin q - drag_cos cos q + load |g_nominal(q)| tanh(dq / load_sign)); "
+        "C, g of these links"
+    ),
+}
+
+
+def identified(arm: InverseDynamics, ahead_s: float, kind: str) -> dict[str, Any]:
+    """Return the model of the identified arm, what it is for, and its numbers."""
+    robot, d = arm.robot, arm.dynamics
     names = FRICTION[d.family.name]
     phi = dict(zip(d.family.names, d.phi.T, strict=False))
     return {
-        "words": (
-            "command torque + M (ddq + w^2 (q - q_arm) + 2 w (dq - dq_arm)) + C(q, dq) + g(q) - g_nominal(q) "
-            "+ friction(dq) - offset - drag_sin sin q - drag_cos cos q + load |g_nominal(q)| tanh(dq / load_sign); "
-            "q, dq, ddq of the plan `ahead_s` later; w multiplies the errors of now; M, C, g of these links; w and "
-            "the cycles between two updates of the feedback are `parameters`"
-        ),
+        "words": WORDS[kind],
         "links": links_of(robot, d),
         "rotors": listed(d.armature),
         "gravity_m_per_s2": listed(robot.gravity),
@@ -249,7 +287,7 @@ def computed_torque_model(control: ComputedTorque) -> dict[str, Any]:
         "drag_sin_Nm": listed(d.drag[:, 0]),
         "drag_cos_Nm": listed(d.drag[:, 1]),
         "load": listed(d.load),
-        "number": {"ahead_s": control.ahead_s, "sign_rad_per_s": WIDTH_DQ, "load_sign_rad_per_s": SLIDES},
+        "number": {"ahead_s": ahead_s, "sign_rad_per_s": WIDTH_DQ, "load_sign_rad_per_s": SLIDES},
     }
 
 

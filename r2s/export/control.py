@@ -71,9 +71,9 @@ def check_control(contract: dict[str, Any]) -> None:
     if name == "computed_torque" and any(x > most for x, most in zip(scale, limit, strict=True)):
         raise BundleError(f"contract.json: an action of 1 is {scale} Nm, the torque limit is {limit}")
     setpoint, goals = control["setpoint"], contract["goal"]["kind"]
-    if setpoint not in (None, "plan", "goal"):
-        raise BundleError(f"contract.json: control.setpoint is '{setpoint}'; allowed: plan, goal")
-    if (control["model"] is None) != (setpoint != "plan"):
+    if setpoint not in (None, "plan", "goal", "surface"):
+        raise BundleError(f"contract.json: control.setpoint is '{setpoint}'; allowed: plan, goal, surface")
+    if (control["model"] is None) == (setpoint == "plan" or goals == "surface"):
         raise BundleError("contract.json: control.model and control.setpoint go together: a plan needs a model")
-    if setpoint is not None and goals != {"plan": "plan", "goal": "point"}[setpoint]:
+    if setpoint is not None and goals != {"plan": "plan", "goal": "point", "surface": "surface"}[setpoint]:
         raise BundleError(f"contract.json: control.setpoint is the {setpoint}, goals are {goals}s")

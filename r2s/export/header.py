@@ -4,10 +4,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from r2s.arm.clients.collision_thresholds import CAUTIOUS
+from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import LINK
-from r2s.export.runtime import MADE_OF
+from r2s.export.push import PUSH_NUMBER, PUSH_VECTOR, STOPS
+from r2s.export.runtime import MADE_OF, MORE_OF
 
 LOWEST = ("q_low", "q_stop_low")  # where null is minus infinity
+PARAMETERS = 7  # of friction, the most that a family has
 
 
 def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
@@ -34,9 +38,11 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
         none = "-INFINITY" if name in LOWEST else "INFINITY"
         lines.append(f"constexpr double {name}[n] = {_braced(values, none)};  // {filter_['units'][name]}")
     lines += [f"constexpr double {name} = {value!r};" for name, value in filter_["number"].items()]
-    setpoints = 3 if control["setpoint"] == "goal" else 0
-    sizes = {"actions": len(control["action_scale"]), "setpoints": setpoints, "memories": control["memory_size"]}
-    goal = ", then the goal in m" if setpoints else ""
+    on_surface = contract["goal"]["kind"] == "surface"
+    begin, end = contract["goal"]["columns"]["setpoint"] if on_surface else (0, 3 * (control["setpoint"] == "goal"))
+    sizes = {"actions": len(control["action_scale"]), "setpoints": end - begin, "memories": control["memory_size"]}
+    goal = ", then the setpoint of the plan" if on_surface else ", then the goal in m" if end > begin else ""
+    lines += _push(filter_["push"]) + (_surface(contract) if on_surface else [])
     lines += ["", f"// control={control['name']}: the command is the policy's action in {control['unit']}{goal}"]
     lines += [f"constexpr int {name} = {size};" for name, size in sizes.items()]
     parameters = control["parameters"] or [0.0]  # C++ has no empty array
@@ -45,7 +51,8 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
     lines += ["                        const double* command, [[maybe_unused]] double* memory, double* out) {"]
     lines += [f"  {line}" for line in law.splitlines()]
     lines += ["}", "", "// a term of an observation is tanh(of / divided_by), or without tanh"]
-    lines += [f"enum Of {{ {', '.join('of_' + word for word in MADE_OF)} }};"]
+    sources = (*MADE_OF, *MORE_OF[contract["goal"]["kind"]])
+    lines += [f"enum Of {{ {', '.join('of_' + word for word in sources)} }};"]
     lines += ["struct Entry { Of of; int begin, count; bool tanh; double divided_by[n > 3 ? n : 3]; };"]
     lines += [f"constexpr int observations = {seen['size']};", "constexpr Entry entries[] = {"]
     for e in seen["entries"]:
@@ -53,6 +60,54 @@ def header(contract: Mapping[str, Any], policy_sha256: str, law: str) -> str:
         by = e["divided_by"] if isinstance(e["divided_by"], list) else [e["divided_by"] or 1.0] * (end - begin)
         lines.append(f"    {{of_{e['of']}, {begin}, {end - begin}, {str(e['tanh']).lower()}, {_braced(by)}}},")
     return "\n".join([*lines, "};", "", "}  // namespace contract", ""])
+
+
+def _push(push: Mapping[str, Any] | None) -> list[str]:
+    """Return the constants of the limit of pushes, zeros without one, and the thresholds of a Franka's reflexes."""
+    own: Mapping[str, Any] = push or {"stop": STOPS[0]} | dict.fromkeys(PUSH_NUMBER, 0.0) | dict.fromkeys(
+        PUSH_VECTOR, [0.0] * 3
+    )
+    lines = ["", f"constexpr bool limits_pushes = {str(push is not None).lower()};", "namespace push {"]
+    lines += [f"constexpr double {name} = {own[name]!r};" for name in PUSH_NUMBER]
+    lines += [f"constexpr double {name}[3] = {_braced(own[name])};" for name in PUSH_VECTOR]
+    lines += [f"enum Stop {{ {', '.join(STOPS)} }};", f"constexpr Stop stop = {own['stop']};", "}  // namespace push"]
+    for name, unit, cautious in (("torque", "Nm", CAUTIOUS.torque), ("force", "N", CAUTIOUS.force)):
+        values = own.get(f"collision_{name}_{unit}") or list(cautious)
+        lines.append(
+            f"constexpr double collision_{name}[{len(values)}] = {_braced(values)};  // of the arm's reflexes"
+        )
+    return lines
+
+
+def _surface(contract: Mapping[str, Any]) -> list[str]:
+    """Return the constants of plans on a surface, and of the model of the force that the policy observes."""
+    goal, model = contract["goal"], contract["control"]["model"]
+    trained, family = goal["trained"], model["friction"]["family"]
+    names, given = FRICTION[family], model["friction"]["parameters"]
+    rows = [given[k] for k in names] + [[1.0] * len(contract["joints"])] * (PARAMETERS - len(names))
+    lines = ["", "#define CONTRACT_ON_SURFACE", f"constexpr int plan_rows = {goal['shape'][0]};"]
+    lines += [f"constexpr int plan_columns = {goal['shape'][1]};"]
+    lines += [f"constexpr int column_{name} = {begin};" for name, (begin, _) in goal["columns"].items()]
+    vectors = {"plane_point": trained["point_m"], "plane_normal": trained["normal"], "tip": goal["tip_m"]}
+    vectors["gravity"] = model["gravity_m_per_s2"]
+    lines += [f"constexpr double {name}[3] = {_braced(value)};" for name, value in vectors.items()]
+    numbers = {
+        "plane_spread": trained["spread_m"],
+        "plan_force": trained["force_N"][1],
+        "regular": goal["regular_m2"],
+    }
+    numbers |= {
+        "friction_sign": model["number"]["sign_rad_per_s"],
+        "load_sign": model["number"]["load_sign_rad_per_s"],
+    }
+    lines += [f"constexpr double {name} = {value!r};" for name, value in numbers.items()]
+    lines += [_rows(name, [link[name] for link in model["links"]], "own_") for name in ("mass", "com", "tensor")]
+    lines += [f"constexpr double {k}[n] = {_braced(model[v])};" for k, v in OWN.items()]
+    lines += [f"constexpr int family = {list(FRICTION).index(family)};  // {family}: {', '.join(names)}"]
+    return [*lines, f"constexpr double own_friction[{PARAMETERS}][n] = {_braced(rows)};"]
+
+
+OWN = {"own_offset": "offset_Nm", "load": "load", "drag_sin": "drag_sin_Nm", "drag_cos": "drag_cos_Nm"}
 
 
 def _fences(contract: Mapping[str, Any]) -> list[str]:
@@ -66,7 +121,7 @@ def _fences(contract: Mapping[str, Any]) -> list[str]:
     return [*lines, f"constexpr double shoulder[3] = {_braced(trained.get('shoulder_m', [0.0] * 3))};  // m"]
 
 
-def _rows(name: str, values: list[Any]) -> str:
+def _rows(name: str, values: list[Any], before: str = "") -> str:
     """Return the constant of what each link has; a matrix is one row, of a tensor six numbers are."""
     if name == "frame":
         values = [[x for row in frame for x in row] for frame in values]
@@ -74,7 +129,7 @@ def _rows(name: str, values: list[Any]) -> str:
         values = [[t[0][0], t[1][1], t[2][2], t[0][1], t[0][2], t[1][2]] for t in values]
     wide = f"[{len(values[0])}]" if isinstance(values[0], list) else ""
     note = "  // xx yy zz xy xz yz" if name == "tensor" else ""
-    return f"constexpr double {name}[n]{wide} = {_braced(values)};{note}"
+    return f"constexpr double {before}{name}[n]{wide} = {_braced(values)};{note}"
 
 
 def _braced(values: Any, none: str = "INFINITY") -> str:

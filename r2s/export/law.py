@@ -19,6 +19,9 @@ LAW_NUMBER = (
 )
 
 
+OVER = 3  # phase of a stop that has left the surface, see push.py
+
+
 class BundleError(ValueError):
     """A bundle that does not run here; its message is one line."""
 
@@ -71,8 +74,12 @@ class Model:
 
     def hand(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the end effector (3,) m and its Jacobian (3, n) m/rad."""
-        ee = self.frame[-1] @ self._hand + self.origin[-1]
-        return ee, cross(self.axis, ee - self.origin).T
+        return self.point(self._hand)
+
+    def point(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a point of the last link (3,) m, which its frame has at `own`, and its Jacobian (3, n) m/rad."""
+        place = self.frame[-1] @ own + self.origin[-1]
+        return place, cross(self.axis, place - self.origin).T
 
     def equations(self, dq: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) kg m^2 and the Coriolis torque (n,) Nm at dq (n,) rad/s.
@@ -123,11 +130,13 @@ class Driver:
 
     Args:
         law: of a contract. model: of the same. soft_start_s: s over which the torque of a motion fades in.
-        control: `Control` of the contract; None: commands are torques.
+        control: `Control` of the contract; None: commands are torques. push: `PushLimit` of the contract, or None.
     """
 
-    def __init__(self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0, control: Any = None):
-        self._model, self._number, self._control = model, law["number"], control
+    def __init__(
+        self, law: dict[str, Any], model: Model, soft_start_s: float = 0.0, control: Any = None, push: Any = None
+    ):
+        self._model, self._number, self._control, self._push = model, law["number"], control, push
         none = {"q_low": -np.inf, "q_stop_low": -np.inf}
         self._j = {k: per_joint(v, none.get(k, np.inf)) for k, v in law["joint"].items()}
         self._fade = round(soft_start_s / self._number["cycle_s"])
@@ -138,17 +147,19 @@ class Driver:
         n = self._model.n
         self.effort, self._target, self._filtered, self._sent, self._held = np.zeros((5, n))
         self.stopping: str | None = None
+        self._brakes_alone = False  # whether a stop is for the arm's own place or state, and so brakes alone
         self._share, self._cycle, self._silent, self._damped, self._rests = 1.0, 0, 0, 0, False
         self.limited = 0
         self._command: np.ndarray | None = None
-        if self._control is not None:
-            self._control.reset()
+        for part in (self._control, self._push):
+            if part is not None:
+                part.reset()
 
     @property
     def done(self) -> bool:
         """Whether a motion that is being stopped is at rest, or its time is over."""
         over = self._damped * self._number["cycle_s"] >= self._number["damp_s"]
-        return self.stopping is not None and (self._rests or over)
+        return self.stopping is not None and self._damped > 0 and (self._rests or over)
 
     def __call__(
         self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, command: np.ndarray | None, placed: bool = False
@@ -170,11 +181,21 @@ class Driver:
         stopping = self.stopping is not None
         self._damped += stopping
         self._rests = seen and bool((np.abs(dq) < c["still"]).all())
+        if seen:
+            if not placed:
+                self._model.place(q)
+            mass, bias = self._model.equations(dq)
+            if self._push is not None:
+                self._push.see(dq, mass, bias)
         if stopping:  # brake from the present speed, at once
-            self._target = np.zeros_like(self._target)
+            self._target, needs = np.zeros_like(self._target), 0.0
             if seen and self._damped == 1:
                 self._share = min(1.0, float((np.abs(dq) / j["most"]).max()))
-            self._share = max(0.0, self._share - c["cycle_s"] / c["brake_s"])
+            if seen and self._push is not None and not self._brakes_alone:
+                target, needs = self._push.stop(self._held, self._damped)
+                self._target = np.clip(target, -j["asked"], j["asked"])
+                self._rests = self._rests and self._push.phase == OVER
+            self._share = max(needs, self._share - c["cycle_s"] / c["brake_s"])
             if seen and self._share == 0.0:  # a spring against joints that a load or a friction estimate moves on
                 slides = np.abs(dq) > c["still"]
                 along = np.where(slides & (dq * self._held > 0), np.minimum(j["release"], np.abs(self._held)), 0.0)
@@ -192,9 +213,7 @@ class Driver:
         self.effort = self.effort + np.clip(self._clipped(self._filtered) - self.effort, -j["step"], j["step"])
         last = tau_J_d if np.isfinite(tau_J_d).all() else self._sent
         if seen:
-            if not placed:
-                self._model.place(q)
-            out, changed = self._guard(q, dq)
+            out, changed = self._guard(q, dq, last, mass, bias)
             self.limited += changed
             way = self._clipped(out) - last
             way *= 1.0 / max(1.0, float((np.abs(way) / j["step"]).max()))
@@ -210,16 +229,20 @@ class Driver:
         j, c = self._j, self._number
         if self._silent * c["cycle_s"] > c["deadline_s"]:
             return f"no finite action for {1e3 * c['deadline_s']:g} ms"
+        self._brakes_alone = True
         if not seen:
             return "the arm's state is not finite"
         if (near := (q < j["q_stop_low"]) | (q > j["q_stop_high"])).any():
             return f"joint {near.argmax() + 1} is at {q[near.argmax()]:.3f} rad, too close to its limit"
         if (fast := np.abs(dq) > j["dq_stop"]).any():
             return f"joint {fast.argmax() + 1} is at {dq[fast.argmax()]:.3f} rad/s, too close to its limit"
+        self._brakes_alone = False
         return None
 
-    def _guard(self, q: np.ndarray, dq: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the torque (n,) Nm nearest to the effort under which no joint accelerates beyond its bounds.
+    def _guard(
+        self, q: np.ndarray, dq: np.ndarray, last: np.ndarray, mass: np.ndarray, bias: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
+        """Return the torque (n,) Nm nearest to the effort within the bounds of joints and pushes.
 
         And whether it is another one than the effort.
         """
@@ -230,21 +253,34 @@ class Driver:
         )
         left = 1.0 - min(max(near, 0.0), 1.0)
         out = left * (self.effort + self._held)
-        mass, bias = self._model.equations(dq)
         mobility = np.linalg.inv(mass + np.diag(j["added"]))
-        ddq = mobility @ (out - bias)
         high = c["rate"] * (self._allowed(j["q_high"] - q) - dq)
         low = -c["rate"] * (self._allowed(q - j["q_low"]) + dq)
+
+        def bounded(tau: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, bool]:
+            return self._bounded(tau, dq, mobility @ (tau - bias), (mobility, low, high))
+
+        out, changed = bounded(out, bias) if self._push is None else self._push.limit(out, last, bounded)
+        return out, changed or left < 1.0
+
+    def _bounded(
+        self, tau: np.ndarray, dq: np.ndarray, ddq: np.ndarray, bounds: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, bool]:
+        """Return the torque (n,) Nm nearest to tau, which causes ddq, under which no joint is beyond its bounds.
+
+        And whether it is another one. bounds: inverse of the mass matrix, low and high (n,) rad/s^2.
+        """
+        j, c, (mobility, low, high) = self._j, self._number, bounds
         if ((low <= ddq) & (ddq <= high)).all():
-            return out, left < 1.0
+            return tau, False
         light = (j["friction"] > 0.0) & (j["added"] > 0.0)
         held = np.where(light, j["friction"], 1.0)
-        eaten = np.where(light, c["sure"] * held * np.abs(np.tanh(dq / c["dry"] + out / held)), 0.0)
+        eaten = np.where(light, c["sure"] * held * np.abs(np.tanh(dq / c["dry"] + tau / held)), 0.0)
         wider = np.abs(mobility) @ eaten
         low, high = low - wider, high + wider
         if ((low <= ddq) & (ddq <= high)).all():
-            return out, left < 1.0
-        return out + self._push(mobility, ddq, low, high), True
+            return tau, False
+        return tau + self._stops(mobility, ddq, low, high), True
 
     def fastest(self, q: np.ndarray, up: bool) -> np.ndarray:
         """Return the speeds (n,) rad/s that the safety filter allows at q (n,) rad, in one direction."""
@@ -262,7 +298,7 @@ class Driver:
             speed = np.minimum(speed, by)
         return speed
 
-    def _push(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def _stops(self, mobility: np.ndarray, ddq: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return the torques (n,) Nm that stops at the joints would add: block principal pivoting."""
         c = self._number
         side = np.where(ddq > high, 1, np.where(ddq < low, -1, 0))

@@ -15,11 +15,14 @@ from r2s.export.law import BundleError, Model
 COLUMNS = ("place", "velocity", "q", "dq", "ddq")  # of a plan
 # sources of observation terms if goals are plans, beside those with points
 OF_PLAN = ("ahead", "velocity", "limited", "q_off", "dq_off", "control")
+NO_PLAN = "the policy of this bundle follows plans: pass one to `reset`"
 
 
 def width(of: str, joints: int, preview: int) -> int:
     """Return the size of an observation term."""
-    return {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}.get(of, joints)
+    own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
+    own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
+    return {**own, "above_target": 1}.get(of, joints)
 
 
 def check_goal(contract: dict[str, Any]) -> None:
@@ -34,7 +37,7 @@ def check_goal(contract: dict[str, Any]) -> None:
             raise BundleError(f"contract.json: expected goal.shape [3], got {goal['shape']}")
         return
     if goal["kind"] != "plan":
-        raise BundleError(f"contract.json: goal.kind is '{goal['kind']}'; allowed: point, plan")
+        raise BundleError(f"contract.json: goal.kind is '{goal['kind']}'; allowed: point, plan, surface")
     if not isinstance(preview, int) or preview < 1 or not isinstance(goal["steps"], int) or goal["steps"] < 1:
         raise BundleError(f"contract.json: a preview of {preview} samples in {goal['steps']} steps")
     if goal["shape"] != [goal["steps"] + 1 + preview, 6 + 3 * n]:
@@ -59,14 +62,27 @@ def check_goal(contract: dict[str, Any]) -> None:
         check_model(model, n)
 
 
+def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a plan; raise BundleError if it is missing, of another shape, or not finite."""
+    if plan is None:
+        raise BundleError(NO_PLAN)
+    plan = np.array(plan, dtype=float)
+    if plan.shape != shape:
+        raise BundleError(f"expected a plan of shape {shape}, got {plan.shape}")
+    if not (good := np.isfinite(plan)).all():
+        row, column = np.argwhere(~good)[0]
+        raise BundleError(f"expected a finite plan, got {plan[row, column]} in row {row}, column {column}")
+    return plan
+
+
 class Follower:
     """Position in a plan: what the policy observes of it, and the setpoints of the controller.
 
     Args:
-        contract: with plans as goals. control: its controller.
+        contract: with plans as goals. control, model: of the contract.
     """
 
-    def __init__(self, contract: dict[str, Any], control: Control):
+    def __init__(self, contract: dict[str, Any], control: Control, model: Model | None = None):
         goal = contract["goal"]
         self._steps, self._hz, self._preview = goal["steps"], goal["row_hz"], contract["observation"]["preview"]
         self._at = {name: slice(*goal["columns"][name]) for name in COLUMNS}
@@ -77,14 +93,7 @@ class Follower:
 
     def take(self, plan: Any) -> None:
         """Take the plan of the next motion; raise BundleError if it is missing, of another size, or not finite."""
-        if plan is None:
-            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
-        plan = np.array(plan, dtype=float)
-        if plan.shape != self._shape:
-            raise BundleError(f"expected a plan of shape {self._shape}, got {plan.shape}")
-        if not (good := np.isfinite(plan)).all():
-            row, column = np.argwhere(~good)[0]
-            raise BundleError(f"expected a finite plan, got {plan[row, column]} in row {row}, column {column}")
+        plan = finite_plan(plan, self._shape)
         if self._dynamics is not None:
             q, dq, ddq = (plan[:, self._at[k]] for k in ("q", "dq", "ddq"))
             self._setpoints = self._dynamics.setpoints(q, dq, ddq, self._hz, self._steps + 1)
@@ -94,22 +103,20 @@ class Follower:
     def start(self) -> np.ndarray:
         """(n,) rad, where the plan begins."""
         if not self._plan.size:
-            raise BundleError("the policy of this bundle follows plans: pass one to `reset`")
+            raise BundleError(NO_PLAN)
         return self._plan[0, self._at["q"]]
 
-    def __call__(
-        self, step: int, q: np.ndarray, dq: np.ndarray, ee: np.ndarray, limited: float
-    ) -> dict[str, np.ndarray]:
+    def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
         """Return the observation sources of a control step: `goal`, the reference position, OF_PLAN, and `setpoint`.
 
         After the last step the reference stays at the end of the plan.
 
         Args:
-            step: from 0. q, dq: (n,) rad, rad/s. ee: (3,) m, the end effector.
+            step: from 0. seen: q, dq (n,) rad, rad/s, and the end effector `ee` (3,) m.
             limited: share of the last control period in which the safety filter changed the command.
         """
         row, at, plan = min(step, self._steps), self._at, self._plan
-        now = plan[row]
+        now, q, dq, ee = plan[row], seen["q"], seen["dq"], seen["ee"]
         made = {"goal": now[at["place"]], "velocity": now[at["velocity"]], "limited": np.array([limited])}
         made["ahead"] = (plan[row + 1 : row + 1 + self._preview, at["place"]] - ee).ravel()
         made |= {"q_off": now[at["q"]] - q, "dq_off": now[at["dq"]] - dq}

@@ -16,45 +16,25 @@ import hashlib
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from r2s.export.arm import Arm, fits
 from r2s.export.control import Control, check_control
 from r2s.export.fences import PolicyThread, check_plan, check_start, outside, stopped_by_signals  # noqa: F401
-from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number, per_joint
+from r2s.export.law import LAW_JOINT, LAW_NUMBER, BundleError, Driver, Model, is_number
 from r2s.export.plan import OF_PLAN, Follower, check_goal, plan_of, width
+from r2s.export.push import PushLimit, check_push
+from r2s.export.surface import OF_SURFACE, SurfaceFollower, check_surface, check_surface_plan
 
-FORMAT = 5
+FORMAT = 6
 CHANGED = "{} is not what was exported: its sha256 is another"
 CONVENTION = "without gravity"
 # sources of observation terms; `pull` is J^T error
 MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
-
-
-@dataclass(frozen=True)
-class Arm:
-    """The arm that a bundle runs on; a bundle made for another arm is refused.
-
-    Attributes:
-        joints: names, from the base on. cycle_hz: rate of its torque commands.
-        torque: "without gravity" if the arm adds its own gravity compensation, as libfranka's arms do.
-        q_min, q_max: rad. dq_max: rad/s. tau_max: Nm. dtau_max: Nm/s. Limits of the arm, one per joint.
-        slows: deceleration, rad/s^2, and offset, rad/s, per joint, of an arm that allows at a distance d before a
-            position limit the speed sqrt(2 deceleration d) - offset only, as an FR3 does; None: it does not.
-    """
-
-    joints: Sequence[str]
-    cycle_hz: float
-    torque: str
-    q_min: Sequence[float]
-    q_max: Sequence[float]
-    dq_max: Sequence[float]
-    tau_max: Sequence[float]
-    dtau_max: Sequence[float]
-    slows: tuple[Sequence[float], Sequence[float]] | None = None
+MORE_OF = {"point": (), "plan": OF_PLAN, "surface": OF_SURFACE}  # sources beside them, by the kind of goal
 
 
 def seal_of(contract: dict[str, Any]) -> str:
@@ -118,9 +98,10 @@ def _check(contract: dict[str, Any]) -> None:
         raise BundleError(f"contract.json: a policy at {policy} Hz in a cycle at {cycle} Hz; the cycle is 1000 Hz")
     if seen["history"]:
         raise BundleError(f"contract.json: observation.history is {seen['history']}; this runtime has no history")
-    check_goal(contract)
+    (check_surface if contract["goal"]["kind"] == "surface" else check_goal)(contract)
     check_control(contract)
-    at, known = 0, (*MADE_OF, *OF_PLAN) if contract["goal"]["kind"] == "plan" else MADE_OF
+    check_push(contract)
+    at, known = 0, (*MADE_OF, *MORE_OF[contract["goal"]["kind"]])
     for entry in seen["entries"]:
         wide = width(entry["of"], n, seen["preview"])
         if entry["of"] not in known or entry["slice"] != [at, at + wide]:
@@ -130,53 +111,6 @@ def _check(contract: dict[str, Any]) -> None:
         at += wide
     if at != seen["size"]:
         raise BundleError(f"contract.json: expected {seen['size']} observations, got {at}")
-
-
-def fits(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle was made for another arm, or exceeds the limits of this one."""
-    own, n = contract["joints"], len(contract["joints"])
-    if len(arm.joints) != n:
-        raise BundleError(f"expected {n} joints, got {len(arm.joints)} of the arm")
-    for j, (theirs, ours) in enumerate(zip(arm.joints, own, strict=True), 1):
-        if theirs != ours:
-            raise BundleError(f"expected joint {j} '{ours}', got '{theirs}' of the arm")
-    if arm.cycle_hz != contract["rates"]["cycle_hz"]:
-        raise BundleError(f"expected {contract['rates']['cycle_hz']} Hz, got {arm.cycle_hz:g} Hz of the arm")
-    if arm.torque != contract["torque"]["convention"]:
-        raise BundleError(f"expected torque '{contract['torque']['convention']}', got '{arm.torque}' of the arm")
-    limits, torque = contract["limits"], contract["torque"]
-    asked = {"q_max": ("rad", limits["q_max_rad"]), "dq_max": ("rad/s", limits["dq_max_rad_per_s"])}
-    asked |= {"tau_max": ("Nm", torque["max_Nm"]), "dtau_max": ("Nm/s", torque["max_rate_Nm_per_s"])}
-    asked["q_min"] = "rad", limits["q_min_rad"]
-    for name, (unit, most) in asked.items():
-        allowed = np.array(getattr(arm, name), dtype=float)
-        sign = -1.0 if name == "q_min" else 1.0
-        needed = per_joint(most, sign * np.inf)
-        if allowed.shape != (n,):
-            raise BundleError(f"expected {n} values of {name}, got {allowed.size} of the arm")
-        if (beyond := ~(sign * allowed >= sign * needed)).any():
-            j = int(beyond.argmax())
-            raise BundleError(
-                f"{name} of joint {j + 1}: the arm allows {allowed[j]:g} {unit}, the bundle needs {needed[j]:g}"
-            )
-    if arm.slows is not None:
-        _slows(contract, arm)
-
-
-def _slows(contract: dict[str, Any], arm: Arm) -> None:
-    """Raise BundleError if a bundle does not slow down before position limits as the arm demands."""
-    law = Driver(contract["law"], Model(contract["model"]))
-    deceleration, offset = np.array(arm.slows, dtype=float)
-    for way in np.linspace(0.0, 1.0, 101):  # rad before the limit
-        allowed = np.maximum(np.sqrt(2 * deceleration * way) - offset, 0.0)
-        for up in (True, False):
-            asked = law.fastest(np.array(arm.q_max) - way if up else np.array(arm.q_min) + way, up)
-            if (beyond := asked > allowed).any():
-                j = int(beyond.argmax())
-                raise BundleError(
-                    f"{way:.2f} rad before a limit of joint {j + 1} the arm allows {allowed[j]:.2f} rad/s, "
-                    f"the bundle {asked[j]:.2f} rad/s: it was exported for another arm"
-                )
 
 
 class Runtime:
@@ -214,10 +148,13 @@ class Runtime:
             raise BundleError(f"contract.json: {size} observations, policy.onnx takes {taken.shape[-1]}")
         self._policy, self._model = policy, Model(contract["model"])
         self._control = Control(contract)
-        self.driver = Driver(contract["law"], self._model, soft_start_s, self._control)
+        push = None if contract["law"]["push"] is None else PushLimit(contract["law"], self._model)
+        self.driver = Driver(contract["law"], self._model, soft_start_s, self._control, push)
         self._every = contract["rates"]["cycle_hz"] // contract["rates"]["policy_hz"]
         self._entries = [(e["of"], e["divided_by"], e["tanh"]) for e in contract["observation"]["entries"]]
-        self._follower = Follower(contract, self._control) if contract["goal"]["kind"] == "plan" else None
+        followers = {"point": None, "plan": Follower, "surface": SurfaceFollower}
+        make = followers[contract["goal"]["kind"]]
+        self._follower = None if make is None else make(contract, self._control, self._model)
         self._trained = contract["goal"].get("trained")
         self._thread = PolicyThread(self.act) if live else None
         self._cycle = self._limited = self._motion = 0
@@ -236,7 +173,8 @@ class Runtime:
         """
         if self._follower is not None:
             self._follower.take(plan)
-            check_plan(self.contract, self._model, np.array(plan, dtype=float))
+            check = check_surface_plan if self.contract["goal"]["kind"] == "surface" else check_plan
+            check(self.contract, self._model, np.array(plan, dtype=float))
         elif plan is not None:
             raise BundleError("the policy of this bundle takes a point in every cycle, and no plan")
         self.driver.reset()
@@ -288,7 +226,7 @@ class Runtime:
             self._model.place(q)
             command = None if self._thread is None else self._thread.newest(self._motion)
             if self._cycle % self._every == 0:
-                made = self._look(q, dq, goal)
+                made = self._look(q, dq, tau_J_d, goal)
                 seen, setpoint = self.observe(made), made.get("setpoint", np.zeros(0))
                 if not np.isfinite(seen).all():
                     command = None
@@ -315,14 +253,16 @@ class Runtime:
             self.stop(why)
         self._goal = goal.copy()
 
-    def _look(self, q: np.ndarray, dq: np.ndarray, goal: np.ndarray | None) -> dict[str, np.ndarray]:
+    def _look(
+        self, q: np.ndarray, dq: np.ndarray, tau_J_d: np.ndarray, goal: np.ndarray | None
+    ) -> dict[str, np.ndarray]:
         """Return the observation sources of this control step; the model is at q already."""
         ee, jacobian = self._model.hand()
-        made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort}
+        made = {"q": q, "dq": dq, "ee": ee, "effort": self.driver.effort, "tau_J_d": tau_J_d}
         if self._follower is not None:
             changed = (self.driver.limited - self._limited) / self._every
             self._limited = self.driver.limited
-            made |= self._follower(self._cycle // self._every, q, dq, ee, changed)
+            made |= self._follower(self._cycle // self._every, made, changed)
         elif goal is not None:
             made["goal"] = goal
             made["setpoint"] = goal if self.contract["control"]["setpoint"] == "goal" else np.zeros(0)
@@ -346,10 +286,11 @@ class Runtime:
         as many as the preview come after.
 
         Raises:
-            BundleError: goals are points, or the motion is of another size.
+            BundleError: goals are points or plans on a surface, or the motion is of another size.
         """
-        if self._follower is None:
-            raise BundleError("the policy of this bundle takes points, not plans")
+        if self.contract["goal"]["kind"] != "plan":
+            kinds = {"point": "points", "surface": "plans on a surface"}[self.contract["goal"]["kind"]]
+            raise BundleError(f"the policy of this bundle takes {kinds}, not plans")
         q, dq, ddq = (np.asarray(x, dtype=float) for x in (q, dq, ddq))
         allowed = self.contract["goal"]["shape"][0], self._model.n
         if not q.shape == dq.shape == ddq.shape == allowed:
@@ -390,7 +331,8 @@ def main() -> int:
     print(f"whole: {contract['robot']}, joints {' '.join(contract['joints'])}")
     print(f"policy {rates['policy_hz']} Hz, torque {torque['convention']} at {rates['cycle_hz']} Hz")
     goal = contract["goal"]
-    print(f"goal: a {goal['kind']} of {' x '.join(map(str, goal['shape']))} numbers, {goal['unit']}")
+    kind = "plan on a surface" if goal["kind"] == "surface" else goal["kind"]
+    print(f"goal: a {kind} of {' x '.join(map(str, goal['shape']))} numbers, {goal['unit']}")
     for name, values in {"max_Nm": torque["max_Nm"], **limits}.items():
         print(f"{name}: {values}")
     return 0

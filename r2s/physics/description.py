@@ -119,25 +119,25 @@ def write_mjcf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     links, tip = chain(robot, dynamics)
     root = ET.Element("mujoco", model=robot.name)
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast", gravity=_words(robot.gravity))
+    ET.SubElement(root, "option", timestep=repr(SIM_DT), integrator="implicitfast", gravity=words(robot.gravity))
     parent, actuator = ET.SubElement(root, "worldbody"), ET.SubElement(root, "actuator")
     for i, link in enumerate(links):
         parent = ET.SubElement(parent, "body", {"name": link.name} | _place(link.origin))
         x = link.inertia
         tensor = np.array([x[0, 0], x[1, 1], x[2, 2], x[0, 1], x[0, 2], x[1, 2]])
-        ET.SubElement(parent, "inertial", pos=_words(link.com), mass=repr(link.mass), fullinertia=_words(tensor))
+        ET.SubElement(parent, "inertial", pos=words(link.com), mass=repr(link.mass), fullinertia=words(tensor))
         own = {"frictionloss": repr(link.friction), "armature": repr(link.armature)}
         own |= {"damping": _polynomial(link.damping)}
         if link.stiffness.any():
             own |= {"stiffness": _polynomial(link.stiffness), "springref": repr(link.springref)}
-        torque = _words(np.array([-robot.tau_max[i], robot.tau_max[i]]))
-        joint = {"name": link.joint, "axis": _words(link.axis), "actuatorfrcrange": torque}
+        torque = words(np.array([-robot.tau_max[i], robot.tau_max[i]]))
+        joint = {"name": link.joint, "axis": words(link.axis), "actuatorfrcrange": torque}
         if np.isfinite(robot.q_max[i]):
-            joint["range"] = _words(np.array([robot.q_min[i], robot.q_max[i]]))
+            joint["range"] = words(np.array([robot.q_min[i], robot.q_max[i]]))
         ET.SubElement(parent, "joint", joint | own)
         ET.SubElement(actuator, "motor", name=link.joint, joint=link.joint, ctrlrange=torque)
     ET.SubElement(parent, "site", {"name": "ee"} | _place(tip))
-    _write(path, root)
+    write_xml(path, root)
 
 
 def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
@@ -154,7 +154,7 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     for link in links:
         if link.armature:
             transmission = ET.SubElement(root, "transmission", name=f"{link.joint}_rotor")
-            _text(transmission, type="transmission_interface/SimpleTransmission")
+            add_text(transmission, type="transmission_interface/SimpleTransmission")
             ET.SubElement(transmission, "joint", name=link.joint)
             actuator = ET.SubElement(transmission, "actuator", name=f"{link.joint}_motor")
             ET.SubElement(actuator, ROTOR, value=repr(link.armature))
@@ -164,7 +164,7 @@ def write_urdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     ET.SubElement(inertial, "mass", value=repr(mass))
     ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(moment * np.eye(3)).items()})
     _urdf_joint(root, "ee_fixed", "fixed", links[-1].name, "ee", tip)
-    _write(path, root)
+    write_xml(path, root)
 
 
 def urdf(robot: Robot, links: list[Link]) -> ET.Element:
@@ -174,13 +174,13 @@ def urdf(robot: Robot, links: list[Link]) -> ET.Element:
     parent = "base"
     for i, link in enumerate(links):
         inertial = ET.SubElement(ET.SubElement(root, "link", name=link.name), "inertial")
-        ET.SubElement(inertial, "origin", xyz=_words(link.com), rpy="0 0 0")
+        ET.SubElement(inertial, "origin", xyz=words(link.com), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(link.mass))
         ET.SubElement(inertial, "inertia", {k: repr(v) for k, v in _moments(link.inertia).items()})
         endless = not np.isfinite(robot.q_max[i])
         kind = "continuous" if endless else "revolute"
         joint = _urdf_joint(root, link.joint, kind, parent, link.name, link.origin)
-        ET.SubElement(joint, "axis", xyz=_words(link.axis))
+        ET.SubElement(joint, "axis", xyz=words(link.axis))
         limit = {} if endless else {"lower": robot.q_min[i], "upper": robot.q_max[i]}
         limit |= {"velocity": robot.dq_max[i], "effort": robot.tau_max[i]}
         ET.SubElement(joint, "limit", {k: repr(float(v)) for k, v in limit.items()})
@@ -205,7 +205,7 @@ def write_sdf(path: Path, robot: Robot, dynamics: Dynamics) -> None:
     _check_linear(links, "SDF", springs=True)
     root = ET.Element("sdf", version="1.9")
     _sdf_model(root, robot, links, tip, world=False)
-    _write(path, root)
+    write_xml(path, root)
 
 
 def write_world(
@@ -230,16 +230,16 @@ def write_world(
     links, tip = chain(robot, dynamics, friction=False)
     root = ET.Element("sdf", version=version)
     place = ET.SubElement(root, "world", name="r2s")
-    _text(
+    add_text(
         ET.SubElement(place, "physics", name="1ms", type=physics),
         max_step_size=SIM_DT,
         real_time_factor=0,
         real_time_update_rate=0,
     )
-    _text(place, gravity="0 0 0")
+    add_text(place, gravity="0 0 0")
     place.append(plugin)
     _sdf_model(place, robot, links, tip, world=True)
-    _write(path, root)
+    write_xml(path, root)
 
 
 def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarray, *, world: bool) -> None:
@@ -250,33 +250,33 @@ def _sdf_model(place: ET.Element, robot: Robot, links: list[Link], tip: np.ndarr
     for i, link in enumerate(links):
         body = ET.SubElement(model, "link", name=link.name)
         pose = pose @ link.origin
-        _text(body, pose=_pose_words(pose))
+        add_text(body, pose=pose_words(pose))
         inertial = ET.SubElement(body, "inertial")
-        _text(inertial, pose=f"{_words(link.com)} 0 0 0", mass=repr(link.mass))
-        _text(ET.SubElement(inertial, "inertia"), **{k: repr(v) for k, v in _moments(link.inertia).items()})
+        add_text(inertial, pose=f"{words(link.com)} 0 0 0", mass=repr(link.mass))
+        add_text(ET.SubElement(inertial, "inertia"), **{k: repr(v) for k, v in _moments(link.inertia).items()})
         joint = ET.SubElement(model, "joint", name=link.joint, type="revolute")
-        _text(joint, parent=parent, child=link.name)
+        add_text(joint, parent=parent, child=link.name)
         axis = ET.SubElement(joint, "axis")
-        _text(axis, xyz=_words(link.axis))
+        add_text(axis, xyz=words(link.axis))
         low, high = np.nan_to_num([robot.q_min[i], robot.q_max[i]], posinf=ENDLESS, neginf=-ENDLESS)
         limit, damping = {"lower": low, "upper": high}, link.damping[0]
         if world:
             damping += link.armature / SIM_DT
         else:
             limit |= {"effort": robot.tau_max[i], "velocity": robot.dq_max[i]}
-        _text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})
+        add_text(ET.SubElement(axis, "limit"), **{k: repr(float(v)) for k, v in limit.items()})
         own = {"damping": repr(float(damping)), "friction": repr(link.friction)}
         if link.stiffness.any():
             own |= {"spring_reference": repr(link.springref), "spring_stiffness": repr(float(link.stiffness[0]))}
-        _text(ET.SubElement(axis, "dynamics"), **own)
+        add_text(ET.SubElement(axis, "dynamics"), **own)
         parent = link.name
     frame = ET.SubElement(model, "frame", name="ee", attached_to=parent)
-    _text(frame, pose=_pose_words(tip))
+    add_text(frame, pose=pose_words(tip))
 
 
 def _polynomial(coefficients: np.ndarray) -> str:
     """Return a coefficient, or all three if it is not linear."""
-    return _words(coefficients if coefficients[1:].any() else coefficients[:1])
+    return words(coefficients if coefficients[1:].any() else coefficients[:1])
 
 
 def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
@@ -293,7 +293,7 @@ def _check_linear(links: list[Link], form: str, *, springs: bool) -> None:
 def _place(pose: np.ndarray) -> dict[str, str]:
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, pose[:3, :3].flatten())
-    return {"pos": _words(pose[:3, 3]), "quat": _words(quat)}
+    return {"pos": words(pose[:3, 3]), "quat": words(quat)}
 
 
 def _moments(x: np.ndarray) -> dict[str, float]:
@@ -303,7 +303,7 @@ def _moments(x: np.ndarray) -> dict[str, float]:
 
 def _urdf_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=_words(origin[:3, 3]), rpy=_words(_roll_pitch_yaw(origin[:3, :3])))
+    ET.SubElement(joint, "origin", xyz=words(origin[:3, 3]), rpy=words(_roll_pitch_yaw(origin[:3, :3])))
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
     return joint
@@ -318,19 +318,23 @@ def _roll_pitch_yaw(r: np.ndarray) -> np.ndarray:
     return np.array([roll, np.arctan2(-r[2, 0], c * r[0, 0] + s * r[1, 0]), yaw])
 
 
-def _pose_words(pose: np.ndarray) -> str:
-    return f"{_words(pose[:3, 3])} {_words(_roll_pitch_yaw(pose[:3, :3]))}"
+def pose_words(pose: np.ndarray) -> str:
+    """Return position and roll, pitch, yaw of a pose (4, 4), as SDF has them."""
+    return f"{words(pose[:3, 3])} {words(_roll_pitch_yaw(pose[:3, :3]))}"
 
 
-def _words(values: np.ndarray) -> str:
+def words(values: np.ndarray) -> str:
+    """Return numbers that come back exactly."""
     return " ".join(repr(float(v)) for v in values)
 
 
-def _text(element: ET.Element, /, **children: object) -> None:
+def add_text(element: ET.Element, /, **children: object) -> None:
+    """Append a child with a text for each name."""
     for name, value in children.items():
         ET.SubElement(element, name).text = str(value)
 
 
-def _write(path: Path, root: ET.Element) -> None:
+def write_xml(path: Path, root: ET.Element) -> None:
+    """Write an indented XML file."""
     ET.indent(root)
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")

@@ -36,7 +36,7 @@ from r2s.physics.linear_algebra import factor, solve, unpack
 from r2s.physics.payload import ee_pose
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, limit_acceleration
+from r2s.physics.safety_filter import APPROACH, RATE, JointDynamics, bounded, joint_bounds
 from r2s.physics.safety_filter import WORK as FILTER_WORK
 from r2s.physics.tip import Tip, nominal_plane
 
@@ -242,18 +242,21 @@ def limit_pushes(limit, arm, kinematics, last, share, friction, limits, out):
     for j in range(n):
         load[j] = arm.bias[j] + max(limit[RESISTED], 0.0) * row[j]
     touching = JointDynamics(arm.q, arm.dq, arm.mass, load)
-    changed = limit_acceleration(touching, share, friction, limits, work, out)
+    joint_bounds(touching, share, limits, work)
+    changed = bounded(touching, friction, limits, work, own[:n], out)
     before = _excess(lever, bound, out)
     if before <= 0.0:
         return changed
     mobility = 0.0
     for j in range(n):
         mobility += row[j] * lever[j]
-    low, high, after, force = 0.0, np.inf, 0.0, before / mobility  # N; the excess at low and high
+    # N; the excess at low and high. Where no joint is at its bound the first trial hits the middle of CLOSE: aimed at
+    # its border, rounding would decide, and another writing of the law would send another torque
+    low, high, after, force = 0.0, np.inf, 0.0, (before + 0.5 * CLOSE) / mobility
     for _ in range(ROUNDS):
         for j in range(n):
             out[j] = effort[j] - force * row[j]
-        limit_acceleration(touching, share, friction, limits, work, out)
+        bounded(touching, friction, limits, work, own[:n], out)
         now = _excess(lever, bound, out)
         if -CLOSE <= now <= 0.0:
             break

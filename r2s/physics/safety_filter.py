@@ -52,8 +52,8 @@ DELAY_PHASE = 1.25  # rad, phase lag that the delay may cause in a loop; pi / 2 
 # Columns of the limits (n, COLUMNS), one row per joint.
 Q_LOW, Q_HIGH, Q_FADE, DQ_ALLOWED, DECELERATION, OFFSET, DQ_MAX, ADDED, TAU_MAX, STEP = range(10)
 COLUMNS = STEP + 1
-WORK = 7  # rows of `work` beside 2 n
-_DDQ, _LOW, _HIGH, _STOP, _SIDE, _NEXT, _SLACK = range(WORK)
+WORK = 10  # rows of `work` beside 2 n; the first of _INVERTED is whether `work` contains M^-1
+_DDQ, _LOW, _HIGH, _WIDE_LOW, _WIDE_HIGH, _STOP, _SIDE, _NEXT, _SLACK, _INVERTED = range(WORK)
 
 
 class JointDynamics(NamedTuple):
@@ -146,26 +146,45 @@ def fade(q, dq, effort, limits, out):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def limit_acceleration(arm, share, friction, limits, work, out):
     """Change the torques `out` (n,) Nm by rule 2; return whether they were beyond it. See `filter_torque`."""
+    joint_bounds(arm, share, limits, work)
+    return bounded(arm, friction, limits, work, work[: len(out)], out)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def joint_bounds(arm, share, limits, work):
+    """Write the root of the mass matrix and the bounds of rule 2 into `work`, for all torques of a cycle."""
     q, dq, n = arm.q, arm.dq, len(arm.q)
-    ddq, low, high, root = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
-    for j in range(n):
-        ddq[j] = out[j] - arm.bias[j]
+    low, high, root = work[2 * n + _LOW], work[2 * n + _HIGH], work[:n]
     unpack(arm.mass, 1.0, limits[:, ADDED], root)
     factor(root, root)
-    solve(root, ddq)
-    inside = True
     for j in range(n):
         up = _speed_limit(limits[j, Q_HIGH] - q[j], share, limits[j])
         down = _speed_limit(q[j] - limits[j, Q_LOW], share, limits[j])
         high[j], low[j] = RATE * (up - dq[j]), -RATE * (down + dq[j])
+    work[2 * n + _INVERTED, 0] = 0.0
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def bounded(arm, friction, limits, work, desk, out):
+    """Change the torques `out` (n,) Nm by the bounds of `joint_bounds`; return whether they were beyond them.
+
+    desk: (n, n), overwritten; with `work[:n]` the bounds serve for one call.
+    """
+    n, dq = len(out), arm.dq
+    ddq, low, high = work[2 * n + _DDQ], work[2 * n + _LOW], work[2 * n + _HIGH]
+    for j in range(n):
+        ddq[j] = out[j] - arm.bias[j]
+    solve(work[:n], ddq)
+    inside = True
+    for j in range(n):
         inside &= low[j] <= ddq[j] <= high[j]
     if not inside:
-        _widen(low, high, dq, out, friction, limits, work)
-        inside = True
+        _widen(dq, out, friction, limits, work)
+        low, high, inside = work[2 * n + _WIDE_LOW], work[2 * n + _WIDE_HIGH], True
         for j in range(n):
             inside &= low[j] <= ddq[j] <= high[j]
     if not inside:
-        _stop_torque(ddq, low, high, work)
+        _stop_torque(ddq, low, high, work, desk)
         for j in range(n):
             out[j] += work[2 * n + _STOP, j]
     return not inside
@@ -203,34 +222,38 @@ def _speed_limit(distance, share, limits):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _widen(low, high, dq, out, friction, limits, work):
-    """Widen the bounds by the acceleration that friction of all joints can take; leave M^-1 in `work`."""
-    n = len(low)
+def _widen(dq, out, friction, limits, work):
+    """Write the bounds, wider by the acceleration that friction of all joints can take, and M^-1 into `work`."""
+    n = len(out)
     root, mobility, slack = work[:n], work[n : 2 * n], work[2 * n + _SLACK]
     for j in range(n):
         slack[j] = 0.0
         if friction[j] > 0.0 and limits[j, ADDED] > 0.0:  # friction opposes motion, or the torque of a joint at rest
             slack[j] = FRICTION_SHARE * friction[j] * abs(np.tanh(dq[j] / FRICTION_WIDTH + out[j] / friction[j]))
+    if work[2 * n + _INVERTED, 0] == 0.0:
+        work[2 * n + _INVERTED, 0] = 1.0
+        for k in range(n):
+            for j in range(n):
+                mobility[k, j] = 1.0 if j == k else 0.0
+            solve(root, mobility[k])
     for k in range(n):
-        for j in range(n):
-            mobility[k, j] = 1.0 if j == k else 0.0
-        solve(root, mobility[k])
         wider = 0.0
         for j in range(n):
             wider += abs(mobility[k, j]) * slack[j]
-        low[k] -= wider
-        high[k] += wider
+        work[2 * n + _WIDE_LOW, k] = work[2 * n + _LOW, k] - wider
+        work[2 * n + _WIDE_HIGH, k] = work[2 * n + _HIGH, k] + wider
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _stop_torque(ddq, low, high, work):
+def _stop_torque(ddq, low, high, work, root):
     """Write the torque (n,) Nm of stops at the joints into row _STOP of `work`, which contains M^-1.
 
     It solves the linear complementarity problem low <= ddq + M^-1 stop <= high, in which a stop pushes inwards and
     only at a bound, by block principal pivoting (Judice and Pires, Computers & Operations Research 21(5), 1994).
+    root: (n, n), overwritten.
     """
     n = len(ddq)
-    root, mobility = work[:n], work[n : 2 * n]
+    mobility = work[n : 2 * n]
     stop, side, following = work[2 * n + _STOP], work[2 * n + _SIDE], work[2 * n + _NEXT]
     for k in range(n):
         side[k] = 1.0 if ddq[k] > high[k] else (-1.0 if ddq[k] < low[k] else 0.0)

@@ -116,7 +116,9 @@ def identify_surface(cfg, run, arm, data):
     """Write contact.yaml and figure of a surface; return its entry of summary.json and print its table."""
     from r2s.identification.contact.contact_file import save_contact
     from r2s.identification.contact.estimate import identify_contact
+    from r2s.identification.contact.exchange import write_surface
     from r2s.identification.contact.surface_space import LOAD
+    from r2s.physics.description import write_description
     from r2s.progress import Progress
     from r2s.reporting.identification.contact import contact_figure, contact_table, press_table
     from r2s.reporting.tables import print_table
@@ -126,6 +128,9 @@ def identify_surface(cfg, run, arm, data):
     progress.close()
     source = {"recording": data.recording.name, "calibration": cfg.calibration or str(run.folder)}
     save_contact(run.folder / "contact.yaml", arm.robot, found, source | {"run": str(run.folder)})
+    for line in write_description(run.folder / "model", arm.robot, arm.space.dynamics(arm.x)):
+        print(line)
+    write_surface(run.folder / "model", arm.robot, found.surface)
     contact_figure(run.figure("contact"), found)
     print_table(console(), contact_table(found), "surface, 95 % intervals")
     print_table(console(), press_table(found), "surface against joint torques")

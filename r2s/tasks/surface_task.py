@@ -88,9 +88,9 @@ class SurfaceTask(BaseTask):
         check_number("task.tilt", self.tilt, "[0, 45]")
         check_number("task.spread", self.spread, "[0, inf)")
         self._check_range("force", "N")
-        if self.clearance <= self._beyond:
+        if self.clearance <= self.beyond:
             raise UserError(
-                f"task.clearance: {self.clearance:g} m may lie inside the surface; more than {self._beyond:.3g} m is "
+                f"task.clearance: {self.clearance:g} m may lie inside the surface; more than {self.beyond:.3g} m is "
                 "allowed, for place, spread and tilt"
             )
 
@@ -102,7 +102,7 @@ class SurfaceTask(BaseTask):
             raise UserError(f"task.{name}: {pair} is not allowed; two numbers above 0 {unit} are, the lesser first")
 
     @property
-    def _beyond(self) -> float:
+    def beyond(self) -> float:
         """Largest distance, m, of the true surface from the nominal plane at a touched point."""
         return self.place + self.spread * float(np.tan(np.radians(self.tilt)))
 
@@ -241,7 +241,7 @@ class SurfaceTask(BaseTask):
         It moves at approach_speed until the tip has touched for sure, then so that the force rises at force_rate.
         """
         height, K = goals[:, HEIGHT], self.spring
-        touched = self._beyond + LAG_M - (height - self.clearance)  # the tip's centre is a radius above its surface
+        touched = self.beyond + LAG_M - (height - self.clearance)  # the tip's centre is a radius above its surface
         slow, late = self.approach_speed * t - height, (t - self.down_s).clip(0.0)
         return np.minimum(
             slow.clip(None, touched) + self.force_rate / K * late, touched + goals[:, FORCES].max(1) / K
@@ -250,7 +250,7 @@ class SurfaceTask(BaseTask):
     @property
     def down_s(self) -> float:
         """When the tip has touched for sure, s."""
-        return (self._beyond + LAG_M + self.clearance) / self.approach_speed
+        return (self.beyond + LAG_M + self.clearance) / self.approach_speed
 
     @property
     def spring(self) -> float:
@@ -295,7 +295,7 @@ class SurfaceTask(BaseTask):
             ObservationTerm(f"tanh(rate / {FINE_V:g} m/s)", "1", "rate", divided_by=FINE_V, tanh=True),
             ObservationTerm("force / 20 N", "1", "force", divided_by=20.0),
             ObservationTerm(f"tanh(force error / {HARD_N:g} N)", "1", "force_error", divided_by=HARD_N, tanh=True),
-            ObservationTerm(f"tanh(ahead / {FINE_M:g} m)", "1", "ahead", divided_by=FINE_M, tanh=True),
+            ObservationTerm(f"tanh(ahead / {FINE_M:g} m)", "1", "above_target", divided_by=FINE_M, tanh=True),
             ObservationTerm("effort / torque", "1", "effort", divided_by=torque),
             ObservationTerm("limited", "1", "limited"),
         ]

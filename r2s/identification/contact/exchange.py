@@ -5,13 +5,22 @@ MuJoCo's contact force is d (aref - a0) / A with impedance d, inverse mass A and
 A; a high `impratio` keeps friction stiff beside it.
 """
 
+import xml.etree.ElementTree as ET
+from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from r2s.identification.contact.surface_space import LOAD
+from r2s.physics.description import add_text, pose_words, words, write_xml
+from r2s.physics.payload import ee_pose
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
+from r2s.physics.welds import make_pose
 
 IMPEDANCE = 0.01  # of MuJoCo, so that the spring is exact to this share
+WIDE = 1.0  # m, half the edge with which a plane is drawn
 IMPRATIO = 1000.0  # makes the impedance of friction 0.91
 
 
@@ -59,3 +68,63 @@ def sdf_surface(surface: Surface) -> str:
     mu = f"<mu>{surface.friction:.6g}</mu><mu2>{surface.friction:.6g}</mu2>"
     ode = f"<kp>{slope:.6g}</kp><kd>{damping:.6g}</kd><min_depth>0</min_depth>"
     return f"<surface><friction><ode>{mu}</ode></friction><contact><ode>{ode}</ode></contact></surface>"
+
+
+def write_surface(folder: Path, robot: Robot, surface: Surface) -> None:
+    """Write a surface and the tool's tip into arm.xml; the surface as surface.sdf, and the tip into arm.sdf.
+
+    A plane, or a box; nothing else in arm.xml touches. An arm.sdf may be missing.
+
+    Args:
+        folder: of `write_description`. robot: with a tool. surface: of one arm.
+    """
+    site, own_axes = ee_pose(robot)
+    tip, radius = site + own_axes @ robot.tool.tip, robot.tool.radius  # type: ignore[union-attr]
+    path = folder / "arm.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    contact = mujoco_contact(surface, float(model.body_invweight0[model.jnt_bodyid[-1], 0]))
+    across = np.cross(surface.normal, np.eye(3)[np.abs(surface.normal).argmin()])
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(surface.normal, across), surface.normal], -1)
+    axes, place = axes if surface.axes is None else np.asarray(surface.axes), np.array(contact["pos_m"])
+    root = ET.parse(path).getroot()
+    for option in root.iter("option"):
+        option.attrib |= {"cone": contact["cone"], "impratio": repr(contact["impratio"])}
+    own = {key: words(np.array(contact[key])) for key in ("solref", "solimp", "friction")} | {"condim": "3"}
+    shape = {"type": "plane", "size": f"{WIDE} {WIDE} 0.01"}
+    if surface.half is not None:
+        shape = {"type": "box", "size": words(np.asarray(surface.half))}
+    shape |= {"pos": words(place), "xyaxes": words(axes[:, :2].T.ravel())}
+    sphere = {"type": "sphere", "size": repr(radius), "pos": words(tip)}
+    ET.SubElement(list(root.iter("body"))[-1], "geom", {"name": "tip"} | sphere | own)
+    ET.SubElement(next(root.iter("worldbody")), "geom", {"name": "surface"} | shape | own)
+    write_xml(path, root)
+    _write_sdf(folder, surface, make_pose(place, axes), (tip, radius))
+
+
+def _write_sdf(folder: Path, surface: Surface, pose: np.ndarray, tip: tuple[np.ndarray, float]) -> None:
+    """Write surface.sdf with the surface at `pose` (4, 4), and the tip, place (3,) m and radius m, into arm.sdf."""
+    root = ET.Element("sdf", version="1.9")
+    solid = ET.SubElement(root, "model", name="surface")
+    add_text(solid, static="true", pose=pose_words(pose))
+    geometry = _collision(ET.SubElement(solid, "link", name="surface"), "surface", surface)
+    if surface.half is None:
+        add_text(ET.SubElement(geometry, "plane"), normal="0 0 1", size=f"{2 * WIDE} {2 * WIDE}")
+    else:
+        add_text(ET.SubElement(geometry, "box"), size=words(2 * np.asarray(surface.half)))
+    write_xml(folder / "surface.sdf", root)
+    path, (place, radius) = folder / "arm.sdf", tip
+    if path.is_file():
+        root = ET.parse(path).getroot()
+        geometry = _collision(list(root.iter("link"))[-1], "tip", surface, f"{words(place)} 0 0 0")
+        add_text(ET.SubElement(geometry, "sphere"), radius=repr(radius))
+        write_xml(path, root)
+
+
+def _collision(link: ET.Element, name: str, surface: Surface, pose: str = "0 0 0 0 0 0") -> ET.Element:
+    """Append a collision with the parameters of a surface to an SDF link; return its empty geometry."""
+    collision = ET.SubElement(link, "collision", name=name)
+    add_text(collision, pose=pose)
+    geometry = ET.SubElement(collision, "geometry")
+    collision.append(ET.fromstring(sdf_surface(surface)))
+    return geometry

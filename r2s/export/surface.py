@@ -1,0 +1,145 @@
+"""Plans on a surface for policies that press and wipe, in NumPy: a second implementation of tasks/surface_task.py.
+
+A plan has a row per control step: the point of the path on the nominal plane, the plane's normal, the depth of the
+target below the point, the force asked for, the path's velocity, the start posture, and the controller's setpoint. It
+needs nothing of r2s; `r2s export` puts it into the one file of a bundle.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from r2s.export.control import Control
+from r2s.export.inverse_dynamics import InverseDynamics, check_model
+from r2s.export.law import BundleError, Model, is_number
+from r2s.export.plan import NO_PLAN, finite_plan
+
+WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
+# sources of observation terms if goals are plans on a surface, beside those with points
+OF_SURFACE = (
+    *("tip", "height", "tip_velocity", "rate", "force", "force_error", "above_target", "limited", "path_error"),
+    "velocity",
+)
+NEAR_M = 1e-3  # between the tip at the start posture and its place in the plan
+ROUNDING = 1e-6  # m, N, of a plan on the border of what the training had
+
+
+def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
+    """Return the first column and the one behind the last of each part of a plan."""
+    widths = {**WIDTHS, "q": n, "setpoint": setpoints}
+    ends = np.cumsum([0, *widths.values()]).tolist()
+    return {name: [begin, end] for name, begin, end in zip(widths, ends[:-1], ends[1:], strict=True)}
+
+
+def check_surface(contract: dict[str, Any]) -> None:
+    """Raise BundleError if goal, model and controller of a contract are inconsistent."""
+    n, goal, control = len(contract["joints"]), contract["goal"], contract["control"]
+    begin, end = goal["columns"]["setpoint"]
+    if goal["columns"] != columns_of(n, end - begin) or goal["shape"] != [goal["steps"] + 1, end]:
+        raise BundleError(
+            f"contract.json: plans of shape {goal['shape']} with columns {goal['columns']}; {goal['steps']} steps, "
+            f"{n} joints and {end - begin} setpoints make {[goal['steps'] + 1, end]}"
+        )
+    if (end == begin) != (control["setpoint"] is None):
+        raise BundleError(f"contract.json: {end - begin} setpoints, control.setpoint is {control['setpoint']}")
+    if contract["observation"]["preview"]:
+        raise BundleError(f"contract.json: observation.preview is {contract['observation']['preview']}; it is 0")
+    if goal["row_hz"] != contract["rates"]["policy_hz"]:
+        raise BundleError(
+            f"contract.json: plans of {goal['row_hz']} Hz and a policy of {contract['rates']['policy_hz']} Hz"
+        )
+    if not is_number(goal["regular_m2"]) or not goal["regular_m2"] > 0:
+        raise BundleError(f"contract.json: goal.regular_m2 is {goal['regular_m2']}; expected a number above 0")
+    if len(goal["tip_m"]) != 3 or not all(map(is_number, goal["tip_m"])):
+        raise BundleError(f"contract.json: goal.tip_m is {goal['tip_m']}; expected 3 numbers")
+    if control["model"] is None:
+        raise BundleError("contract.json: plans on a surface need control.model")
+    check_model(control["model"], n)
+
+
+def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
+    """Raise BundleError for a plan that the training did not have: off its plane, too hard, or a start elsewhere."""
+    goal = contract["goal"]
+    at, own, trained = goal["columns"], contract["law"]["joint"], goal["trained"]
+    place, normal, depth, force, q = (plan[:, slice(*at[k])] for k in ("place", "normal", "depth", "force", "q"))
+    if (off := np.abs(normal - np.array(trained["normal"])).max(1)).max() > ROUNDING:
+        row = int(off.argmax())
+        raise BundleError(f"row {row} of the plan: a normal of {normal[row].tolist()}, expected {trained['normal']}")
+    away = place - np.array(trained["point_m"])
+    if (high := np.abs((away * normal).sum(1))).max() > ROUNDING:
+        row = int(high.argmax())
+        raise BundleError(f"row {row} of the plan is {1e3 * high[row]:.1f} mm off the nominal plane")
+    if (far := np.linalg.norm(away, axis=1)).max() > trained["spread_m"] + ROUNDING:
+        row = int(far.argmax())
+        raise BundleError(
+            f"row {row} of the plan is {far[row]:.3f} m from the middle; the training had up to "
+            f"{trained['spread_m']:g} m"
+        )
+    most = trained["force_N"][1]
+    if force.max() > most + ROUNDING or force.min() < -ROUNDING:
+        row = int(np.abs(force - 0.5 * most).argmax())
+        raise BundleError(f"row {row} of the plan asks for {force[row, 0]:.3g} N; the training had up to {most:g} N")
+    low, high_q = (np.array([s if v is None else v for v in own[k]]) for k, s in LIMITS.items())
+    if (beyond := (q[0] < low) | (q[0] > high_q)).any():
+        j = int(beyond.argmax())
+        raise BundleError(f"row 0 of the plan: joint {j + 1} at {q[0, j]:.3f} rad is beyond its limit")
+    model.place(q[0])
+    tip = model.point(np.array(goal["tip_m"]))[0]
+    if (apart := np.linalg.norm(tip - place[0] + depth[0] * normal[0])) > NEAR_M:
+        raise BundleError(f"the tip is {1e3 * apart:.1f} mm from where the plan begins")
+
+
+LIMITS = {"q_stop_low": -np.inf, "q_stop_high": np.inf}  # rows of the law, and what null means
+
+
+class SurfaceFollower:
+    """Position in a plan on a surface: what the policy observes of it, and the setpoints of the controller.
+
+    Args:
+        contract: with plans on a surface as goals. control, model: of the contract.
+    """
+
+    def __init__(self, contract: dict[str, Any], control: Control, model: Model):
+        goal = contract["goal"]
+        self._steps, self._shape = goal["steps"], tuple(goal["shape"])
+        self._at = {name: slice(*ends) for name, ends in goal["columns"].items()}
+        self._tip, self._regular = np.array(goal["tip_m"], dtype=float), goal["regular_m2"] * np.eye(3)
+        self._dynamics, self._model = InverseDynamics(contract), model
+        self._plan = np.zeros((0, self._shape[1]))
+
+    def take(self, plan: Any) -> None:
+        """Take the plan of the next motion; raise BundleError if it is missing, of another size, or not finite."""
+        self._plan = finite_plan(plan, self._shape)
+
+    @property
+    def start(self) -> np.ndarray:
+        """(n,) rad, where the plan begins."""
+        if not len(self._plan):
+            raise BundleError(NO_PLAN)
+        return self._plan[0, self._at["q"]]
+
+    def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
+        """Return the observation sources of a control step: OF_SURFACE, `goal`, and `setpoint`.
+
+        After the last step the target stays at the end of the plan.
+
+        Args:
+            step: from 0. seen: q, dq (n,) rad, rad/s, and tau_J_d (n,) Nm. The model is at q already.
+            limited: share of the last control period in which the safety filter changed the command.
+        """
+        now = self._plan[min(step, self._steps)]
+        point, normal, depth, force, velocity = (now[self._at[k]] for k in WIDTHS)
+        place, jacobian = self._model.point(self._tip)
+        offset, speed = place - point, jacobian @ seen["dq"]
+        height, rate = offset @ normal, speed @ normal
+        felt = self._force(seen, jacobian) @ normal
+        made = {"goal": point, "tip": offset, "height": height, "tip_velocity": speed, "rate": rate, "force": force}
+        made |= {"force_error": force + felt, "above_target": height + depth, "limited": limited}
+        made |= {"path_error": offset - height * normal, "velocity": velocity, "setpoint": now[self._at["setpoint"]]}
+        return {name: np.atleast_1d(value) for name, value in made.items()}
+
+    def _force(self, seen: dict[str, np.ndarray], jacobian: np.ndarray) -> np.ndarray:
+        """Return the estimated force (3,) N of the surface on the tip."""
+        q, dq = seen["q"], seen["dq"]
+        external = seen["tau_J_d"] - self._dynamics.equations(q, dq, np.zeros_like(q))[1]
+        return np.linalg.solve(jacobian @ jacobian.T + self._regular, jacobian @ external)

@@ -1,0 +1,84 @@
+"""Contract of a policy that presses or wipes: its plans on a surface, and the limit of its pushes."""
+
+from typing import Any
+
+import numpy as np
+
+from r2s.arm.clients.collision_thresholds import thresholds_of
+from r2s.errors import UserError
+from r2s.export.push import PUSH_NUMBER, STOPS
+from r2s.export.surface import columns_of
+from r2s.physics import contact_stop as stop
+from r2s.physics import push_limit as law
+from r2s.physics.payload import ee_pose
+from r2s.physics.robot import Robot
+from r2s.physics.tip import Tip
+from r2s.tasks.surface_task import REGULAR, START, SurfaceTask
+
+
+def surface_plans(robot: Robot, task: SurfaceTask, goals: np.ndarray) -> np.ndarray:
+    """Return the plans (k, steps + 1, columns) of goals (k, ...) of the task."""
+    control, t = task.control(robot), np.arange(task.steps + 1) / task.ctrl_hz
+    none, starts, out = np.zeros((len(t), 3)), np.zeros((len(t), robot.n)), []
+    for goal in goals:
+        rows = np.tile(goal, (len(t), 1))
+        contact = task.contact(t, rows)
+        velocity = task.now(t, rows)[:, 3:6] if hasattr(task, "now") else none
+        parts = [task.at(t, rows), contact[:, :3], task.depth(t, rows)[:, None], contact[:, 3:], velocity]
+        out.append(np.hstack([*parts, task.begin(starts, rows), control.setpoint(task, t, rows)]))
+    return np.array(out)
+
+
+def surface_goal(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
+    """Return the format of a goal that is a plan on a surface, and what the training had of it."""
+    columns = columns_of(robot.n, task.control(robot).setpoint_size)
+    point, normal = task.plane(robot)
+    trained = {"point_m": point.tolist(), "normal": normal.tolist(), "spread_m": task.spread}
+    trained |= {"place_m": task.place, "tilt_rad": float(np.radians(task.tilt)), "force_N": list(task.force)}
+    site, axes = ee_pose(robot)
+    return {
+        "kind": "surface",
+        "shape": [task.steps + 1, columns["setpoint"][1]],
+        "steps": task.steps,
+        "row_hz": task.ctrl_hz,
+        "columns": columns,
+        "unit": "m, m/s, N, rad, and the units of the controller",
+        "frame": "the arm's base",
+        "examples": "plans.npz",
+        "tip_m": (site + axes @ robot.tool.tip).tolist(),  # type: ignore[union-attr]
+        "regular_m2": REGULAR,
+        "trained": trained | {"seconds": task.episode_s},
+    }
+
+
+def surface_start(robot: Robot, task: SurfaceTask) -> dict[str, Any]:
+    """Return the start of the first example, rad, and how far each joint may be from the start of a plan.
+
+    The tip then is above the surface for sure.
+    """
+    q = task.goals(robot, np.random.default_rng(0), 1)[0, START : START + robot.n]
+    lever = np.abs(task.plane(robot)[1] @ Tip(robot)(q)[1]).sum()
+    return {"q_rad": q.tolist(), "within_rad": round(float((task.clearance - task.beyond) / lever), 4)}
+
+
+def pushes(robot: Robot, limit: law.PushLimit | None) -> dict[str, Any] | None:
+    """Return the numbers of a limit of pushes and of what a stop does with a force; None: without limit."""
+    if limit is None:
+        return None
+    columns = limit.columns(robot)
+    values = [float(columns[k]) for k in (law.FORCE_MAX, law.SPEED_NEAR, law.SLOPE, law.MARGIN, law.RADIUS)]
+    values += [law.NEAR_M, law.OVERSHOOT, law.ROUNDS, law.CLOSE, law.LEAVE, stop.LEAVES_S, stop.RELEASED]
+    values += [stop.SLIDES, stop.RETREAT_M, stop.MOST, stop.GAIN]
+    out: dict[str, Any] = dict(zip(PUSH_NUMBER, values, strict=True))
+    for name, at in (("point", law.POINT), ("normal", law.NORMAL), ("tip", law.TIP)):
+        out[name] = columns[at : at + 3].tolist()
+    out |= {"stop": limit.stop, "collision_torque_Nm": None, "collision_force_N": None}
+    assert limit.stop in STOPS
+    if robot.n == 7:  # of a Franka arm, for libfranka's setCollisionBehavior; null: its cautious ones
+        try:
+            own = thresholds_of(robot, limit)
+        except UserError as error:
+            print(f"no thresholds of an arm's reflexes in the bundle: {error}")
+        else:
+            out |= {"collision_torque_Nm": list(own.torque), "collision_force_N": list(own.force)}
+    return out
