@@ -83,11 +83,18 @@ def finished() -> list[tuple[str, str, float, int]]:
     return [run for run in RUNS if (folder(run) / "summary.json").is_file()]
 
 
+def commit(run: tuple[str, str, float, int]) -> str:
+    """Return the commit of a training, with a + for uncommitted changes."""
+    git = json.loads((folder(run) / "meta.json").read_text())["git"]
+    return git["commit"][:7] + "+" * git["dirty"]
+
+
 def trainings_table() -> str:
     """Return a row per way, algorithm and gamma: the last policy of each seed, on the goals of all reports."""
     rows, order = {}, list(WAYS)
     done = sorted(finished(), key=lambda run: (order.index(run[0]), run[1], run[2], run[3]))
-    for (way, algo, gamma), same in groupby(done, key=lambda run: run[:3]):
+    for (way, algo, gamma), runs in groupby(done, key=lambda run: run[:3]):
+        same = list(runs)
         last = [json.loads((folder(run) / "summary.json").read_text())["last"] for run in same]
 
         def each(key: str, scale: float, digits: int, last=last) -> str:
@@ -95,6 +102,7 @@ def trainings_table() -> str:
 
         rows[f"{WAYS[way].label}; {algo}, gamma {gamma:g}"] = {
             "seeds": len(last),
+            "commit": ", ".join(dict.fromkeys(commit(run) for run in same)),
             "1000 env steps": f"{last[0]['env_steps'] / 1000:.0f}",
             "< 2 cm, %": each("success_2cm", 100, 1),
             "< 1 cm, %": each("success_1cm", 100, 1),
@@ -183,10 +191,10 @@ def page() -> None:
     stops = {(profile, share): motions.stopping(profile, share) for profile in PROFILES for share in SHARES}
     plot(stops)
     parts = [
-        f"{len(finished())} of {len(RUNS)} trainings have finished. The last policy of each seed, on goals, starts "
-        "and arms on which nothing was selected; success for the last 0.5 s. limited: cycles in which the safety "
-        "filter acts. Where eq. (2) acts alone from the first step, exploration noise has a correlation of 0.9 from "
-        "step to step.",
+        f"{len(finished())} of {len(RUNS)} trainings have finished. The last policy of each seed, on goals, "
+        "starts and arms on which nothing was selected; success lasts 0.5 s. limited: cycles in which the "
+        "safety filter acts. Where eq. (2) acts alone from the first step, exploration noise has a correlation of "
+        "0.9 from step to step.",
         trainings_table(),
         "![](paper_reward.png)",
         "## Stopping short, without learning",

@@ -33,7 +33,7 @@ from r2s.override_checks import check_overrides, quoted
 from r2s.physics.robot import load_robot
 from r2s.stages import pipeline
 from r2s.stages.transfer import rest_warning
-from r2s.tasks.rewards import TERMS
+from r2s.tasks.rewards import PAPER, TERMS, Curriculum
 
 TOY = ["+experiment=toy"]
 SHORT = [*TOY, "budget.env_steps=1600", "evaluation.env_steps=1600"]  # if the policy does not matter
@@ -218,6 +218,19 @@ def test_the_grid_is_what_its_file_says(tmp_path):
     config = yaml.safe_load((tmp_path / "train" / names[0] / "config.yaml").read_text())
     assert (config["seed"], config["threads"], config["algo"]["policy_delay"]) == (3, 1, 2)
     assert all((tmp_path / "train" / name / "policy.onnx").is_file() for name in names)
+
+
+def test_the_papers_reward_ends_alone_and_without_noise(tmp_path):
+    """experiment=paper_reward ends in eq. (2) alone; noise has fallen 15-fold before, the learning rate threefold."""
+    succeed("+experiment=[paper_reward,toy]", f"root={tmp_path}", "name=eq2")
+    config = yaml.safe_load((tmp_path / "train" / "eq2" / "config.yaml").read_text())
+    reward = Curriculum(**{k: v for k, v in config["reward"].items() if k != "_target_"})
+    algo, (_, alone) = config["algo"], reward.anneal
+    assert alone < 1
+    assert np.array_equal(reward.weights(None, alone), PAPER)
+    assert algo["explore_end"] ** alone < 1 / 15
+    lr_share = 1 - (1 - algo["lr_end"]) * (alone - algo["lr_decay"]) / (1 - algo["lr_decay"])
+    assert lr_share < 1 / 3
 
 
 COMMANDS = [c.removeprefix("python run.py ") for c in in_blocks(ROOT / "docs" / "reference" / "commands.md")]

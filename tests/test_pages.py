@@ -34,6 +34,7 @@ ELSEWHERE = {  # what this file does not type, and why
     r"python run.py resume=": "test_cli.py kills a run first",
     r"python run.py -m \+experiment=paper_grid": "144 jobs; test_cli.py runs two of them",
     r"python run.py \+experiment=tune": "test_tune.py",
+    r"python run.py \+experiment=paper_reward": "test_cli.py, at toy size",
     r"python run.py .*data\.path=(logs/|\[a\.csv)": "recordings that a reader has: test_known.py",
     r"python run.py .*identify\.prior\.": "a recording of three joints: test_known.py",
     r"python run.py .*(UNLOADED|LOADED)": "an arm with and without a payload: test_loaded.py",

@@ -512,7 +512,14 @@ def test_a_task_from_outside_r2s_shows_its_own_measures(tmp_path, panda, console
     assert list(diagnostic_rows(table, {"arm": row | {"limited": 0.012}})) == ["filter active, %"]
     config = {"algo": {"name": "tqc"}, "task": {"name": "press"}, "dr": {"name": "none"}, "friction": {}}
     contract = {"rates": {"policy_hz": 50, "cycle_hz": 1000}, "robot": "panda", "goal": {"kind": "point"}}
-    sections = card(folder, config, {}, contract | {"torque": {"convention": "without gravity"}}, folder, ["twin"])
+    sections = card(
+        folder,
+        config,
+        {},
+        contract | {"torque": {"convention": "without gravity"}, "law": {"push": None}},
+        folder,
+        ["twin"],
+    )
     assert "It presses on a surface." in sections["tqc for panda, press"][1]
     assert sections["Measured"][0]["held, %"].to_list() == ["97.0"]
 
