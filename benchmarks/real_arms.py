@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import RESULTS, conf, identify_settings, markdown, searches, write_page
+from common import conf, identify_settings, markdown, searches, write_page
 
 from r2s.identification.identify import identify
 from r2s.identification.parameters import parameter_space
@@ -118,12 +118,9 @@ def main() -> None:
         train = joined([load("optitraj1", "motor"), *(trapezoids[j] for j in some)], label)
         test = joined([r for j, r in trapezoids.items() if j not in some], "the other joints")
         evaluate("motor", f"optitraj1, trapezoids of {label}", "the other trapezoids", train, test)
-    page = RESULTS / "real_arms.md"
-    _, heading, sections = page.read_text().partition("\n## ")  # benchmarks/stand.py writes them
     title = "A physical Kinova Gen3: torque sensors and motor currents"
     parts = [DATA, markdown(pd.DataFrame(rows).set_index("torque")), CONCLUSION]
     write_page("real_arms", title, "python benchmarks/real_arms.py FOLDER", parts)
-    page.write_text(page.read_text() + heading + sections)
 
 
 DATA = """\

@@ -57,7 +57,7 @@ class SmoothMotion:
     ) -> "SmoothMotion":
         """Resample to 1 kHz, low-pass forward and backward, differentiate, and keep `rate_hz` without the edges.
 
-        late: of the logged dq against q, which is corrected; None: dq as logged.
+        rate_hz: at most FRICTION_HZ. late: of the logged dq against q, which is corrected; None: dq as logged.
 
         Raises:
             UserError: no trajectory is long enough.
