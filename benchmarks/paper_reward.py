@@ -22,6 +22,10 @@ FALLING = {  # exploration: correlated, and falling to where a joint at rest sta
     "tqc": ("algo.explore_end=0.05",),
     "ddpg": ("algo.explore_std=0.2", "algo.explore_end=0.01"),
 }
+EARLY = (
+    "reward=to_paper",
+    "reward.anneal=[0.3,0.7]",
+)  # eq. (2) acts alone before noise and learning rate have fallen
 CORRELATED = ("algo.explore_correlation=0.9",)
 STILLS = (0.003, 0.01, 0.03, 0.06, 0.1, 0.3)  # standard deviations of an action
 PULLS = (0.0, 1.54, 3.0, 5.0, 7.0)  # S of the figure
@@ -52,8 +56,8 @@ WAYS = {
     "settled": Way("+experiment=paper_reward", 500_000, ("+experiment=paper_reward",), falling=False),
     "alone": Way("eq. (2) alone, action_l2 0", 250_000, ("reward=paper", "algo.action_l2=0", *CORRELATED)),
     "weighed": Way("eq. (2) alone, action_l2 0.5", 500_000, ("reward=paper", *CORRELATED)),
-    "noisy": Way("curriculum that ends in eq. (2), noise stays", 500_000, ("reward=to_paper",), falling=False),
-    "quiet": Way("curriculum that ends in eq. (2), noise falls", 500_000, ("reward=to_paper",)),
+    "noisy": Way("curriculum that ends in eq. (2), noise stays", 500_000, EARLY, falling=False),
+    "quiet": Way("curriculum that ends in eq. (2), noise falls", 500_000, EARLY),
 }
 SEEDS = range(3)
 JUDGED = range(3, 6)  # of the settings that reach; seeds 10 and 11 chose them

@@ -72,6 +72,8 @@ def run_hydra(typed):
             os.environ[FAILED] = str(errors)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints a launcher's exception and exits
             os.environ.setdefault(GROUP, default_name(typed.overrides))
+        else:  # a command that a job of a sweep runs is no job of that sweep: it ends with a status of its own
+            os.environ.pop(FAILED, None)
         try:
             job()
         except Exception as error:

@@ -208,6 +208,16 @@ def test_a_sweep_goes_on_without_the_job_that_fails(tmp_path):
     assert f"already finished: {tmp_path}/train/lr0.001" in r2s(*sweep).stdout
 
 
+def test_a_command_that_a_job_of_a_sweep_runs_fails_by_itself(tmp_path):
+    """It ends with status 2 and is no failed job of the sweep, so that the job sees that its command failed."""
+    env = os.environ | {"R2S_FAILED": str(tmp_path / "failed.txt")}
+    command = [sys.executable, "run.py", "seed=-1", f"root={tmp_path}"]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: seed: ")
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_the_grid_is_what_its_file_says(tmp_path):
     """paper_grid, cut down to two jobs, runs them side by side in folders named by their settings."""
