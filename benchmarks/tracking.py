@@ -3,7 +3,8 @@
 Parts, each doing only what is missing:
     python benchmarks/tracking.py twins VARIANT SEED ...      computed torque with the nominal and identified model
     python benchmarks/tracking.py simulated SEED ...          the same, the true model and policies, on known truth
-    python benchmarks/tracking.py learned VARIANT SEED ...    policies: identified, and nominal with dr=paper
+    python benchmarks/tracking.py learned VARIANT SEED ...    policies of training seed 0: identified, and nominal
+                                                              with dr=paper; trainings=0,1,2: of three seeds
     python benchmarks/tracking.py ablation VARIANT SEED ...   previews, randomizations and pure torque, seed 0
     python benchmarks/tracking.py policy FOLDER VARIANT SEED  any training's policy on a twin
     python benchmarks/tracking.py                             the table of all rows
@@ -214,7 +215,8 @@ if __name__ == "__main__":
         case ["simulated", *seeds]:
             simulated([int(s) for s in seeds])
         case ["learned", variant, *seeds]:
-            learned(variant, [int(s) for s in seeds], LEARNED, TRAININGS)
+            given = [s.removeprefix("trainings=") for s in seeds if "=" in s] or ["0"]
+            learned(variant, [int(s) for s in seeds if "=" not in s], LEARNED, [int(k) for k in given[0].split(",")])
         case ["ablation", variant, *seeds]:
             learned(variant, [int(s) for s in seeds], ABLATION, TRAININGS[:1])
         case ["policy", folder, variant, seed]:
