@@ -212,7 +212,7 @@ def by_numpy(exported: Exported, motion: dict[str, np.ndarray]) -> float:
 )
 def hostile(request, tmp_path_factory) -> Exported:
     """The bundle of a policy of torques, and what a stop does with a force."""
-    torques = "control=torque", "task.torque_fraction=0.5"
+    torques = ("control=torque",)
     return export(tmp_path_factory.mktemp("hostile"), "task=press", *torques, f"task.stop={request.param}", *QUICK)
 
 

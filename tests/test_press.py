@@ -187,7 +187,7 @@ def test_a_step_down_turns_the_direction_of_friction():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"force": (5.0, 90.0)}, r"task.force: expected at most 22.2 N, which control.torque_fraction allows"),
+        ({"force": (5.0, 90.0)}, r"task.force: expected at most 22.2 N, which torque_fraction allows"),
         ({"force": (9.0, 5.0)}, r"task.force: \(9.0, 5.0\) is not allowed"),
         ({"robot": BARE}, r"robot.tool: .* has no tool"),
         ({"clearance": 0.005}, r"task.clearance: 0.005 m may lie inside the surface; more than 0.00937 m"),

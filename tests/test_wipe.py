@@ -156,7 +156,7 @@ def test_measures_of_known_errors(task):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"force": (5.0, 90.0)}, r"task.force: expected at most 22.2 N, which control.torque_fraction allows"),
+        ({"force": (5.0, 90.0)}, r"task.force: expected at most 22.2 N, which torque_fraction allows"),
         ({"speed": (0.3, 0.1)}, r"task.speed: \(0.3, 0.1\) is not allowed; two numbers above 0 m/s"),
         ({"size": (0.03, 0.2)}, r"task.size: expected a number in \(0, 0.0566\]"),
         ({"kinds": ("cirle",)}, r"task.kinds: 'cirle'; .*circle"),

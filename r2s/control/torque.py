@@ -12,4 +12,5 @@ CPP = "for (int j = 0; j < n; ++j) out[j] = command[j];"
 
 def torque(robot: Robot, task: ControlledTask, dynamics: Dynamics | None = None) -> Controller:
     """Return the controller whose action of 1 is the task's torque limit."""
-    return Controller("torque", torque_law, task.torque_limit(robot), np.zeros(robot.n), cpp=CPP)
+    limit = task.torque_limit(robot)
+    return Controller("torque", torque_law, limit, np.zeros(robot.n), cpp=CPP, torque_limit=limit)

@@ -49,7 +49,8 @@ class SurfaceTask(BaseTask):
             `point`. place: m and tilt: degrees, by which the true plane may differ from the nominal one.
         point, normal: of the nominal plane in the base frame, m; None: a table below the tip at home.
         tool: tool file of the robot if robot.tool is null; the stages read it.
-        torque_fraction, cutoff_hz, speed_noise: see `ReachTask`; the torque limit is the controller's, if it has one.
+        torque_fraction: share of tau_max, the largest torque of the task's own controller and of control=torque.
+        cutoff_hz, speed_noise: see `ReachTask`.
         pool: number of goals that a training draws from.
         stop: what a stop does with a force, of `r2s.physics.push_limit.STOPS`; None: release.
         model, own, parameters: the identified arm, the task's own controller and its parameters; see `with_model`.
@@ -67,7 +68,7 @@ class SurfaceTask(BaseTask):
     point: tuple[float, float, float] | None = None
     normal: tuple[float, float, float] | None = None
     tool: str | None = None
-    torque_fraction: float | tuple[float, ...] = 0.3
+    torque_fraction: float | tuple[float, ...] = 0.5
     cutoff_hz: float = 100.0
     speed_noise: float | None = None
     pool: int = 512
@@ -122,7 +123,8 @@ class SurfaceTask(BaseTask):
         if noise is None:
             noise = SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
         task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=noise)
-        own = cartesian_impedance(robot, task, dynamics, hybrid=True, displacement=RESIDUAL_M, **self.own_settings)
+        settings = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M} | self.own_settings
+        own = cartesian_impedance(robot, task, dynamics, hybrid=True, **settings)
         task._check_force(own)
         return replace(task, own=own, parameters=own.parameters)
 
@@ -150,8 +152,7 @@ class SurfaceTask(BaseTask):
             most = float(controller.parameters[FORCE_MAX])
             if self.force[1] > most:
                 raise UserError(
-                    f"task.force: expected at most {most:.3g} N, which control.torque_fraction allows, got "
-                    f"{self.force[1]:g} N"
+                    f"task.force: expected at most {most:.3g} N, which torque_fraction allows, got {self.force[1]:g} N"
                 )
 
     def control(self, robot: Robot) -> Controller:
