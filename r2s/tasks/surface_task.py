@@ -152,7 +152,8 @@ class SurfaceTask(BaseTask):
             most = float(controller.parameters[FORCE_MAX])
             if self.force[1] > most:
                 raise UserError(
-                    f"task.force: expected at most {most:.3g} N, which torque_fraction allows, got {self.force[1]:g} N"
+                    f"task.force: expected at most {most:.3g} N, which torque_fraction allows, got "
+                    f"{self.force[1]:g} N"
                 )
 
     def control(self, robot: Robot) -> Controller:
