@@ -8,6 +8,7 @@ import pandas as pd
 
 from r2s.identification.link_inertia import LINK
 from r2s.identification.result import IdentificationResult
+from r2s.identification.structure.family_selection import CLOSE
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.reporting.document import Item
@@ -204,6 +205,7 @@ def family_table(found: IdentificationResult) -> list[Item]:
     table = pd.DataFrame.from_dict(rows, orient="index", columns=["error / best error", ""]).rename_axis("family")
     words = (
         "Each family was fitted to a part of the recording and scored by its torque error on the rest. A family with "
-        "more parameters is chosen only if it is better by more than one standard error."
+        "more parameters is chosen only if it is better by more than one standard error and, of commanded torque in "
+        f"windows of sliding, if the error of the simpler family is more than {CLOSE} times its own."
     )
     return [words, table]
