@@ -121,7 +121,7 @@ def write(table: pd.DataFrame) -> None:
     text = (
         "Recordings of a synthetic arm of three joints at 1 kHz, identified with the settings of `stage=identify`, "
         "from the command line to the exit: wall-clock time, its ratio to that of the first recording, and largest "
-        "resident memory (libraries alone: about 300 MB). From ten minutes on, torque rows are farther apart, and "
+        "resident memory (libraries alone: about 300 MB). From five minutes on, torque rows are farther apart, and "
         "windows are replayed from 4 minutes spread over the recording."
     )
     parts = [text, markdown(table.set_index("torque")), "![Time and memory by length](long_logs.png)"]

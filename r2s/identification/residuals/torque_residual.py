@@ -28,7 +28,7 @@ from r2s.recordings.recording import Recording
 STEP = 1e-4  # of the unit cube: finite differences, far above round-off and far below the residual's curvature
 MAX_CORRELATION = 40  # rows: a slowly drifting residual still counts as more than one row
 MIN_SIGMA = 1e-9  # Nm
-MOST_ROWS = 60_000  # moments: from ten minutes on they are farther apart, and below the cutoff lose little
+MOST_ROWS = 30_000  # moments: from five minutes on they are farther apart; the cutoff needs 20 of the 100 in a second
 PIECE_S = 60.0  # s of a recording that are filtered at once
 PART = 2048  # moments whose Jacobian is in memory at once
 FULLY_BENT = 4.0  # presliding distances after which bristles are bent to 98 %
