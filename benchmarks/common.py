@@ -17,17 +17,13 @@ sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments; scripts not listed check their own
-    **dict.fromkeys(("bench", "gallery", "watchdog"), ()),
+    **dict.fromkeys(("algorithms", "bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
-    "algorithms": ("trials",),
-    "families": (r"\d+",),
-    "known_truth": (r"\d+",),
     "grid": (r"\d+(,\d+)*", NUMBER),
-    "least_squares": (NUMBER,),
     "press": (rf"minutes={NUMBER}", r"(rigid|elastic)_\d+"),
     "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
-    "transfer": ("page", "twins", "noise", "ablation", "engines", "clients", "driver", r"\d+", r".*/.*"),
+    "transfer": ("page", "twins", "noise", r"\d+"),
     "twins": (r"variant=(rigid|elastic)", r"\d+"),
 }
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from bench import duel
 from common import NEW, ROBOT
+from independent_judge import true_dynamics
 from scipy.signal import savgol_filter
-from stick_slip import true_dynamics
 
 from r2s.physics.actuation import Motors
 from r2s.physics.contact import COLUMNS, DEFLECTION, FORCE

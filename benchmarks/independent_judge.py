@@ -13,10 +13,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-from common import ROBOT
+from common import ROBOT, replace
 from independent_arms import friction
 from scipy.signal import butter, filtfilt, savgol_filter
-from stick_slip import true_dynamics
 
 from r2s.identification.parameter_file import load_parameters, load_posterior
 from r2s.identification.prediction import open_loop_error
@@ -32,12 +31,48 @@ SPEEDS, CHECKED = 40, 5  # points per direction: for the friction error, and for
 POSTURES = 200
 DIRECTIONS = (1, -1)
 REACHED = 5e-3  # rad of motion that counts as breakaway
+START_SPEED = 2e-3  # rad/s, largest measured start velocity of a joint that is at rest
 
 
 def load_truth(folder: Path) -> dict:
     """Return truth.json with lists as arrays."""
     truth = json.loads((folder / "truth.json").read_text())
     return {k: np.array(v) if isinstance(v, list) else v for k, v in truth.items()}
+
+
+def true_dynamics(truth: dict) -> Dynamics:
+    """Return the dynamics of a truth.json; the families do not express the damping of LuGre bristles."""
+    f = {name: np.array(values) for name, values in truth["friction"].items()}
+    if "phi1" in f:
+        family, phi = SIGMOID, np.stack([f["phi1"], f["phi2"], f["phi3"]], -1)
+    else:
+        family, (level, apart), (viscous, own) = COULOMB, _sides(f, "fc"), _sides(f, "fv")
+        columns = [level, apart, viscous]
+        if "vs" in f:
+            rises = [f[f"fs_{side}"] / f[f"fc_{side}"] - 1 for side in ("pos", "neg")]
+            rise, other = _sides({"rise_pos": rises[0], "rise_neg": rises[1]}, "rise")
+            family, columns = STRIBECK, [*columns, rise, f["vs"], other]
+        if "sigma0" in f:  # presliding: deflection of the bristles at the Coulomb level
+            family = BRISTLE
+            columns.insert(5, level / f["sigma0"])
+        phi = np.stack([*columns, own], -1)
+    return replace(
+        Dynamics.of(ROBOT, phi, family, dq_min=START_SPEED),
+        offset=np.array(truth["offset"]),
+        breakaway=np.stack([truth["breakaway_net_neg"], truth["breakaway_net_pos"]], -1),
+        mass=np.array(truth["mass"]),
+        com=np.array(truth["com"]),
+        inertia=np.array(truth["inertia"]),
+        delay=truth["delay_s"],
+        lag=truth["lag_s"],
+        stiction_model="net",  # also if the true breakaway applies to the command: joints rest by their net torque
+    )
+
+
+def _sides(f: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean over both directions, and the relative deviation from it."""
+    mean = 0.5 * (f[f"{name}_pos"] + f[f"{name}_neg"])
+    return mean, f[f"{name}_pos"] / mean - 1
 
 
 def visited(q: np.ndarray) -> np.ndarray:

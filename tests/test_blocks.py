@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_identify import BOUNDS, arm, clean, truth, wrong  # noqa: F401
+from test_identify import BOUNDS, arm, truth, wrong  # noqa: F401
+from test_identify_torque import clean  # noqa: F401
 
 import r2s.identification.residuals.torque_residual as torque_residual
 from r2s.identification.blocks import BLOCK_S, blocks_of

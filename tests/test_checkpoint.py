@@ -1,4 +1,4 @@
-"""A stopped training continues; a value that is not finite stops it, and a dump reproduces it."""
+"""A stopped training continues; a value that is not finite stops it."""
 
 import time
 import zipfile
@@ -13,13 +13,12 @@ from test_cli import r2s, started, succeed
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 
-from r2s.errors import UserError
 from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import UniformRandomization
 from r2s.learning.tqc import TQC
-from r2s.learning.train import Budget, Loop, generators, replay_dump, set_generators, train
+from r2s.learning.train import Budget, Loop, generators, set_generators, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
@@ -196,7 +195,7 @@ def test_noise_of_a_gpu_goes_on_where_it_stopped():
     assert torch.equal(first, torch.randn(5, device=gpu))
 
 
-def train_until_it_breaks(env, algo, dump):
+def train_until_it_breaks(env, algo):
     with pytest.raises(FloatingPointError) as caught:
         train(
             env,
@@ -204,7 +203,6 @@ def train_until_it_breaks(env, algo, dump):
             make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
             Loop(batch_size=16, learning_starts=80),
             Budget(None, 4000),
-            dump=dump,
         )
     return str(caught.value)
 
@@ -224,26 +222,16 @@ def break_goal(env, step):
     return env
 
 
-def never(policy):
-    raise AssertionError("no evaluation was asked for")
-
-
-def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, tmp_path):
-    """NaN in the physics: the message names value, arm and time, and the dump reproduces it."""
+def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda):
+    """NaN in the physics: the message names value, arm and time."""
     env = break_goal(make_env(panda), 250)
-    algo = make_algo(env)
-    message = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
+    message = train_until_it_breaks(env, make_algo(env))
     assert "observation of arm 2 is nan" in message
-    assert "after 996 env steps" in message
-    left = 250 - 200  # steps since the state that the dump begins with
-    with pytest.raises(FloatingPointError) as caught:
-        replay_dump(tmp_path / "dump.pt", break_goal(make_env(panda, seed=3), left), algo, never)
-    assert message.startswith(str(caught.value))
-    assert len(torch.load(tmp_path / "dump.pt", weights_only=True)["actions"]) == left
+    assert message.endswith("after 996 env steps")
 
 
-def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
-    """A NaN in a network: the message names the update, and the dump reproduces it."""
+def test_a_loss_that_is_not_finite_stops_the_run(panda):
+    """A NaN in a network: the message names the update."""
     env = make_env(panda)
     algo = make_algo(env)
     inner = algo.update
@@ -254,30 +242,14 @@ def test_a_loss_that_is_not_finite_stops_the_run(panda, tmp_path):
         return inner(batch)
 
     algo.update = broken  # type: ignore[method-assign]
-    message = train_until_it_breaks(env, algo, tmp_path / "dump.pt")
-    assert message.startswith("the loss of update 41 is nan, after ")
-    with pytest.raises(FloatingPointError, match=r"^the loss of update 41 is nan$"):
-        replay_dump(tmp_path / "dump.pt", make_env(panda), make_algo(env), never)
-    with pytest.raises(UserError, match="is no dump"):
-        replay_dump(tmp_path / "nothing.pt", make_env(panda), algo, never)
+    assert train_until_it_breaks(env, algo).startswith("the loss of update 41 is nan, after ")
 
 
-def test_an_evaluation_that_is_not_finite_stops_the_run(panda, tmp_path):
-    """The message names the time, and the dump reproduces it."""
+def test_an_evaluation_that_is_not_finite_stops_the_run(panda):
     env = make_env(panda)
-    algo = make_algo(env)
 
     def evaluate(policy):
         raise FloatingPointError("action of arm 0 is nan at step 0 of its episode")
 
-    with pytest.raises(FloatingPointError, match=r"after 4000 env steps, in an evaluation; replay it with"):
-        train(
-            env,
-            algo,
-            evaluate,
-            Loop(batch_size=16, learning_starts=4000),
-            Budget(None, 4000),
-            dump=tmp_path / "dump.pt",
-        )
-    with pytest.raises(FloatingPointError, match=r"^action of arm 0 is nan at step 0 of its episode$"):
-        replay_dump(tmp_path / "dump.pt", make_env(panda), make_algo(env), evaluate)
+    with pytest.raises(FloatingPointError, match=r"after 4000 env steps, in an evaluation$"):
+        train(env, make_algo(env), evaluate, Loop(batch_size=16, learning_starts=4000), Budget(None, 4000))

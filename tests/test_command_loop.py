@@ -30,7 +30,7 @@ from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.minimum_jerk import minimum_jerk
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import Space
-from r2s.excitation.paths import check_path
+from r2s.excitation.paths import path_violation
 from r2s.learning.evaluate import fixed_episodes
 from r2s.learning.policy import make_policy
 from r2s.physics.dynamics import nominal_dynamics
@@ -294,7 +294,7 @@ def test_move_to_avoids_obstacles(monkeypatch):
     arm.move_to(folded)
     assert len(places) == 6
     np.testing.assert_array_equal(places[-1], folded)
-    check_path(PANDA, np.array([PANDA.q_home, *places]))
+    assert path_violation(PANDA, np.array([PANDA.q_home, *places]), Space(PANDA)) == ""
     with pytest.raises(ArmStopped, match=r"the path of move_to: the end effector is 0.0.* guide the arm by hand"):
         arm.move_to(LOW)
     assert len(places) == 6

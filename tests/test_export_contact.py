@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, unfenced
-from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, Exported, arm_of, drawn, edited, loaded
+from test_export import COMPILER, LAW_NM, LIBFRANKA, POLICY, Exported, arm_of, drawn, loaded
 
 from r2s import commands
 from r2s.arm.policy_runner import as_state, episode_driver
@@ -307,34 +307,6 @@ def test_a_motion_begins_where_its_plan_does(pressing):
     other.reset(plan)
     with pytest.raises(runtime.BundleError, match=r"joint \d is at .* rad; motions begin within 0.00\d+ rad of"):
         other(plan[0, 11:18] + 0.01, np.zeros(7), np.zeros(7))
-
-
-MUTATIONS = {
-    "a number less": (lambda c: c["law"]["push"].pop("leave"), "law.push.leave is missing"),
-    "no force": (lambda c: c["law"]["push"].update(force_max=0.0), "law.push.force_max is 0.0; expected a number ab"),
-    "a flat normal": (
-        lambda c: c["law"]["push"].update(normal=[0.0, 1.0]),
-        "law.push.normal is [0.0, 1.0]; expected",
-    ),
-    "another stop": (lambda c: c["law"]["push"].update(stop="flee"), "law.push.stop is 'flee'; allowed: hold, rel"),
-    "no limit": (lambda c: c["law"].pop("push"), "damaged: KeyError 'push'"),
-    "longer plans": (lambda c: c["goal"].update(steps=400), "400 steps, 7 joints and 12 setpoints make [401, 30]"),
-    "no model": (lambda c: c["control"].update(model=None), "plans on a surface need control.model"),
-    "no setpoint": (lambda c: c["control"].update(setpoint=None), "12 setpoints, control.setpoint is None"),
-    "a preview": (lambda c: c["observation"].update(preview=2), "observation.preview is 2; it is 0"),
-    "another rate": (lambda c: c["goal"].update(row_hz=50), "plans of 50 Hz and a policy of 100 Hz"),
-    "a tip of two": (lambda c: c["goal"].update(tip_m=[0.0, 0.1]), "goal.tip_m is [0.0, 0.1]; expected 3 numbers"),
-}
-
-
-@pytest.mark.parametrize("kind", MUTATIONS)
-def test_a_contract_that_says_another_thing_is_refused(pressing, tmp_path, kind):
-    """In one line, also where somebody sealed it anew."""
-    change, words = MUTATIONS[kind]
-    refused = edited(pressing, tmp_path / "b", change, runtime := loaded(pressing.folder))
-    with pytest.raises(runtime.BundleError, match=re.escape(words)) as error:
-        runtime.load(refused)
-    assert "\n" not in str(error.value)
 
 
 def test_a_friction_of_ones_own_does_not_travel(pressing):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT, conf
-from test_export import POLICY, arm_of, bare, compare, drawn, edited, fewer, hostile, loaded, refuses, runs_in, swap  # noqa: F401
+from test_export import POLICY, arm_of, bare, compare, drawn, hostile, loaded, runs_in  # noqa: F401
 
 from r2s import commands
 from r2s.arm.policy_runner import PolicyRunner
@@ -18,7 +18,7 @@ from r2s.arm.simulated import SimulatedArm
 from r2s.errors import UserError
 from r2s.export.contract import make_contract
 from r2s.export.control import Control
-from r2s.export.plan import Follower, check_goal
+from r2s.export.plan import Follower
 from r2s.physics.dynamics import nominal_dynamics, with_family
 from r2s.physics.friction import FAMILIES, SIGMOID
 from r2s.physics.robot import load_robot
@@ -89,7 +89,6 @@ def test_the_torque_of_the_model_is_that_of_r2s(panda, arm, family):
     more = {} if arm == "panda" else {"reach": None, "torque_fraction": 0.2}
     task = TrackTask(**SETTINGS | more).with_model(robot, dynamics_of(robot, family))
     contract = json.loads(json.dumps(make_contract(robot, task, task.model.level), allow_nan=False))
-    check_goal(contract)
     control, rng, n = task.control(robot), np.random.default_rng(3), robot.n
     follow = Follower(contract, Control(contract))
     plan = rng.normal(size=contract["goal"]["shape"])
@@ -249,90 +248,6 @@ def test_a_motion_begins_at_the_first_row_of_its_plan(planned, runtime):
     other.reset(plan)
     with pytest.raises(runtime.BundleError, match=r"joint . is at .* rad; motions begin within 0.05 rad of"):
         other(plan[0, 6:13] + 0.1, np.zeros(7), np.zeros(7))
-
-
-def model(contract: dict) -> dict:
-    return contract["control"]["model"]
-
-
-def without_model(contract: dict) -> None:
-    """Leave the model of computed torque out, and its observation."""
-    fewer(contract)
-    contract["control"].update(model=None, setpoint=None)
-
-
-def as_points(contract: dict) -> None:
-    contract["goal"] = {"kind": "point", "shape": [3], "unit": "m"}
-
-
-MUTATIONS: dict[str, tuple[Callable[[dict], object], str]] = {
-    "a longer preview": (
-        lambda c: c["observation"].update(preview=5),
-        "124, 27]; 120 steps, a preview of 5 and 7 jo",
-    ),
-    "no preview": (lambda c: c["observation"].update(preview=0), "a preview of 0 samples in 120 steps"),
-    "half a sample": (lambda c: c["observation"].update(preview=2.5), "a preview of 2.5 samples"),
-    "a history": (lambda c: c["observation"].update(history=3), "observation.history is 3"),
-    "a preview of another width": (
-        lambda c: (c["observation"].update(preview=4), c["goal"].update(shape=[125, 27])),
-        "observation 'the next 3 places - ee' is ahead at [54, 63]; 54 comes next",
-    ),
-    "longer plans": (lambda c: c["goal"].update(steps=400), "shape [124, 27]; 400 steps"),
-    "plans of another rate": (lambda c: c["goal"].update(row_hz=50), "plans of 50 Hz and a policy of 100 Hz"),
-    "another order of columns": (
-        lambda c: c["goal"]["columns"].update(place=[3, 6], velocity=[0, 3]),
-        "'place' of a plan is at [3, 6]; 0 is next",
-    ),
-    "a missing column": (lambda c: c["goal"]["columns"].pop("ddq"), "damaged: KeyError 'ddq'"),
-    "goals that are points": (as_points, "observation.preview is 3; with point goals it is 0"),
-    "another kind of goal": (lambda c: c["goal"].update(kind="path"), "goal.kind is 'path'; allowed: point"),
-    "no model": (lambda c: c["control"].update(model=None), "an observation term needs control.model"),
-    "neither model nor its observation": (without_model, "observations, policy.onnx takes"),
-    "a model that no term observes": (fewer, "no observation term has the controller's torque"),
-    "an action of more than is asked for": (
-        lambda c: c["control"]["action_scale"].__setitem__(0, 99.0),
-        "an action of 1 is [99.0",
-    ),
-    "what an action adds": (lambda c: c["control"]["action_scale"].__setitem__(0, 9.0), "action_scale: '9 "),
-    "an unknown friction": (
-        lambda c: model(c)["friction"].update(family="rubber"),
-        "is 'rubber'; this runtime has",
-    ),
-    "a missing parameter": (
-        lambda c: model(c)["friction"]["parameters"].pop("phi2"),
-        "damaged: KeyError 'phi2'",
-    ),
-    "another family": (
-        lambda c: model(c)["friction"].update(family="coulomb"),
-        "damaged: KeyError 'coulomb'",
-    ),
-    "a joint less": (lambda c: model(c)["offset_Nm"].pop(), "got 6 (control.model.offset_Nm)"),
-    "a number that is none": (
-        lambda c: model(c)["load"].__setitem__(2, None),
-        "control.model.load is [0.0, 0.0, None",
-    ),
-    "a link less": (lambda c: model(c)["links"].pop(), "got 6 (control.model.links)"),
-    "a link without mass": (
-        lambda c: model(c)["links"][3].pop("mass"),
-        "control.model.links has a link without mass",
-    ),
-    "no gravity": (lambda c: model(c).pop("gravity_m_per_s2"), "damaged: KeyError 'gravity_m_per_s2'"),
-    "no delay": (lambda c: model(c)["number"].pop("ahead_s"), "control.model.number.ahead_s is None"),
-    "a delay backwards": (
-        lambda c: model(c)["number"].update(ahead_s=-0.01),
-        "control.model.number.ahead_s is -0.01",
-    ),
-    "a parameter of the law": (
-        lambda c: c["control"]["parameters"].__setitem__(0, None),
-        "control.parameters is [None",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", MUTATIONS)
-def test_a_contract_that_says_another_thing_is_refused(planned, runtime, tmp_path, kind):
-    """In one line, also where somebody sealed it anew."""
-    refuses(planned, runtime, tmp_path / "b", *MUTATIONS[kind])
 
 
 def test_a_friction_of_ones_own_does_not_travel(panda):

@@ -19,9 +19,8 @@ from r2s.adaptation.momentum_residual import MomentumResidual, ResidualState, up
 from r2s.adaptation.payload_jump import JUMP, MEAN, apply_jump
 from r2s.adaptation.tuning import FRICTION_CURVE, LEAST_KG, REPLACED, REST_SPANS, SETTLING_SPANS, THRESHOLD
 from r2s.errors import UserError
+from r2s.identification.posterior import Z_95
 from r2s.physics.robot import SIM_DT
-
-Z = 1.96  # standard deviations of a 95 % interval
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ class Estimator:
     def payload(self) -> np.ndarray:
         """(10,), the payload's inertial parameters in the payload frame; zeros if its mass is not significant."""
         x = self._filter.x[:BODY]
-        return x.copy() if x[0] > max(Z * np.sqrt(self._filter.P[0, 0]), LEAST_KG) else np.zeros(BODY)
+        return x.copy() if x[0] > max(Z_95 * np.sqrt(self._filter.P[0, 0]), LEAST_KG) else np.zeros(BODY)
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
@@ -146,10 +145,10 @@ class Estimator:
 
     def _report(self, changed: bool) -> Estimate:
         x, P, n = self._filter.x, self._filter.P, self._n
-        half = Z * np.sqrt(np.maximum(np.diag(P), 0.0))
+        half = Z_95 * np.sqrt(np.maximum(np.diag(P), 0.0))
         mass, centre, tensor = nearest_body(x[:BODY])
         of_centre = np.column_stack([-centre, np.eye(3)]) / max(mass, LEAST_KG)
-        spread = Z * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", of_centre, P[:4, :4], of_centre), 0.0))
+        spread = Z_95 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", of_centre, P[:4, :4], of_centre), 0.0))
         heavy = mass > max(half[0], LEAST_KG)
         return Estimate(
             cycle=self._cycle,
@@ -160,7 +159,7 @@ class Estimator:
             centre_half=spread if heavy else np.full(3, np.nan),
             tensor=tensor,
             friction=1.0 + x[BODY : BODY + n],
-            friction_half=np.hypot(half[BODY : BODY + n], Z * FRICTION_CURVE),
+            friction_half=np.hypot(half[BODY : BODY + n], Z_95 * FRICTION_CURVE),
             offset=-(x[BODY + n : BODY + 2 * n]),
             offset_half=half[BODY + n : BODY + 2 * n],
             rests=not (self._residual.sliding > 0).any(),

@@ -91,7 +91,7 @@ MOMENTUM_NOISE = 1.33  # of the speed noise: white noise of momenta from filtere
 # 1/s, of the high-pass of momenta; 1/s, of its mean square; times that: noise of momenta on vibrating gears
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation of the friction model's error
-WRENCH_FRICTION, WRENCH_FRICTION_FLOOR = 1.5, 0.03  # of the model error; of the friction level
+WRENCH_FRICTION = 0.03  # of the friction level
 INERTIA_SHARE = 0.05  # of a joint's net torque: error of the inertia
 STIFFNESS = 4e4  # N/m, of what may be touched: force per motion of the tip
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s and s: the most that this makes a force change, and its correlation

@@ -26,12 +26,12 @@ from r2s.adaptation.offline_estimation import at_rate, pauses
 from r2s.adaptation.wrench_filter import update_wrench
 from r2s.adaptation.wrench_state import HANGING, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
+from r2s.identification.posterior import Z_95
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import ee_pose
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
-Z = 1.96  # standard deviations of a 95 % interval
 GAUSSIAN = float(chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
 
 
@@ -43,18 +43,15 @@ class WrenchObserver:
         tool: the robot's, or None.
 
     Args:
-        robot, dynamics: the identified arm. noise: its uncertainty; None: `default_wrench_noise`.
-        threshold: None: twice that of Gaussian noise.
+        robot, dynamics: the identified arm. threshold: None: twice that of Gaussian noise.
     """
 
-    def __init__(
-        self, robot: Robot, dynamics: Dynamics, noise: WrenchNoise | None = None, threshold: float | None = None
-    ):
+    def __init__(self, robot: Robot, dynamics: Dynamics, threshold: float | None = None):
         self._arm, self.tool = make_arm_model(robot, dynamics), robot.tool
         position, axes = ee_pose(robot)
         self._tip = position if robot.tool is None else position + axes @ robot.tool.tip
         self._components = 6 if robot.tool is None else 3
-        self._noise = noise if noise is not None else default_wrench_noise(robot, dynamics)
+        self._noise = wrench_noise(robot, dynamics)
         self.threshold = tuning.UNCALIBRATED * GAUSSIAN if threshold is None else threshold
         self._q, self._dq, self._tau = np.zeros((3, robot.n))
         self.begin()
@@ -113,7 +110,7 @@ class WrenchObserver:
     @property
     def wrench_half(self) -> np.ndarray:
         """Half widths of the 95 % intervals of `wrench`."""
-        return Z * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return Z_95 * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def force(self) -> np.ndarray:
@@ -141,11 +138,10 @@ class WrenchObserver:
         return self._state.joints[REST] > 0.0
 
 
-def default_wrench_noise(robot: Robot, dynamics: Dynamics, model: np.ndarray | None = None) -> WrenchNoise:
-    """Return the uncertainty of an identified arm; model: (n,) Nm, error of its friction; None: a typical error."""
+def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
+    """Return the uncertainty of an identified arm."""
     arm = make_arm_model(robot, dynamics)
-    floor = tuning.WRENCH_FRICTION_FLOOR * arm.level + 3e-3  # Nm: a wrist's
-    friction = floor if model is None else np.maximum(tuning.WRENCH_FRICTION * model, floor)
+    friction = tuning.WRENCH_FRICTION * arm.level + 3e-3  # Nm: a wrist's
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))

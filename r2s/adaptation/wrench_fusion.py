@@ -18,7 +18,6 @@ import numpy as np
 
 from r2s.adaptation import tuning
 from r2s.adaptation.wrench import WrenchObserver
-from r2s.adaptation.wrench_state import WrenchNoise
 from r2s.compiled import njit
 from r2s.errors import UserError
 from r2s.physics.dynamics import Dynamics
@@ -60,14 +59,13 @@ class FusedWrench(WrenchObserver):
         dynamics: Dynamics,
         surface: Surface,
         draws: Sequence[Surface] = (),
-        noise: WrenchNoise | None = None,
         threshold: float | None = None,
     ):
         if robot.tool is None:
             raise UserError("robot.tool: a force from a surface needs the tip that touches it, got none")
         self._law = surface_law(surface, draws, robot.tool.radius, tuning.ANGLE_NOISE)
         self._fused, self._fused_covariance = np.zeros(3), np.zeros((3, 3))
-        super().__init__(robot, dynamics, noise, threshold)
+        super().__init__(robot, dynamics, threshold)
 
     def begin(self) -> None:
         """Begin a motion from rest; the surface is trusted until it errs."""

@@ -14,7 +14,7 @@ from r2s.arm.driver import Driver
 from r2s.arm.interface import Arm, ArmState, speed_share
 from r2s.arm.realtime import Timing
 from r2s.errors import UserError
-from r2s.excitation.motion_checks import DEVIATION, TABLE_M, TOOL_M, Space
+from r2s.excitation.motion_checks import DEVIATION, Space
 from r2s.excitation.paths import approach
 from r2s.identification.friction.breakaway import MOVED
 from r2s.physics.collision import CollisionCheck
@@ -47,11 +47,9 @@ def poses_about(robot: Robot, count: int) -> np.ndarray:
     return np.clip(poses, robot.q_min + 0.2, robot.q_max - 0.2)
 
 
-def check_paths(
-    robot: Robot, poses: np.ndarray, *, what: str = "ramp.poses", table: float = TABLE_M, z_min: float = TOOL_M
-) -> None:
+def check_paths(robot: Robot, poses: np.ndarray, *, what: str = "ramp.poses") -> None:
     """Raise UserError if no path leads from home to the first pose of (P, n) rad, or from a pose to the next."""
-    space = Space(robot, table=table, z_min=z_min)
+    space = Space(robot)
     for k, (a, b) in enumerate(pairwise([robot.q_home, *poses]), 1):
         approach(robot, a, b, what=f"{what}: the path to pose {k}", space=space)
 
@@ -62,16 +60,13 @@ def ramp(
     *,
     rate: np.ndarray | Sequence[float] | float | None = None,
     largest: np.ndarray | Sequence[float] | float | None = None,
-    moved: float = MOVED,
-    table: float = TABLE_M,
-    z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
     timing: Timing | None = None,
 ) -> Ramps:
     """Ramp every joint both ways at every pose and return one trajectory per ramp.
 
     A ramp is a short rest without command, then a command of one joint that rises from 0 at `rate`, the others at 0,
-    until the joint has moved by `moved` (or the command reaches `largest`, or another joint strays). The stop after
+    until the joint has moved by MOVED (or the command reaches `largest`, or another joint strays). The stop after
     each ramp is not recorded. Rows are as in `r2s.arm.recorder`: the state and the command of one cycle. If gravity
     compensation leaves more torque than friction holds, a joint slides without command. It then rests at
     the command that stopped it, and its ramp starts there.
@@ -83,8 +78,6 @@ def ramp(
         rate: (n,) or one number, Nm/s; default 2.2 for joints of tau_max from 40 Nm, 4 below, and in proportion to
             tau_max below 12 Nm.
         largest: (n,) or one number, Nm, at which a ramp gives up; default 20 % of tau_max.
-        moved: rad, well beyond the presliding displacement.
-        table, z_min: m, see `r2s.excitation.motion_checks.check_motion`.
         progress: called after every ramp with (ramps done, total), in a cycle: it must return at once.
         timing: receives the durations of the cycles.
 
@@ -95,24 +88,22 @@ def ramp(
     """
     robot = arm.robot
     places = _poses(robot, poses)
-    check_paths(robot, places, table=table, z_min=z_min)
+    check_paths(robot, places)
     rising = _positive("rate", rate, _default_rate(robot), 0.1 * robot.dtau_max)
     limit = _positive("largest", largest, MAX_SHARE * robot.tau_max, robot.tau_max)
-    if not 1e-4 <= moved <= 0.02:
-        raise UserError(f"ramp.moved: {moved} rad; allowed: 0.0001 to 0.02")
     # all joints one way, then all the other way: each rests in between
     each = [(j, sign) for sign in (1, -1) for j in range(robot.n)]
     which = [(p, j, sign) for p in range(len(places)) for j, sign in each]
     # the ramp of a sliding joint starts at the command that holds it; friction is unknown, this bounds it
     most = np.minimum(limit + BRAKE_SHARE * robot.tau_max, robot.tau_max)
     timing = timing or Timing()
-    how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot, table=table), "speed_share": speed_share(arm)}
+    how = {"cutoff_hz": UNFILTERED_HZ, "fence": CollisionCheck(robot), "speed_share": speed_share(arm)}
     drive, recorded = _Drive(CommandLoop(arm, Driver(robot, most, 2 * most, **how)), timing), []
     try:
         for place in places:
             drive.place(place)
             for i, (j, sign) in enumerate(each):
-                recorded.append(drive.push(j, sign * rising[j], limit[j], moved))
+                recorded.append(drive.push(j, sign * rising[j], limit[j]))
                 drive.stop(next_joint=each[(i + 1) % len(each)][0])
                 if np.abs(drive.state.q - place).max() > STRAY:
                     drive.end()
@@ -187,12 +178,12 @@ class _Drive:
         self.rows.append((s.t, s.q, s.dq, self._loop.sent))
         return after
 
-    def push(self, joint: int, rate: float, largest: float, moved: float) -> list:
+    def push(self, joint: int, rate: float, largest: float) -> list:
         """Ramp one joint at `rate` Nm/s (signed); return all rows since the release."""
         tau, start, left = self.base.copy(), self.rows[0][1], AFTER_MOTION
         while left and abs(tau[joint]) < largest:
             distance = np.abs(self.send(tau).q - start)
-            if left < AFTER_MOTION or distance[joint] >= moved or distance.max() > STRAY:
+            if left < AFTER_MOTION or distance[joint] >= MOVED or distance.max() > STRAY:
                 left -= 1
             tau[joint] += rate * SIM_DT
         return self.rows

@@ -2,7 +2,7 @@
 
 The arm's process continues whatever happens to the policy's process: without a new command for the driver's deadline
 it damps the arm and stops it. A thread would not suffice, because a policy that holds Python's global lock blocks
-every thread (benchmarks/watchdog.py). The processes share memory without a lock, which a killed process would keep.
+every thread. The processes share memory without a lock, which a killed process would keep.
 
 The arm's process has a session of its own, so that no signal of the terminal reaches it. Every motion, the approach
 too, ends damped if the policy's process receives a signal or ends, or if this process receives a signal

@@ -19,7 +19,7 @@ from r2s.arm.tracking_controller import (
 from r2s.errors import UserError
 from r2s.excitation.deviation import DeviationLimits
 from r2s.excitation.motion import Excitation
-from r2s.excitation.motion_checks import TABLE_M, TOOL_M, Space, check_limits, check_space, friction_margin
+from r2s.excitation.motion_checks import Space, check_limits, check_space, friction_margin
 from r2s.physics.collision import CollisionCheck
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording, declared_torque
@@ -34,8 +34,6 @@ def record(
     excitation: Excitation,
     *,
     torque: str = "commanded",
-    table: float = TABLE_M,
-    z_min: float = TOOL_M,
     progress: Callable[[int, int], None] | None = None,
     loaded: bool = False,
     timing: Timing | None = None,
@@ -50,7 +48,6 @@ def record(
         arm: moved to the excitation's first posture, and always stopped at the end.
         excitation: on a 1 ms clock; inside the limits and clear of table and arm, otherwise nothing moves.
         torque: 'commanded' (tau_J_d, without gravity) or 'measured' (tau_J, includes gravity).
-        table, z_min: m, see `r2s.excitation.motion_checks.check_motion`.
         progress: called every 0.5 s of motion with (cycles done, total), in a cycle: it must return at once.
         loaded: the arm may carry an undeclared payload; it is tracked by `LoadedTrackingController`.
         timing: receives the durations of the cycles.
@@ -65,12 +62,13 @@ def record(
     declared_torque(torque)
     share = speed_share(arm)
     _check(arm.robot, excitation, share)
-    check_space(arm.robot, excitation, table=table, z_min=z_min)
+    space = Space(arm.robot)
+    check_space(arm.robot, excitation, space=space)
     follow, most = (LoadedTrackingController, LOADED_DEVIATION) if loaded else (TrackingController, MAX_DEVIATION)
-    allowed = DeviationLimits.along(Space(arm.robot, table=table, z_min=z_min), excitation, most)
+    allowed = DeviationLimits.along(space, excitation, most)
     controller = follow(arm.robot, excitation, allowed)
     limits = TORQUE_SHARE * arm.robot.tau_max, 2 * friction_margin(arm.robot)
-    fence = CollisionCheck(arm.robot, table=table)
+    fence = CollisionCheck(arm.robot)
     loop = CommandLoop(arm, Driver(arm.robot, *limits, cutoff_hz=CUTOFF_HZ, fence=fence, speed_share=share))
     loop.place(excitation.q[0])
     rows, timing = _Rows(len(excitation.t), arm.robot, torque), timing or Timing()

@@ -9,48 +9,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.excitation.motion_checks import CLEARANCE_M, TABLE_M, TOOL_M, Space
+from r2s.excitation.motion_checks import CLEARANCE_M, Space
 from r2s.physics.robot import Robot
 
 CLOSER_M = 1e-3  # m, an arm that starts too near may come closer by this on its way out
 SAME = 1e-3  # rad, a joint so near to its target need not move
 
 
-def check_path(
-    robot: Robot,
-    path: np.ndarray,
-    *,
-    what: str = "the path",
-    table: float = TABLE_M,
-    z_min: float = TOOL_M,
-    space: Space | None = None,
-) -> None:
-    """Raise UserError if a path leaves the limits or comes too near to the table or to the arm itself.
-
-    The first posture is the arm's present one and may violate clearances, but those distances must not decrease.
-
-    Args:
-        robot: limits and links.
-        path: (k, n) rad, k >= 2.
-        what: name of the path for the message.
-        table, z_min: m, see `check_motion`. space: built from them before, to save time.
-    """
-    space = space or Space(robot, table=table, z_min=z_min)
-    if violation := _violation(robot, np.asarray(path, dtype=float), space):
-        raise UserError(f"{what}: {violation}")
-
-
-def approach(
-    robot: Robot,
-    q_from: np.ndarray,
-    q_to: np.ndarray,
-    *,
-    what: str = "the approach",
-    table: float = TABLE_M,
-    z_min: float = TOOL_M,
-    space: Space | None = None,
-) -> np.ndarray:
-    """Return the first path (k, n) rad from q_from to q_to that passes `check_path`.
+def approach(robot: Robot, q_from: np.ndarray, q_to: np.ndarray, *, what: str, space: Space) -> np.ndarray:
+    """Return the first path (k, n) rad from q_from to q_to without a `path_violation`.
 
     The candidates are the straight line, a path through q_home, joint by joint (last or first joint first), and
     joint by joint through q_home.
@@ -58,16 +25,14 @@ def approach(
     Args:
         robot: limits and links.
         q_from, q_to: (n,) rad.
-        what: name of the path for the message.
-        table, z_min: m, see `check_motion`. space: built from them before, to save time.
+        what: name of the path for the message. space: of the robot.
 
     Raises:
         UserError: no candidate is free; the message describes the violation on the straight line.
     """
-    space = space or Space(robot, table=table, z_min=z_min)
     first = ""
     for path in _candidates(robot, np.asarray(q_from, dtype=float), np.asarray(q_to, dtype=float)):
-        violation = _violation(robot, path, space)
+        violation = path_violation(robot, path, space)
         if not violation:
             return path
         first = first or violation
@@ -94,8 +59,11 @@ def _one_by_one(a: np.ndarray, b: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.array([*path[: max(1, len(path) - 1)], b])
 
 
-def _violation(robot: Robot, path: np.ndarray, space: Space) -> str:
-    """Return a description of the first violation on a path (k, n), or ""."""
+def path_violation(robot: Robot, path: np.ndarray, space: Space) -> str:
+    """Return a description of the first place where a path (k, n) leaves limits or comes too near, or "".
+
+    The first posture is the arm's present one and may violate clearances, but those distances must not decrease.
+    """
     if path.ndim != 2 or len(path) < 2 or path.shape[1] != robot.n:
         return f"expected postures of shape (2 or more, {robot.n}), got {path.shape}"
     if not np.isfinite(path).all():

@@ -23,7 +23,7 @@ from r2s.export.card import card
 from r2s.export.contract import make_contract
 from r2s.export.control import LAWS
 from r2s.export.header import header
-from r2s.export.runtime import BundleError, agree, seal_of
+from r2s.export.runtime import BundleError, seal_of
 from r2s.export.surface_contract import surface_plans
 from r2s.identification.contact.contact_file import load_contact
 from r2s.identification.contact.exchange import write_surface
@@ -149,6 +149,28 @@ def copy_policy(source: Path, part: Path, policy: Policy, contract: Mapping[str,
         raise UserError(f"export: {source / 'policy.onnx'} is damaged ({seen_})") from None
     if not off.max() < SAME:
         raise UserError(f"export: policy.onnx of {source} is not its policy.pt: actions differ by {off.max():.2g}")
+
+
+def agree(contract: dict[str, Any], metadata: dict[str, str]) -> None:
+    """Raise BundleError if the metadata of policy.onnx differ from the contract."""
+    limits, torque, rates, control = (contract[k] for k in ("limits", "torque", "rates", "control"))
+
+    def words(values: Sequence[float | None], none: str = "inf") -> str:
+        return " ".join(none if v is None else f"{v:g}" for v in values)
+
+    expected = {"joints": " ".join(contract["joints"]), "observation": contract["observation"]["words"]}
+    expected |= {"policy_hz": str(rates["policy_hz"]), "low_pass_hz": str(rates["low_pass_hz"])}
+    expected |= {"q_min_rad": words(limits["q_min_rad"], "-inf"), "q_max_rad": words(limits["q_max_rad"])}
+    expected |= {"dq_max_rad_per_s": words(limits["dq_max_rad_per_s"]), "torque_max_Nm": words(torque["max_Nm"])}
+    expected["torque_rate_max_Nm_per_s"] = words(torque["max_rate_Nm_per_s"])
+    expected |= {"control": control["name"], "action_scale": words(control["action_scale"])}
+    for name, value in expected.items():
+        if metadata.get(name) != value:
+            raise BundleError(f"{name}: '{value}' in contract.json, '{metadata.get(name)}' in policy.onnx")
+    if not metadata.get("torque", "").startswith(torque["convention"]):
+        raise BundleError(
+            f"torque: '{torque['convention']}' in contract.json, '{metadata.get('torque')}' in policy.onnx"
+        )
 
 
 def one_file(control: Controller) -> str:

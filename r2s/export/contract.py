@@ -16,9 +16,9 @@ from r2s.control.controller import Controller
 from r2s.control.impedance import Impedance
 from r2s.errors import UserError
 from r2s.export.inverse_dynamics import FRICTION
-from r2s.export.law import LAW_JOINT, Model
-from r2s.export.plan import COLUMNS, width
-from r2s.export.runtime import CONVENTION, FORMAT, MADE_OF, MORE_OF
+from r2s.export.law import Model
+from r2s.export.plan import COLUMNS
+from r2s.export.runtime import FORMAT
 from r2s.export.surface_contract import pushes, surface_goal, surface_start
 from r2s.learning.policy import observation_words
 from r2s.physics import safety_filter as law
@@ -32,6 +32,17 @@ from r2s.tasks.surface_task import SurfaceTask
 from r2s.tasks.task import ObservationTerm, Task, observation_scale
 from r2s.tasks.track import TrackTask
 
+CONVENTION = "without gravity"
+# sources of observation terms; `pull` is J^T error
+MADE_OF = ("q", "dq", "ee", "goal", "error", "effort", "pull")
+MORE_OF = {  # sources beside them, by the kind of goal
+    "point": (),
+    "plan": ("ahead", "velocity", "limited", "q_off", "dq_off", "control"),
+    "surface": (
+        *("tip", "height", "tip_velocity", "rate", "force", "force_error", "above_target", "limited", "path_error"),
+        "velocity",
+    ),
+}
 NEAR_RAD = 0.05  # rad, of an arm that was moved to a start posture; half of what a move_to may be off its path
 FIRST_ROW = "at rest, at the joint angles of a plan's first row"
 RESTING = 0.1  # rad/s, of a joint at rest: five times the driver's STILL, for noise of slower sensors
@@ -210,6 +221,13 @@ def observation(robot: Robot, task: Task) -> dict[str, Any]:
     return words | {"normalised": "in policy.onnx", "entries": entries}
 
 
+def width(of: str, joints: int, preview: int) -> int:
+    """Return the size of an observation term."""
+    own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
+    own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
+    return {**own, "above_target": 1}.get(of, joints)
+
+
 def goal(robot: Robot, task: Task, shoulder_m: list[float]) -> dict[str, Any]:
     """Return the format of a goal that is a point, and the region of the training's goals."""
     out: dict[str, Any] = {"kind": "point", "shape": [3], "unit": "m", "frame": "the arm's base"}
@@ -298,7 +316,7 @@ def of_joints(robot: Robot, task: Task, friction: np.ndarray) -> dict[str, list[
     values += [friction, task.torque_limit(robot), robot.q_min + driver.Q_INSIDE, robot.q_max - driver.Q_INSIDE]
     values += [driver.DQ_INSIDE * robot.dq_max, driver.spring(robot)]
     values += [drive_cycle.RELEASE * SIM_DT * robot.tau_max, drive_cycle.ADDED * robot.tau_max]
-    return {name: listed(row) for name, row in zip(LAW_JOINT, values, strict=True)}
+    return {name: listed(row) for name, row in zip(UNITS, values, strict=True)}
 
 
 def numbers(task: Task) -> dict[str, float]:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from r2s.export.law import BundleError, is_number
 from r2s.physics.control_laws import computed_torque_law, torque_law
 
 LAWS: dict[str, Callable] = {"torque": torque_law, "computed_torque": computed_torque_law}
@@ -46,34 +45,3 @@ class Control:
         command = np.concatenate([np.zeros(self.action_dim), setpoint])
         self._law(q, dq, command, self._parameters, np.zeros(self._memory_size), out)
         return out
-
-
-def check_control(contract: dict[str, Any]) -> None:
-    """Raise BundleError if the controller of a contract is unknown or inconsistent."""
-    control, torque = contract["control"], contract["torque"]
-    name, scale = control["name"], control["action_scale"]
-    if name not in LAWS:
-        raise BundleError(
-            f"contract.json: control is '{name}'; this runtime has {', '.join(LAWS)}, "
-            "the r2s_runtime.py of the bundle has its own"
-        )
-    for key in ("action_scale", "action_offset", "parameters"):
-        if not all(map(is_number, control[key])):
-            raise BundleError(f"contract.json: control.{key} is {control[key]}; expected finite numbers")
-    if len(control["action_offset"]) != len(scale):
-        raise BundleError(
-            f"contract.json: expected {len(scale)} numbers, got {len(control['action_offset'])} "
-            "(control.action_offset)"
-        )
-    limit = torque["limit_Nm"]
-    if name == "torque" and scale != limit:
-        raise BundleError(f"contract.json: an action of 1 is {scale} Nm, the torque limit is {limit}")
-    if name == "computed_torque" and any(x > most for x, most in zip(scale, limit, strict=True)):
-        raise BundleError(f"contract.json: an action of 1 is {scale} Nm, the torque limit is {limit}")
-    setpoint, goals = control["setpoint"], contract["goal"]["kind"]
-    if setpoint not in (None, "plan", "goal", "surface"):
-        raise BundleError(f"contract.json: control.setpoint is '{setpoint}'; allowed: plan, goal, surface")
-    if (control["model"] is None) == (setpoint == "plan" or goals == "surface"):
-        raise BundleError("contract.json: control.model and control.setpoint go together: a plan needs a model")
-    if setpoint is not None and goals != {"plan": "plan", "goal": "point", "surface": "surface"}[setpoint]:
-        raise BundleError(f"contract.json: control.setpoint is the {setpoint}, goals are {goals}s")

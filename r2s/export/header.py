@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from r2s.arm.clients.collision_thresholds import CAUTIOUS
+from r2s.export.contract import MADE_OF, MORE_OF
 from r2s.export.inverse_dynamics import FRICTION
 from r2s.export.law import LINK
 from r2s.export.push import PUSH_NUMBER, PUSH_VECTOR, STOPS
-from r2s.export.runtime import MADE_OF, MORE_OF
 
 LOWEST = ("q_low", "q_stop_low")  # where null is minus infinity
 PARAMETERS = 7  # of friction, the most that a family has

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from r2s.export.law import LINK, BundleError, Model, is_number
+from r2s.export.law import Model
 
 MODEL_JOINT = ("rotors", "offset_Nm", "load", "drag_sin_Nm", "drag_cos_Nm")
-MODEL_NUMBER = ("ahead_s", "sign_rad_per_s", "load_sign_rad_per_s")
 _STRIBECK = ("coulomb", "asymmetry", "viscous", "rise", "stribeck_velocity", "rise_asymmetry", "viscous_asymmetry")
 FRICTION = {
     "sigmoid": ("phi1", "phi2", "phi3", "viscous"),
@@ -19,34 +18,6 @@ FRICTION = {
     "stribeck": _STRIBECK,
     "bristle": _STRIBECK,  # feedforward without presliding
 }
-
-
-def check_model(model: dict[str, Any], n: int) -> None:
-    """Raise BundleError if `control.model` of a contract is incomplete."""
-    friction = model["friction"]
-    if friction["family"] not in FRICTION:
-        raise BundleError(
-            f"contract.json: control.model.friction is '{friction['family']}'; this runtime has {', '.join(FRICTION)}"
-        )
-    if missing := [k for link in model["links"] for k in LINK if k not in link]:
-        raise BundleError(f"contract.json: control.model.links has a link without {missing[0]}")
-    lists = {f"control.model.{k}": model[k] for k in ("links", *MODEL_JOINT)}
-    own = FRICTION[friction["family"]]
-    lists |= {f"control.model.friction.parameters.{k}": friction["parameters"][k] for k in own}
-    for name, values in lists.items():
-        if len(values) != n:
-            raise BundleError(f"contract.json: expected {n} joints, got {len(values)} ({name})")
-        if name != "control.model.links" and not all(map(is_number, values)):
-            raise BundleError(f"contract.json: {name} is {values}; expected finite numbers")
-    if len(model["gravity_m_per_s2"]) != 3:
-        raise BundleError(
-            f"contract.json: expected 3 numbers, got {len(model['gravity_m_per_s2'])} "
-            "(control.model.gravity_m_per_s2)"
-        )
-    for name in MODEL_NUMBER:
-        value = model["number"].get(name)
-        if not is_number(value) or value < 0 or (value == 0 and name != "ahead_s"):
-            raise BundleError(f"contract.json: control.model.number.{name} is {value}; expected a number above 0")
 
 
 class InverseDynamics:

@@ -9,26 +9,12 @@ from typing import Any
 import numpy as np
 
 LINK = {"place": (3,), "frame": (3, 3), "axis": (3,), "mass": (), "com": (3,), "tensor": (3, 3)}
-LAW_JOINT = (
-    *("q_low", "q_high", "q_fade", "most", "slowing", "offset", "dq_max", "added", "tau_max", "step"),
-    *("friction", "asked", "q_stop_low", "q_stop_high", "dq_stop", "spring", "release", "held_most"),
-)
-LAW_NUMBER = (
-    *("cycle_s", "low_pass", "rate", "approach", "allowed", "nothing", "exact", "dry", "sure", "pivots", "rounds"),
-    *("brake_s", "damp_s", "still", "deadline_s"),
-)
-
 
 OVER = 3  # phase of a stop that has left the surface, see push.py
 
 
 class BundleError(ValueError):
     """A bundle that does not run here; its message is one line."""
-
-
-def is_number(value: Any) -> bool:
-    """Return whether a value of a contract is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < np.inf
 
 
 def per_joint(values: Sequence[float | None], none: float) -> np.ndarray:

@@ -9,57 +9,11 @@ from typing import Any
 import numpy as np
 
 from r2s.export.control import Control
-from r2s.export.inverse_dynamics import InverseDynamics, check_model
+from r2s.export.inverse_dynamics import InverseDynamics
 from r2s.export.law import BundleError, Model
 
 COLUMNS = ("place", "velocity", "q", "dq", "ddq")  # of a plan
-# sources of observation terms if goals are plans, beside those with points
-OF_PLAN = ("ahead", "velocity", "limited", "q_off", "dq_off", "control")
 NO_PLAN = "the policy of this bundle follows plans: pass one to `reset`"
-
-
-def width(of: str, joints: int, preview: int) -> int:
-    """Return the size of an observation term."""
-    own = {"ee": 3, "goal": 3, "error": 3, "velocity": 3, "limited": 1, "ahead": 3 * preview}
-    own |= {"tip": 3, "tip_velocity": 3, "path_error": 3, "height": 1, "rate": 1, "force": 1, "force_error": 1}
-    return {**own, "above_target": 1}.get(of, joints)
-
-
-def check_goal(contract: dict[str, Any]) -> None:
-    """Raise BundleError if goal, preview and controller of a contract are inconsistent."""
-    n, goal, seen = len(contract["joints"]), contract["goal"], contract["observation"]
-    model = contract["control"]["model"]
-    preview, made = seen["preview"], {entry["of"] for entry in seen["entries"]}
-    if goal["kind"] == "point":
-        if preview:
-            raise BundleError(f"contract.json: observation.preview is {preview}; with point goals it is 0")
-        if goal["shape"] != [3]:
-            raise BundleError(f"contract.json: expected goal.shape [3], got {goal['shape']}")
-        return
-    if goal["kind"] != "plan":
-        raise BundleError(f"contract.json: goal.kind is '{goal['kind']}'; allowed: point, plan, surface")
-    if not isinstance(preview, int) or preview < 1 or not isinstance(goal["steps"], int) or goal["steps"] < 1:
-        raise BundleError(f"contract.json: a preview of {preview} samples in {goal['steps']} steps")
-    if goal["shape"] != [goal["steps"] + 1 + preview, 6 + 3 * n]:
-        raise BundleError(
-            f"contract.json: plans of shape {goal['shape']}; {goal['steps']} steps, a preview of {preview} and {n} "
-            f"joints make {[goal['steps'] + 1 + preview, 6 + 3 * n]}"
-        )
-    ends = np.cumsum([0, 3, 3, n, n, n]).tolist()
-    for name, begin, end in zip(COLUMNS, ends[:-1], ends[1:], strict=True):
-        if goal["columns"][name] != [begin, end]:
-            raise BundleError(f"contract.json: '{name}' of a plan is at {goal['columns'][name]}; {begin} is next")
-    if goal["row_hz"] != contract["rates"]["policy_hz"]:
-        raise BundleError(
-            f"contract.json: plans of {goal['row_hz']} Hz and a policy of {contract['rates']['policy_hz']} Hz"
-        )
-    if (model is None) == ("control" in made):
-        words = (
-            "no observation term has the controller's torque" if model else "an observation term needs control.model"
-        )
-        raise BundleError(f"contract.json: {words}")
-    if model is not None:
-        check_model(model, n)
 
 
 def finite_plan(plan: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -107,7 +61,7 @@ class Follower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step: `goal`, the reference position, OF_PLAN, and `setpoint`.
+        """Return the observation sources of a control step, and `setpoint`; `goal` is the reference position.
 
         After the last step the reference stays at the end of the plan.
 

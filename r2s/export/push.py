@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from r2s.export.law import OVER, BundleError, Model, cross, is_number
+from r2s.export.law import OVER, Model, cross
 
 PUSH_NUMBER = (
     *("force_max", "speed_near", "slope", "margin", "radius", "near_m", "overshoot", "trials", "close", "leave"),
@@ -18,23 +18,6 @@ PUSH_NUMBER = (
 PUSH_VECTOR = ("point", "normal", "tip")
 STOPS = ("hold", "release", "retreat")
 BEGINS, PRESSES, CLEAR = range(3)  # phases of a stop, before OVER
-
-
-def check_push(contract: dict[str, Any]) -> None:
-    """Raise BundleError if the limit of pushes of a contract is incomplete; null: it has none."""
-    push = contract["law"]["push"]
-    if push is None:
-        return
-    if missing := [k for k in PUSH_NUMBER if not is_number(push.get(k))]:
-        raise BundleError(f"contract.json: law.push.{missing[0]} is missing")
-    for name in PUSH_VECTOR:
-        if len(push[name]) != 3 or not all(map(is_number, push[name])):
-            raise BundleError(f"contract.json: law.push.{name} is {push[name]}; expected 3 numbers")
-    if push["stop"] not in STOPS:
-        raise BundleError(f"contract.json: law.push.stop is '{push['stop']}'; allowed: {', '.join(STOPS)}")
-    for name in ("force_max", "speed_near"):
-        if not push[name] > 0:
-            raise BundleError(f"contract.json: law.push.{name} is {push[name]}; expected a number above 0")
 
 
 class PushLimit:

@@ -10,16 +10,11 @@ from typing import Any
 import numpy as np
 
 from r2s.export.control import Control
-from r2s.export.inverse_dynamics import InverseDynamics, check_model
-from r2s.export.law import BundleError, Model, is_number
+from r2s.export.inverse_dynamics import InverseDynamics
+from r2s.export.law import BundleError, Model
 from r2s.export.plan import NO_PLAN, finite_plan
 
 WIDTHS = {"place": 3, "normal": 3, "depth": 1, "force": 1, "velocity": 3}  # columns before q and setpoint
-# sources of observation terms if goals are plans on a surface, beside those with points
-OF_SURFACE = (
-    *("tip", "height", "tip_velocity", "rate", "force", "force_error", "above_target", "limited", "path_error"),
-    "velocity",
-)
 NEAR_M = 1e-3  # between the tip at the start posture and its place in the plan
 ROUNDING = 1e-6  # m, N, of a plan on the border of what the training had
 
@@ -29,32 +24,6 @@ def columns_of(n: int, setpoints: int) -> dict[str, list[int]]:
     widths = {**WIDTHS, "q": n, "setpoint": setpoints}
     ends = np.cumsum([0, *widths.values()]).tolist()
     return {name: [begin, end] for name, begin, end in zip(widths, ends[:-1], ends[1:], strict=True)}
-
-
-def check_surface(contract: dict[str, Any]) -> None:
-    """Raise BundleError if goal, model and controller of a contract are inconsistent."""
-    n, goal, control = len(contract["joints"]), contract["goal"], contract["control"]
-    begin, end = goal["columns"]["setpoint"]
-    if goal["columns"] != columns_of(n, end - begin) or goal["shape"] != [goal["steps"] + 1, end]:
-        raise BundleError(
-            f"contract.json: plans of shape {goal['shape']} with columns {goal['columns']}; {goal['steps']} steps, "
-            f"{n} joints and {end - begin} setpoints make {[goal['steps'] + 1, end]}"
-        )
-    if (end == begin) != (control["setpoint"] is None):
-        raise BundleError(f"contract.json: {end - begin} setpoints, control.setpoint is {control['setpoint']}")
-    if contract["observation"]["preview"]:
-        raise BundleError(f"contract.json: observation.preview is {contract['observation']['preview']}; it is 0")
-    if goal["row_hz"] != contract["rates"]["policy_hz"]:
-        raise BundleError(
-            f"contract.json: plans of {goal['row_hz']} Hz and a policy of {contract['rates']['policy_hz']} Hz"
-        )
-    if not is_number(goal["regular_m2"]) or not goal["regular_m2"] > 0:
-        raise BundleError(f"contract.json: goal.regular_m2 is {goal['regular_m2']}; expected a number above 0")
-    if len(goal["tip_m"]) != 3 or not all(map(is_number, goal["tip_m"])):
-        raise BundleError(f"contract.json: goal.tip_m is {goal['tip_m']}; expected 3 numbers")
-    if control["model"] is None:
-        raise BundleError("contract.json: plans on a surface need control.model")
-    check_model(control["model"], n)
 
 
 def check_surface_plan(contract: dict[str, Any], model: Model, plan: np.ndarray) -> None:
@@ -119,7 +88,7 @@ class SurfaceFollower:
         return self._plan[0, self._at["q"]]
 
     def __call__(self, step: int, seen: dict[str, np.ndarray], limited: float) -> dict[str, np.ndarray]:
-        """Return the observation sources of a control step: OF_SURFACE, `goal`, and `setpoint`.
+        """Return the observation sources of a control step, and `setpoint`.
 
         After the last step the target stays at the end of the plan.
 

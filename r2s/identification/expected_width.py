@@ -12,7 +12,7 @@ import pandas as pd
 
 from r2s.identification.identify import History, State, formulate
 from r2s.identification.parameters import TIMING, ParameterSpace
-from r2s.identification.posterior import posterior
+from r2s.identification.posterior import Z_95, posterior
 from r2s.identification.problem import Problem
 from r2s.identification.result import SHARPER, conclude
 from r2s.identification.search.least_squares import LeastSquares
@@ -24,7 +24,6 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 STEPS, FTOL = 6, 1e-2  # Jacobians between two reweightings of the fit, and its relative gain at the end
-Z = 1.96  # standard deviations of half a 95 % interval
 USED_S = 120.0  # s of a longer recording that are used
 
 
@@ -75,7 +74,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     # the rows that are left out have as much information as those that are used
     more = recording.duration / used.duration
     less = 1.0 / np.sqrt(share**2 + more * (1.0 - share**2))
-    seen = found.identifiable | ((more > 1.0) & (Z * less * share < 1.0 / SHARPER))
+    seen = found.identifiable | ((more > 1.0) & (Z_95 * less * share < 1.0 / SHARPER))
     if timing := [k for name in TIMING if name in space.blocks for k in space.where(name).tolist()]:
         draws = space.from_unit(u + sure.steps)[:, timing].sum(1)
         late = float(space.from_unit(u)[timing].sum()), float(draws.std())

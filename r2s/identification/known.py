@@ -14,11 +14,11 @@ import pandas as pd
 
 from r2s.identification.link_inertia import PAYLOAD
 from r2s.identification.parameters import OF_LINKS, ParameterSpace, logarithmic, units
+from r2s.identification.posterior import Z_95
 
 BODY = (*OF_LINKS, *PAYLOAD)  # what every kind of torque shares; friction, offsets and gains are of each kind
 DRIFTING = ("offset", "load", "drag_sin", "drag_cos")  # beside the friction law
 FLOOR = 1e-4  # of the usual deviation among arms: least deviation of a value, if draws are clipped at a bound
-Z = 1.96  # standard deviations of half a 95 % interval
 FAR = 5.0  # standard deviations of the largest of some thirty directions, beyond which knowledge and data disagree
 
 
@@ -128,7 +128,7 @@ def drift_table(known: Known, space: ParameterSpace, x: np.ndarray, samples: np.
     gain, p = np.linalg.solve(s, q).T, s - q
     change = gain @ (now - known.mean)
     left = np.diag(gain @ v @ gain.T + p - p @ np.linalg.solve(s, p))
-    half = Z * np.sqrt(np.maximum(left, 0.0))
+    half = Z_95 * np.sqrt(np.maximum(left, 0.0))
     then, unit = np.where(log, np.exp(np.where(log, known.mean, 0.0)), known.mean), units()
 
     def si(w: np.ndarray) -> np.ndarray:

@@ -9,9 +9,8 @@ import numpy as np
 
 from r2s.errors import UserError, nearest
 from r2s.excitation.information import COARSE_HZ, NOISE
-from r2s.identification.expected_width import Z
 from r2s.identification.identify import STANDSTILL
-from r2s.identification.posterior import FLAT
+from r2s.identification.posterior import FLAT, Z_95
 from r2s.identification.problem import Problem
 from r2s.identification.residuals.planned_motion import PlannedMotion
 from r2s.identification.residuals.torque_residual import STEP, TorqueResidual
@@ -97,7 +96,7 @@ class PlannedWidths:
     def half(self, information: np.ndarray) -> np.ndarray:
         """Return half widths (..., P) on the unit cube, of the information (..., P, P)."""
         covariance = np.linalg.inv(information + self._prior)
-        return Z * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        return Z_95 * np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
     def score(self, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return (B,) minus the mean logarithm of the chosen widths, after the motions so far and each of B more."""
@@ -115,9 +114,9 @@ class PlannedWidths:
     @property
     def share(self) -> np.ndarray:
         """(P,) of the prior's width that is left after the motions so far."""
-        return np.minimum(self.half(self.information) / (Z * self._problem.prior_width), 1.0)
+        return np.minimum(self.half(self.information) / (Z_95 * self._problem.prior_width), 1.0)
 
     @property
     def identifiable(self) -> np.ndarray:
         """(P,) whether the motions so far will determine the value, as in the identification's result."""
-        return Z * self.share < 1.0 / SHARPER
+        return Z_95 * self.share < 1.0 / SHARPER

@@ -8,6 +8,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 DRAWS = 512  # of the joint distribution
+Z_95 = 1.96  # standard deviations of half a 95 % interval
 FLAT = 12.0  # information of a flat prior on the unit cube: its bounds leave a variance of 1/12
 LEAST_LEFT = 0.1  # lower limit of the share of information in a direction that all other blocks hold
 

@@ -12,17 +12,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.errors import UserError, check_number
-from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
+from r2s.learning.checkpoint import Checkpoint
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
@@ -128,7 +127,6 @@ def train(
     budget: Budget,
     *,
     checkpoint: Checkpoint | None = None,
-    dump: Path | None = None,
     callbacks: Callbacks = Callbacks(),
 ) -> None:
     """Train `algo` in place.
@@ -139,7 +137,6 @@ def train(
         evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
         loop, budget: settings.
         checkpoint: written after every evaluation; if it exists, the training continues from it.
-        dump: file that stores the cause of a non-finite value, for `replay_dump`.
         callbacks: for logs and progress.
 
     Raises:
@@ -147,7 +144,7 @@ def train(
     """
     keep_memory()
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage that it allocates
-    run = Training(env, algo, evaluate, loop, dump)
+    run = Training(env, algo, evaluate, loop)
     if checkpoint:
         run.restore(checkpoint)
     while (spent := budget.spent(run.seconds, run.env_steps)) < 1.0:
@@ -178,17 +175,13 @@ class Training:
         factor: result of `Reward.adapt`, or of Reward.factor. evaluation: the last row of evaluations.csv.
     """
 
-    def __init__(
-        self, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes], loop: Loop, dump: Path | None
-    ):
+    def __init__(self, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes], loop: Loop):
         self._began = time.perf_counter()
-        self._env, self._algo, self._evaluate, self._loop, self._dump = env, algo, evaluate, loop, dump
+        self._env, self._algo, self._evaluate, self._loop = env, algo, evaluate, loop
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
         self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
-        self._origin: dict[str, Any] = {}  # state of the environment before `_actions`, for a dump
-        self._actions: list[torch.Tensor] = []
         self._device = algo.action_scale.device
         if loop.compile:
             with matmul_precision(loop.matmul):
@@ -208,10 +201,7 @@ class Training:
         observation = state["observation"].to(self._device)
         random = self.env_steps < self._loop.learning_starts
         state["action"] = env.action_spec.rand() if random else self._algo.explore(observation).cpu()
-        if len(self._actions) % env.task.steps == 0:
-            self._origin, self._actions = env.state(), []  # once per episode: a copy in every step is slow
-        self._actions.append(state["action"])
-        with self._dump_errors(lambda: {"env": self._origin, "actions": torch.stack(self._actions)}):
+        with self._dated_errors():
             step, self._state = env.step_and_maybe_reset(state)
         self._replay.extend(_transition(step))
         terms = step["next", "reward_terms"].mean(0).numpy()
@@ -224,12 +214,7 @@ class Training:
         weights = torch.from_numpy(self._env.weights.astype(np.float32)).to(self._device)
         batch = self._replay.sample()
         batch["reward"] = batch["reward_terms"] @ weights
-        random, matmul = generators(self._device), self._loop.matmul
-
-        def cause() -> dict[str, Any]:
-            return {"algo": self._algo.state_dict(), "batch": batch.to_dict(), "matmul": matmul} | random
-
-        with self._dump_errors(cause), matmul_precision(matmul):
+        with self._dated_errors(), matmul_precision(self._loop.matmul):
             losses = self._algo.update(batch)
         self.updates += 1
         return losses
@@ -245,7 +230,7 @@ class Training:
 
     def evaluate(self) -> dict[str, Any]:
         """Evaluate the present policy; return a row of evaluations.csv."""
-        with self._dump_errors(lambda: {"algo": self._algo.state_dict()}, ", in an evaluation"):
+        with self._dated_errors(", in an evaluation"):
             measures = self._env.task.measures(self._evaluate(copy.deepcopy(self._algo.policy).cpu()))
         counters = {"env_steps": self.env_steps, "updates": self.updates, "wall_clock_s": self.seconds}
         self.evaluation = counters | measures
@@ -278,47 +263,12 @@ class Training:
         set_generators(saved, self._device)
 
     @contextmanager
-    def _dump_errors(self, cause: Callable[[], dict[str, Any]], when: str = "") -> Iterator[None]:
-        """If the block raises FloatingPointError, write `cause` into the dump and name it in the message."""
+    def _dated_errors(self, when: str = "") -> Iterator[None]:
+        """If the block raises FloatingPointError, add the env steps so far to the message."""
         try:
             yield
         except FloatingPointError as error:
-            message = f"{error}, after {self.env_steps} env steps{when}"
-            if self._dump is not None:
-                save_tensors(self._dump, _tensors(cause()))
-                message += f"; replay it with r2s.learning.train.replay_dump on {self._dump}"
-            raise FloatingPointError(message) from None
-
-
-def replay_dump(path: Path, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes]) -> None:
-    """Repeat the step, update or evaluation that gave a non-finite value.
-
-    Args:
-        path: the dump. env, algo, evaluate: made as for the training.
-
-    Raises:
-        FloatingPointError: the same as in the training.
-        UserError: there is no dump.
-    """
-    if not path.is_file():
-        raise UserError(f"{path} is no dump of a training")
-    cause = load_tensors(path, "dump")
-    if "algo" in cause:
-        algo.load_state_dict(cause["algo"])
-        if "batch" not in cause:
-            evaluate(copy.deepcopy(algo.policy).cpu())
-            return
-        device = algo.action_scale.device
-        set_generators(cause, device)
-        with matmul_precision(cause["matmul"]):
-            algo.update({k: v.to(device) for k, v in cause["batch"].items()})
-        return
-    env.reset()
-    env.set_state(_arrays(cause["env"]))
-    state: TensorDictBase = env.read()
-    for action in cause["actions"]:
-        state["action"] = action
-        _, state = env.step_and_maybe_reset(state)
+            raise FloatingPointError(f"{error}, after {self.env_steps} env steps{when}") from None
 
 
 def generators(device: torch.device) -> dict[str, torch.Tensor]:

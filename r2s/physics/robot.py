@@ -6,7 +6,7 @@ objects, gravity compensation and contacts. The file's damping and frictionloss 
 `robot.mjcf=FILE`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -196,15 +196,7 @@ def load_robot(
     def each(name: str, value: list[float] | float | None, fallback: np.ndarray) -> np.ndarray:
         return per_joint(f"robot.{name}", fallback if value is None else value, n, f"the {n} joints of {path.name}")
 
-    limited = model.jnt_limited.astype(bool)
-    low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
-    high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
-    tenth = 0.1 * np.where(np.isfinite(high - low), high - low, 0.0)
-    keys = {model.key(i).name: model.key_qpos[i] for i in range(model.nkey)}
-    home = each("q_home", q_home, keys.get("home", np.clip(model.qpos0, low + tenth, high - tenth)))
-    torque = each("tau_max", tau_max, torque_limits(model))
-    unset = [joint.name for joint in spec.joints if joint.info == NO_RANGE and (q_min is None or q_max is None)]
-    check_limits(model, path, low, high, home, torque, unset)
+    low, high, home, torque = _limits(spec, model, path, each, q_min, q_max, q_home, tau_max)
     check_masses(model, path, down, home, torque)
     own_armature, damping = rotors(model)
     return Robot(
@@ -243,6 +235,29 @@ def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, 
         raise UserError(f"robot.mjcf: {path} is not a valid model: {' '.join(str(error).split())}") from None
     check_arm(model, path)
     return spec, model, fastest
+
+
+def _limits(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    path: Path,
+    each: Callable[[str, list[float] | None, np.ndarray], np.ndarray],
+    q_min: list[float] | None,
+    q_max: list[float] | None,
+    q_home: list[float] | None,
+    tau_max: list[float] | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return q_min, q_max, q_home (n,) rad and tau_max (n,) Nm, checked; `each` takes None for the file's value."""
+    limited = model.jnt_limited.astype(bool)
+    low = each("q_min", q_min, np.where(limited, model.jnt_range[:, 0], -np.inf))
+    high = each("q_max", q_max, np.where(limited, model.jnt_range[:, 1], np.inf))
+    tenth = 0.1 * np.where(np.isfinite(high - low), high - low, 0.0)
+    keys = {model.key(i).name: model.key_qpos[i] for i in range(model.nkey)}
+    home = each("q_home", q_home, keys.get("home", np.clip(model.qpos0, low + tenth, high - tenth)))
+    torque = each("tau_max", tau_max, torque_limits(model))
+    unset = [joint.name for joint in spec.joints if joint.info == NO_RANGE and (q_min is None or q_max is None)]
+    check_limits(model, path, low, high, home, torque, unset)
+    return low, high, home, torque
 
 
 def _payload_max(

@@ -147,7 +147,7 @@ def train(cfg, overrides):
 
         callbacks = Callbacks(lambda row: run.log("metrics", row), evaluated, show)
         given = parts.env, algo, parts.evaluate, parts.loop, parts.budget
-        run_train(*given, checkpoint=checkpoint, dump=run.folder / "dump.pt", callbacks=callbacks)
+        run_train(*given, checkpoint=checkpoint, callbacks=callbacks)
         progress.close()
         conclude(cfg, run, parts, selection)
         checkpoint.clear()

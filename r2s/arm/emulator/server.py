@@ -1,12 +1,10 @@
 """The robot's side of the Franka Control Interface on loopback: requests by TCP, states and commands by UDP."""
 
 import contextlib
-import ipaddress
 import os
 import select
 import socket
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -37,13 +35,12 @@ class Server:
         self._udp: socket.socket | None = None
         self._reset()
 
-    def serve(self, parent: int | None = None, note: Callable[[str], None] = lambda line: None) -> None:
-        """Run until the pipe `parent` closes (None: forever); `note` receives a line per event."""
-        self._note = note
+    def serve(self, parent: int) -> None:
+        """Run until the pipe `parent` closes."""
         with realtime_section() if self._realtime else contextlib.nullcontext():
             self._serve(parent)
 
-    def _serve(self, parent: int | None) -> None:
+    def _serve(self, parent: int) -> None:
         while True:
             due = None if self._due is None else max(0.0, self._due - time.monotonic())
             watched = [x for x in (parent, self._socket, self._tcp, self._udp) if x is not None]
@@ -63,12 +60,11 @@ class Server:
                 self._disconnect()
 
     def _accept(self) -> None:
-        tcp, client = self._socket.accept()
+        tcp, _ = self._socket.accept()
         if self._tcp is not None and _is_closed(self._tcp):  # the client reconnects before its end was processed
             self._disconnect()
         if self._tcp is not None:
             tcp.close()
-            self._note(f"{client[0]} refused, another client is connected")
             return
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._tcp = tcp
@@ -80,7 +76,6 @@ class Server:
                 s.close()
         self._tcp = self._udp = None
         self._reset()
-        self._note("client disconnected")
 
     def _reset(self) -> None:
         self._received = b""
@@ -135,7 +130,6 @@ class Server:
         version, port = np.frombuffer(payload, fci.CONNECT, 1)[0].tolist()
         ours = np.array(self._version, "<u2").tobytes()
         if version != self._version:
-            self._note(f"expected a client of version {self._version}, got {version}")
             self._reply("Connect", number, fci.NOT_POSSIBLE, ours)
             return
         self._client = self._tcp.getpeername()[0], port
@@ -144,13 +138,11 @@ class Server:
         self._udp.setblocking(False)
         self._reply("Connect", number, fci.DONE, ours)
         self._due = time.monotonic()
-        self._note("client connected")
 
     def _begin(self, number: int, payload: bytes) -> None:
         controller, generator = np.frombuffer(payload, fci.MOVE, 1)[0].tolist()
         status = fci.MOVE_STATUS[self._version]
         if (controller, generator) != (fci.EXTERNAL_CONTROLLER, fci.GENERATOR_REQUESTED[self._version]):
-            self._note(f"Move with modes {controller}, {generator}: only torque control is available")
             self._reply("Move", number, status["InvalidArgument"])
         elif not self._control.can_move:
             self._reply("Move", number, status["NotPossible"])
@@ -207,7 +199,6 @@ class Server:
         if self._control.running:
             self._send()
         else:
-            self._note(f"motion aborted: {self._control.stopped_by}")
             self._finish(self._control.aborted_as)
 
     def _tick(self) -> None:
@@ -252,22 +243,18 @@ class Server:
         self._reply("Move", move, fci.MOVE_STATUS[self._version][status])
 
 
-def open_port(address: str | None = None) -> socket.socket:
-    """Open the FCI's port on a loopback address, the first free one by default; return the server socket.
+def open_port() -> socket.socket:
+    """Open the FCI's port, which clients always use, on the first free loopback address; return the server socket.
 
     Raises:
-        UserError: not a loopback address, or the port is in use.
-
+        UserError: all are in use.
     """
-    if address is not None:
-        check_loopback(address)
-    candidates = [address] if address is not None else [f"127.0.0.{i}" for i in range(1, 255)]
-    for candidate in candidates:
+    for k in range(1, 255):
         try:
-            return socket.create_server((candidate, fci.PORT))
+            return socket.create_server((f"127.0.0.{k}", fci.PORT))
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
-    raise UserError(f"emulator: port {fci.PORT} is not free on {address or 'any loopback address'} ({reason})")
+    raise UserError(f"emulator: port {fci.PORT} is not free on any loopback address ({reason})")
 
 
 def _is_closed(tcp: socket.socket) -> bool:
@@ -277,11 +264,3 @@ def _is_closed(tcp: socket.socket) -> bool:
         return False
     except OSError:
         return True
-
-
-def check_loopback(address: str) -> None:
-    """Raise UserError unless the address is an IPv4 loopback address."""
-    with contextlib.suppress(ValueError):
-        if ipaddress.IPv4Address(address).is_loopback:
-            return
-    raise UserError(f"emulator: address '{address}'; allowed: loopback, 127.0.0.1 to 127.255.255.254")

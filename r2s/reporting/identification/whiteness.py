@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.signal import butter, freqz_sos
 
+from r2s.identification.posterior import Z_95
 from r2s.physics.robot import SIM_DT
 from r2s.reporting.figures.colours import colours
 from r2s.reporting.figures.log_rows import without_pauses
@@ -71,7 +72,7 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, and its 1.96 sigma (L,).
+    """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, and its Z_95 sigma (L,).
 
     The filter is that of `Recording.smooth`. Sigma is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """
@@ -85,4 +86,4 @@ def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.nda
     white = np.interp(lags * step, SIM_DT * np.arange(len(white) // 2), white[: len(white) // 2] / white[0])
     pairs = np.maximum(np.diff(edges)[:, None] - lags, 0).sum(0)
     sigma = np.sqrt((white[0] + 2 * np.sum(white[1:] ** 2)) / np.maximum(pairs, 1))
-    return lags * step, white, np.where(lags > 0, 1.96 * sigma, 0.0)
+    return lags * step, white, np.where(lags > 0, Z_95 * sigma, 0.0)

@@ -1,5 +1,0 @@
-"""`python -m r2s.arm.emulator`: serve a twin until Ctrl-C."""
-
-from r2s.arm.emulator.process import main
-
-main()
