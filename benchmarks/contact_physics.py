@@ -16,7 +16,7 @@ from independent_judge import true_dynamics
 from scipy.signal import savgol_filter
 
 from r2s.physics.actuation import Motors
-from r2s.physics.contact import COLUMNS, DEFLECTION, FORCE
+from r2s.physics.contact_layout import COLUMNS, DEFLECTION, FORCE
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import Simulator

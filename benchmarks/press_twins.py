@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from r2s.arm.twins.make_twin import make_twin
-from r2s.physics.contact import FORCE, NORMAL
+from r2s.physics.contact_layout import FORCE, NORMAL
 from r2s.physics.rigid_body import mass_matrix
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.surface import Tool

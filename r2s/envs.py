@@ -1,6 +1,6 @@
 """Environments for other libraries: `gymnasium.make("r2s/PandaReach-v0", calibration=RUN)` and `torchrl_env`.
 
-Importing this module registers r2s/PandaReach-v0, PandaTrack, PandaPress and PandaWipe where Gymnasium is
+Importing this module registers r2s/PandaReach-v0, PandaTrack, PandaPress, PandaWipe and PandaPush where Gymnasium is
 installed; `gymnasium.make("r2s.envs:r2s/PandaReach-v0")` imports it itself.
 """
 
@@ -15,7 +15,7 @@ from r2s.override_checks import check_overrides
 from r2s.stages.build import CONF, make_draw, make_dynamics, make_robot, make_task
 from r2s.stages.parts import part
 
-TASKS = ("reach", "track", "press", "wipe")
+TASKS = ("reach", "track", "press", "wipe", "push")
 SETTINGS = ("task", "robot", "friction", "inertia", "calibration", "dr", "reward", "control", "threads")
 READ = (*SETTINGS, "safety")  # keys of overrides
 

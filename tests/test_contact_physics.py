@@ -13,7 +13,7 @@ from test_physics import light, mass_matrix
 from r2s.engines.dart import dart
 from r2s.engines.interface import FrictionTorque
 from r2s.errors import UserError
-from r2s.physics.contact import COLUMNS, DEPTH, FORCE
+from r2s.physics.contact_layout import COLUMNS, DEPTH, FORCE
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import COULOMB
 from r2s.physics.robot import SIM_DT

@@ -13,7 +13,7 @@ from r2s.arm.interface import ArmStopped
 from r2s.arm.simulated import SimulatedArm
 from r2s.arm.twins.make_twin import make_twin
 from r2s.errors import UserError
-from r2s.physics.contact import DEPTH, FORCE, NORMAL, POINT, K
+from r2s.physics.contact_layout import DEPTH, FORCE, NORMAL, POINT, K
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import load_robot
 from r2s.physics.surface import Tool

@@ -14,7 +14,7 @@ from r2s.arm.twins.make_twin import make_twin
 from r2s.errors import UserError
 from r2s.identification.contact.exchange import linearized
 from r2s.learning.randomization import ContactRandomization
-from r2s.physics.contact import EXPONENT, FORCE, K
+from r2s.physics.contact_layout import EXPONENT, FORCE, K
 from r2s.physics.impedance import FORCE_MAX
 from r2s.physics.robot import SIM_DT
 from r2s.stages.data import ArmData

@@ -51,6 +51,7 @@ class ArmState:
         control_command_success_rate: share of the last 100 commands that arrived; 0 while no motion runs.
         O_T_EE: (16,) column by column, end effector's pose in the base frame.
         m_ee, m_load: kg, end effector and load that the arm's gravity compensation assumes.
+        box: (6,), centre m and first axis of a box before the arm in the base frame, as a camera perceives it.
     """
 
     t: float
@@ -68,6 +69,7 @@ class ArmState:
     O_T_EE: np.ndarray | None = None
     m_ee: float | None = None
     m_load: float | None = None
+    box: np.ndarray | None = None
 
     @property
     def in_contact(self) -> bool:

@@ -223,4 +223,5 @@ def as_state(kinematics: Kinematics, s: ArmState, effort: np.ndarray, stopped: b
         t=np.array([s.t]), q=s.q[None], dq=s.dq[None], ee=ee[None], jacobian=np.ascontiguousarray(jacobian)[None],
         tau=s.tau_J_d[None], effort=effort[None], stopped=np.array([stopped]), limited=np.array([limited]),
         force=None if s.O_F_ext_hat_K is None else s.O_F_ext_hat_K[None, :3],
+        box=None if s.box is None else s.box[None],
     )  # fmt: skip

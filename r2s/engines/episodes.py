@@ -7,7 +7,7 @@ import numpy as np
 from r2s.engines.interface import Engine, FrictionTorque
 from r2s.learning.evaluate import fixed_draws
 from r2s.physics.actuation import Actuation, Motors
-from r2s.physics.contact import FORCE
+from r2s.physics.contact_layout import FORCE, box_pose
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import Robot
@@ -41,7 +41,7 @@ class EngineArms:
         count: int,
     ):
         self.robot, self._make, self._torque = robot, make, task.torque_limit(robot)
-        self._control = task.control(robot)
+        self._control, self._moves_box = task.control(robot), task.moves_box
         self._substeps, self._period = task.substeps, 1 / task.ctrl_hz
         self._drawn = fixed_draws(draw, count)
         self._kinematics, self._command = Kinematics(robot), np.zeros(robot.n)
@@ -88,5 +88,6 @@ class EngineArms:
         self._noise = noise[0]
         contact = self._law.contact
         force = None if contact is None else -contact[None, FORCE : FORCE + 3]
+        box = box_pose(contact)[None] if self._moves_box and contact is not None else None
         joints = q[None], dq[None]
-        return State(t, *joints, ee[None], jacobian[None], tau, effort, NONE, limited, noise, force)
+        return State(t, *joints, ee[None], jacobian[None], tau, effort, NONE, limited, noise, force, box)

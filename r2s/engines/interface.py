@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from r2s.physics import mujoco_callback as native
-from r2s.physics.contact import contact_columns
+from r2s.physics.contact_layout import contact_columns
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import single_arm

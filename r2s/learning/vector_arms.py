@@ -12,6 +12,7 @@ from r2s.physics.simulator import Simulator
 from r2s.tasks.task import State, Task
 
 ALL = slice(None)
+NOISES = "_sigma", "_noise", "_pose_noise"
 
 
 class VectorArms:
@@ -41,8 +42,11 @@ class VectorArms:
         soft_start_s: float = 0.0,
         seed: int | np.random.SeedSequence = 0,
     ):
-        if task.touches and dynamics.surface is None:
-            raise UserError(f"dr: {type(task).__name__} touches a surface; dr=contact draws one")
+        surface, named = dynamics.surface, type(task).__name__
+        if task.touches and surface is None:
+            raise UserError(f"dr: {named} touches a surface; dr={'box' if task.moves_box else 'contact'} draws one")
+        if task.moves_box and surface.mass is None:  # type: ignore[union-attr]
+            raise UserError(f"dr: {named} pushes a box; dr=box draws one")
         self.robot, self.width = robot, width
         torque, self._period = task.torque_limit(robot), 1 / task.ctrl_hz
         self.sim = Simulator(robot, dynamics, width, nthread, control=task.control(robot))
@@ -54,6 +58,9 @@ class VectorArms:
         self.seed(seed)
         self._sigma, self._noise = np.zeros((2, width, robot.n))
         self._sigma[:] = dynamics.speed_noise
+        # of the perceived pose of a box: x m, y m, yaw rad
+        self._pose = (task.table, task.pose_noise) if task.moves_box else None  # type: ignore[attr-defined]
+        self._pose_noise = np.zeros((width, 3))
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
         """Replace the dynamics, delay and lag of the arms `ids`."""
@@ -83,6 +90,10 @@ class VectorArms:
         if self._sigma.any():
             sigma = self._sigma[at]
             self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
+        if self._pose is not None:
+            m, degrees = self._pose[1]
+            noise = self._pose_noise[at]
+            self._pose_noise[at] = np.array([m, m, np.radians(degrees)]) * self._rng.standard_normal(noise.shape)
 
     def read(self) -> State:
         """Return the present state of all arms; its arrays are views."""
@@ -91,7 +102,8 @@ class VectorArms:
         noise = self._noise if self._sigma.any() else None
         force = None if self.robot.tool is None else -sim.contact_force
         arm = sim.q, sim.dq, sim.ee, sim.jacobian, sim.tau, sim.effort
-        return State(t, *arm, self._stopped, limited, noise, force)
+        box = None if self._pose is None else self._pose[0].moved(sim.box, self._pose_noise)
+        return State(t, *arm, self._stopped, limited, noise, force, box)
 
     def step(self, command: np.ndarray) -> State:
         """Run one control period with commands (width, c) of the controller; return the state after it.
@@ -114,14 +126,15 @@ class VectorArms:
 
     def state(self) -> dict:
         """Return a copy of the state of simulation and noise for `set_state`."""
-        own = {name: getattr(self, name).copy() for name in ("_steps", "_limited", "_sigma", "_noise")}
+        own = {name: getattr(self, name).copy() for name in ("_steps", "_limited", *NOISES)}
         return {"sim": self.sim.state()} | own | {"_rng": self._rng.bit_generator.state}
 
     def set_state(self, state: Mapping) -> None:
         """Restore what `state` returned; the same commands then give the same states, bit for bit."""
         self.sim.set_state(state["sim"])
         self._steps[:], self._limited[:] = state["_steps"], state["_limited"]
-        self._sigma[:], self._noise[:] = state["_sigma"], state["_noise"]
+        for name in NOISES:
+            getattr(self, name)[:] = state[name]
         self._rng.bit_generator.state = state["_rng"]
 
 

@@ -19,24 +19,44 @@ step.
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.errors import UserError
+from r2s.physics.contact_layout import (
+    AXES,
+    BEGIN,
+    BOX_END,
+    BRISTLE,
+    DAMPER,
+    DAMPING,
+    DEFLECTION,
+    DEPTH,
+    EXPONENT,
+    FORCE,
+    FORCE_BEGIN,
+    GUESS,
+    HALF,
+    LINEAR,
+    MASS,
+    MU,
+    NEXT,
+    NORMAL,
+    NORMAL_FORCE,
+    POINT,
+    RADIUS,
+    RATE,
+    RESISTANCE,
+    SLID,
+    SLIDE,
+    SLOPE,
+    SPEED,
+    SPRING,
+    TIP,
+    TIP_BEGIN,
+    VELOCITY,
+    K,
+)
 from r2s.physics.friction import MICRO_DAMPING
-from r2s.physics.payload import ee_pose
-from r2s.physics.robot import Robot
+from r2s.physics.sliding import contact_point_velocity, load_box, move_box, slide, start_box, yielded, yielding
 from r2s.physics.stick_slip import JointForces, coming_velocity
-from r2s.physics.surface import Surface, normal_force
-
-# Columns of a contact: surface (see `Surface`), tool, and what a step writes
-K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
-# HALF: 0 for a plane. AXES: row by row. NORMAL: of a box, where the tip is
-HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
-COLUMNS = DEPTH + 1
-ROWS = 4  # of the Jacobian: normal, and the tangential part of x, y and z
-# Columns of a guess. RATE: of the depth, and SLIDE (3): tangential velocity, at the beginning of the step. NEXT and
-# SPEED: their guess for its end. BEGIN: m, where the path begins. LINEAR and SLID (3): force and velocity found.
-RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
-SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
-GUESS = SLID + 3
+from r2s.physics.surface import normal_force
 
 RIGID = 1e-6  # m, `bristle` of a surface without one: a fiftieth of an encoder's step at a tip
 SLIP = 0.02  # m/s, damping of the bristles fades with speed, otherwise each reversal would cause a pulse of force
@@ -45,37 +65,9 @@ FAR = 0.02  # m, a tip farther away would need 20 m/s
 ROUNDS = 12  # most guesses
 TOLERANCE = 1e-4  # of the force, error of the normal force at which they end
 LATE = 1e-2  # of the force, by which the tangential force may then lag behind load and speed
+BOX_LATE = 1e-3  # of the table's friction, by which it may lag behind the speed of a box
 NEGLIGIBLE = 1e-6  # N
 SHORT = 1e-6  # of the depth, a shorter path has the force of its middle: the potential's difference is round-off
-
-
-def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
-    """Return (..., COLUMNS) of a surface and the robot's tool, before the first step.
-
-    Raises:
-        UserError: the robot has no tool, or a value of the surface is out of its range.
-    """
-    if robot.tool is None:
-        raise UserError(f"robot.tool: {robot.name} has no tool that could touch the surface; give robot.tool=FILE")
-    surface.check()
-    place, axes = ee_pose(robot)
-    law = surface.coefficient, surface.exponent, surface.damping, surface.friction, surface.bristle
-    box = np.zeros(3) if surface.half is None else surface.half, np.eye(3) if surface.axes is None else surface.axes
-    lead = np.broadcast_shapes(
-        *(np.shape(a) for a in law), surface.point.shape[:-1], surface.normal.shape[:-1], np.shape(box[0])[:-1],
-        np.shape(box[1])[:-2],
-    )  # fmt: skip
-    out = np.zeros((*lead, COLUMNS))
-    for k, value in enumerate(law):
-        out[..., k] = value
-    out[..., POINT : POINT + 3], out[..., NORMAL : NORMAL + 3] = surface.point, surface.normal
-    out[..., TIP : TIP + 3], out[..., RADIUS] = place + axes @ robot.tool.tip, robot.tool.radius
-    if surface.half is not None:
-        out[..., HALF : HALF + 3] = surface.half
-        axes = np.asarray(surface.axes)
-        out[..., AXES : AXES + 9] = axes.reshape(*axes.shape[:-2], 9)
-    out[..., DEPTH] = -np.inf
-    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,6 +132,8 @@ def _from_box(contact, x, y, z):
 def near(contact, place, anchor, axis, dq, h, jacobian):
     """Write depth and Jacobian (ROWS, n) of a tip; return whether it may touch within the step.
 
+    Call it once per step: a box that the tip cannot touch slides on by the step.
+
     Args:
         contact: (COLUMNS,); of a tip that cannot touch, force and deflection become 0.
         place: position (3,) m and rotation (9,) of the link that carries the tool, in the base frame.
@@ -172,11 +166,27 @@ def near(contact, place, anchor, axis, dq, h, jacobian):
             jacobian[0, j] = along
             jacobian[1, j], jacobian[2, j], jacobian[3, j] = a - nx * along, b - ny * along, c - nz * along
             rate -= along * dq[j]
+        if contact[MASS] > 0.0:
+            load_box(contact, x, y, z)
+            rate += _box_rate(contact)
         if depth + h * max(rate, 0.0) + MARGIN > 0.0:
             return True
     for k in range(3):
         contact[DEFLECTION + k] = contact[FORCE + k] = 0.0
+    if contact[MASS] > 0.0:
+        load_box(contact, x, y, z)
+        slide(contact, h)
     return False
+
+
+@njit(cache=True, error_model="numpy")
+def _box_rate(contact):
+    """Return the rate of the depth, m/s, that the box's motion adds."""
+    point, rate = np.empty(3), 0.0
+    contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
+    for k in range(3):
+        rate += contact[NORMAL + k] * point[k]
+    return rate
 
 
 @njit(cache=True, error_model="numpy")
@@ -205,9 +215,28 @@ def _velocity(jacobian, dq, slide):
 
 
 @njit(cache=True, error_model="numpy")
+def _relative(contact, rate, slide, point):
+    """Return rate and speed relative to a box whose contact has the velocity `point` (3,) m/s; change `slide`."""
+    n, along, speed = contact[NORMAL : NORMAL + 3], 0.0, 0.0
+    for k in range(3):
+        along += n[k] * point[k]
+    for k in range(3):
+        slide[k] -= point[k] - along * n[k]
+        speed += slide[k] * slide[k]
+    return rate + along, np.sqrt(speed)
+
+
+@njit(cache=True, error_model="numpy")
 def start_guess(contact, jacobian, dq, h, guess):
     """Write the guess (GUESS,) that a tip goes on at dq (n,) rad/s."""
     rate, speed = _velocity(jacobian, dq, guess[SLIDE : SLIDE + 3])
+    if contact[MASS] > 0.0:
+        point = np.empty(3)
+        for k in range(3):
+            guess[TIP_BEGIN + k] = guess[SLIDE + k] - rate * contact[NORMAL + k]
+        contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
+        rate, speed = _relative(contact, rate, guess[SLIDE : SLIDE + 3], point)
+        start_box(contact, guess)
     guess[RATE], guess[NEXT], guess[SPEED], guess[BEGIN] = rate, rate, speed, contact[DEPTH] - 0.5 * h * rate
     guess[NORMAL_FORCE], guess[SLOPE] = mean_force(contact, guess[BEGIN], rate, rate, h)
 
@@ -221,6 +250,9 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
     x = spring * contact[DEFLECTION] + damper * guess[SLIDE]
     y = spring * contact[DEFLECTION + 1] + damper * guess[SLIDE + 1]
     z = spring * contact[DEFLECTION + 2] + damper * guess[SLIDE + 2]
+    if contact[MASS] > 0.0:
+        _add_box_contact(contact, jacobian, h, guess, (force, x, y, z), mass, drive)
+        return
     slope, damper, row = h * slope, h * damper, 0
     for i in range(len(drive)):
         n, a, b, c = jacobian[0, i], jacobian[1, i], jacobian[2, i], jacobian[3, i]
@@ -232,17 +264,49 @@ def add_contact(contact, jacobian, h, guess, mass, drive):
 
 
 @njit(cache=True, error_model="numpy")
+def _add_box_contact(contact, jacobian, h, guess, held, mass, drive):
+    """Add the contact with a box; held: normal force N and minus the tangential one (3) if the box did not yield."""
+    n, at = contact[NORMAL : NORMAL + 3], np.empty(3)
+    for k in range(3):
+        at[k] = held[0] * n[k] - held[1 + k]
+    yielding(contact, at, h, guess)
+    force, resistance, row = guess[FORCE_BEGIN : FORCE_BEGIN + 3], guess[RESISTANCE : RESISTANCE + 9], 0
+    for i in range(len(drive)):
+        for k in range(3):
+            at[k] = jacobian[1 + k, i] + n[k] * jacobian[0, i]
+        drive[i] += at[0] * force[0] + at[1] * force[1] + at[2] * force[2]
+        a = h * (resistance[0] * at[0] + resistance[1] * at[1] + resistance[2] * at[2])
+        b = h * (resistance[3] * at[0] + resistance[4] * at[1] + resistance[5] * at[2])
+        c = h * (resistance[6] * at[0] + resistance[7] * at[1] + resistance[8] * at[2])
+        along = n[0] * a + n[1] * b + n[2] * c
+        for k in range(i + 1):
+            mass[row + k] += along * jacobian[0, k] + a * jacobian[1, k] + b * jacobian[2, k] + c * jacobian[3, k]
+        row += i + 1
+
+
+@njit(cache=True, error_model="numpy")
 def next_guess(contact, jacobian, h, coming, guess):
     """Set the guess to the velocities found, coming (n,) rad/s; return whether the old guess was right."""
     force, fast = guess[NORMAL_FORCE], guess[SPEED]
     rate, speed = _velocity(jacobian, coming, guess[SLID : SLID + 3])
+    box_late = 0.0
+    if contact[MASS] > 0.0:
+        tip, point = np.empty(3), np.empty(3)
+        for k in range(3):
+            tip[k] = guess[SLID + k] - rate * contact[NORMAL + k]
+        box_late = yielded(contact, tip, h, guess, point)
+        rate, speed = _relative(contact, rate, guess[SLID : SLID + 3], point)
     guess[LINEAR] = force + guess[SLOPE] * (rate - guess[NEXT])
     guess[NEXT], guess[SPEED] = rate, speed
     new, guess[SLOPE] = mean_force(contact, guess[BEGIN], guess[RATE], rate, h)
     guess[NORMAL_FORCE] = new
     wrong = h * abs(speed - fast) / (max(contact[BRISTLE], RIGID) + h * max(speed, fast))
     late = contact[MU] * (abs(new - force) + new * wrong)
-    return abs(new - guess[LINEAR]) <= TOLERANCE * new + NEGLIGIBLE and late <= LATE * new + NEGLIGIBLE
+    return (
+        abs(new - guess[LINEAR]) <= TOLERANCE * new + NEGLIGIBLE
+        and late <= LATE * new + NEGLIGIBLE
+        and box_late <= BOX_LATE
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -250,6 +314,8 @@ def finish_contact(contact, h, guess):
     """Write force and deflection after a step."""
     spring, damper, force = guess[SPRING], guess[DAMPER], guess[LINEAR]
     _deflect(contact, guess[SLID : SLID + 3], guess[SPEED], h, (force, spring, damper))
+    if contact[MASS] > 0.0:
+        move_box(contact, guess[BOX_END : BOX_END + 4], h)
 
 
 @njit(cache=True, error_model="numpy")
@@ -269,11 +335,17 @@ def _deflect(contact, slide, speed, h, terms):
 @njit(cache=True, error_model="numpy")
 def explicit_contact(contact, jacobian, dq, h):
     """Write force and deflection of a step that is much shorter than the contact's oscillation."""
-    slide = np.empty(3)
-    rate, speed = _velocity(jacobian, dq, slide)
+    tangent = np.empty(3)
+    rate, speed = _velocity(jacobian, dq, tangent)
+    if contact[MASS] > 0.0:
+        point = np.empty(3)
+        contact_point_velocity(contact, contact[VELOCITY : VELOCITY + 4], point)
+        rate, speed = _relative(contact, rate, tangent, point)
     force = normal_force(contact[K], contact[EXPONENT], contact[DAMPING], contact[DEPTH], rate)
     spring, damper = _bristles(contact, force, speed, h)
-    _deflect(contact, slide, speed, h, (force, spring, damper))
+    _deflect(contact, tangent, speed, h, (force, spring, damper))
+    if contact[MASS] > 0.0:
+        slide(contact, h)
 
 
 @njit(cache=True, error_model="numpy")

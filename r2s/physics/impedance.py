@@ -14,7 +14,7 @@ Feedforward: friction at the reference speed dq_r, and errors of the arm's gravi
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.physics.kinematics import pose_axes, write_pose
+from r2s.physics.kinematics import POSE, pose_axes, write_pose
 from r2s.physics.newton_euler import (
     COM,
     LINK,
@@ -72,6 +72,18 @@ def arm_pose(q, parameters, frames, jacobian, place):
         x, y, z = place[0] - frames[i, 0], place[1] - frames[i, 1], place[2] - frames[i, 2]
         a, b, c = jacobian[3, i], jacobian[4, i], jacobian[5, i]
         jacobian[0, i], jacobian[1, i], jacobian[2, i] = b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@njit(cache=True, error_model="numpy")
+def arm_tips(q, parameters):
+    """Return place (m, 3) m and Jacobian (m, 3, n) of the tip at q (m, n) rad; parameters of an impedance."""
+    m, n = q.shape
+    places, out = np.empty((m, 3)), np.empty((m, 3, n))
+    frames, jacobian = np.empty((n, POSE)), np.empty((6, n))
+    for i in range(m):
+        arm_pose(q[i], parameters, frames, jacobian, places[i])
+        out[i] = jacobian[:3]
+    return places, out
 
 
 @njit(cache=True, error_model="numpy")

@@ -24,9 +24,9 @@ from numba.extending import intrinsic, is_jitted
 
 from r2s.compiled import cfunc, njit
 from r2s.physics.actuation import SLOTS, condition_joint, motor_torque
-from r2s.physics.contact import COLUMNS as CONTACT_COLUMNS
-from r2s.physics.contact import ROWS as CONTACT_ROWS
 from r2s.physics.contact import contact_velocity, near
+from r2s.physics.contact_layout import COLUMNS as CONTACT_COLUMNS
+from r2s.physics.contact_layout import ROWS as CONTACT_ROWS
 from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
 from r2s.physics.control_laws import chain, control_law, registered
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family

@@ -14,7 +14,17 @@ import numpy as np
 from r2s.compiled import njit
 from r2s.physics import mujoco_callback as native
 from r2s.physics.actuation import low_pass_factor, steps_late
-from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, TIP, contact_columns
+from r2s.physics.contact_layout import (
+    COLUMNS,
+    DEFLECTION,
+    DEPTH,
+    FORCE,
+    NORMAL,
+    RADIUS,
+    TIP,
+    box_pose,
+    contact_columns,
+)
 from r2s.physics.control_laws import ControlLaw, law_number
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.push_limit import COLUMNS as PUSH_COLUMNS
@@ -214,6 +224,11 @@ class Simulator:
     def contact_force(self) -> np.ndarray:
         """(nsim, 3) N on the tool in the base frame, mean of the last step; only of a robot with a tool."""
         return self._contact[:, FORCE : FORCE + 3]
+
+    @property
+    def box(self) -> np.ndarray:
+        """(nsim, 6), centre m and first axis of the box that the tool pushes; only of a robot with a tool."""
+        return box_pose(self._contact)
 
     @property
     def depth(self) -> np.ndarray:

@@ -44,6 +44,8 @@ class Surface:
         stiffness: N/m, k: force per penetration at 1 mm. exponent: e, 1 (linear) to 1.5 (Hertz).
         damping: s/m, c. friction: mu. bristle: m, tangential deflection at which friction reaches mu F; 0: rigid.
         half: (3,) m, half edges of a box; None: a plane. axes: (3, 3), its axes in columns.
+        mass: kg, of a box that slides on a table when it is pushed (sliding.py); None: the surface is fixed.
+        table: friction coefficient between that box and its table.
     """
 
     point: np.ndarray
@@ -55,6 +57,14 @@ class Surface:
     bristle: np.ndarray | float = 0.0
     half: np.ndarray | None = None
     axes: np.ndarray | None = None
+    mass: np.ndarray | float | None = None
+    table: np.ndarray | float = 0.0
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Mean distance, m, of the points of a box's base from its centre."""
+        a, b = np.moveaxis(np.asarray(self.half), -1, 0)[:2]
+        return np.hypot(a, b) / 3 + a**2 / (6 * b) * np.arcsinh(b / a) + b**2 / (6 * a) * np.arcsinh(a / b)
 
     @property
     def coefficient(self) -> np.ndarray | float:
@@ -70,7 +80,7 @@ class Surface:
 
     def one(self, k: int) -> "Surface":
         """Return the k-th surface of a batch (m, ...); fields without a batch shape stay unchanged."""
-        values = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        values = {f.name: np.asarray(v) for f in fields(self) if (v := getattr(self, f.name)) is not None}
         one = {"point": 1, "normal": 1, "half": 1, "axes": 2}  # number of axes for one arm
         return replace(self, **{name: v[k] for name, v in values.items() if v.ndim > one.get(name, 0)})
 
@@ -78,16 +88,21 @@ class Surface:
         """Raise UserError unless all values are in their ranges."""
         for name, low, high in (
             ("stiffness", TINY, np.inf), ("exponent", 1.0, 2.0), ("damping", 0.0, np.inf), ("friction", 0.0, np.inf),
-            ("bristle", 0.0, np.inf),
+            ("bristle", 0.0, np.inf), ("mass", TINY, np.inf), ("table", 0.0, np.inf),
         ):  # fmt: skip
+            if getattr(self, name) is None:
+                continue
             value = np.asarray(getattr(self, name), dtype=float)
             if not ((value >= low) & (value <= high) & np.isfinite(value)).all():
-                allowed = {"stiffness": "above 0 N/m", "exponent": "from 1 to 2"}.get(name, "of 0 or more")
+                ranges = {"stiffness": "above 0 N/m", "exponent": "from 1 to 2", "mass": "above 0 kg"}
+                allowed = ranges.get(name, "of 0 or more")
                 raise UserError(f"surface.{name}: expected a value {allowed}, got {value.min():g} to {value.max():g}")
         if not np.isfinite(self.point).all() or np.abs(np.linalg.norm(self.normal, axis=-1) - 1.0).max() > 1e-6:
             raise UserError(
                 f"surface: expected a finite point and a normal of length 1, got {self.point}, {self.normal}"
             )
+        if self.mass is not None and self.half is None:
+            raise UserError("surface.mass: only a box moves, and this surface has no half edges")
         if self.half is not None:
             half, axes = np.asarray(self.half), np.asarray(self.axes)
             if not (np.isfinite(half) & (half > 0)).all():

@@ -132,14 +132,19 @@ def compose_step(words: Sequence[str], option: str) -> Any:
 
 
 def touches(cfg: Any) -> bool:
-    """Return whether the task presses a tool on a surface."""
-    return bool(getattr(target(cfg.task, "task"), "touches", False))
+    """Return whether the task presses a tool on a surface, which is identified."""
+    return bool(getattr(target(cfg.task, "task"), "touches", False)) and not moves_box(cfg)
+
+
+def moves_box(cfg: Any) -> bool:
+    """Return whether the task pushes a box, whose mass and friction are not identified."""
+    return bool(getattr(target(cfg.task, "task"), "moves_box", False))
 
 
 def labels(cfg: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the labels of the trainings and of the transfers."""
     adapts = cfg.adapt.name != "none"
-    unlearned = [REFERENCE] if touches(cfg) else [COMPUTED] if adapts else []
+    unlearned = [REFERENCE] if touches(cfg) or moves_box(cfg) else [COMPUTED] if adapts else []
     trained = *MODELS, *unlearned
     return trained, (*trained, ADAPTED) if adapts else trained
 
@@ -192,17 +197,18 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
     }
     unlearned = without("adapt", "algo", "reward", "costs", "evaluation.env_steps", "compile", "matmul", "device")
     if REFERENCE in labels(cfg)[0]:
-        words, typed = ["algo=hybrid_force", known, *drawn], [o for o in unlearned if not o.startswith("control")]
+        reference = "algo=pusher" if moves_box(cfg) else "algo=hybrid_force"
+        words, typed = [reference, known, *drawn], [o for o in unlearned if not o.startswith("control")]
         trained[REFERENCE] = step("train", REFERENCE, *words, calibration=known, typed=typed)
     elif adapts:
         words, typed = ["algo=computed_torque", "dr=none", known], [o for o in unlearned if not o.startswith("dr")]
         trained[COMPUTED] = step("train", COMPUTED, *words, calibration=known, typed=typed)
-    table = surface_words(cfg) if touched else []
+    table = surface_words(cfg) if touched or moves_box(cfg) else []
     transferred = {}
     for label in labels(cfg)[1]:
         policy = f"policy={root / 'train' / f'{name}_{MODELS[0] if label == ADAPTED else label}'}"
         transferred[label] = step("transfer", label, policy, *table, typed=overrides if label == ADAPTED else bare)
-    unchanged = without(*(CHANGES if adapts else ()), *(["arm.surface"] if touched else []))
+    unchanged = without(*(CHANGES if adapts else ()), *(["arm.surface"] if table or touched else []))
     steps = [{"identify": step("identify", "identify", typed=unchanged)}, trained, transferred]
     if touched:
         words = [known, f"data.presses={PATHS}", *tool_words(cfg), *table]
@@ -212,11 +218,13 @@ def commands(cfg: Any, name: str, overrides: Sequence[str]) -> list[dict[str, li
 
 
 def surface_words(cfg: Any) -> list[str]:
-    """Return the words that give a simulated arm a surface at the plane of the task, if it has none."""
+    """Return the words that give a simulated arm a surface at the plane of the task, or its box, if it has none."""
     if not is_simulated(cfg) or cfg.arm.get("surface"):
         return []
     plane = {k: cfg.task[k] for k in ("point", "normal")}
-    if None in plane.values():
+    if moves_box(cfg):
+        plane = {"box": cfg.task.size} | ({} if None in plane.values() else plane)
+    elif None in plane.values():
         return ["arm.surface=true"]
     return ["arm.surface={" + ",".join(f"{k}:{list(v)}" for k, v in plane.items()) + "}"]
 

@@ -111,7 +111,13 @@ def make_request(cfg):
         raise UserError("simulator: expected a simulator or an arm, got simulator=none and arm=none")
     if task.touches and is_simulated(cfg) and not cfg.arm.get("surface"):
         raise UserError(
-            f"arm.surface: {type(task).__name__} touches a surface, and this arm has none; true is allowed"
+            f"arm.surface: {type(task).__name__} touches a surface, and this arm has none; "
+            f"{'box' if task.moves_box else 'true'} is allowed"
+        )
+    if task.moves_box and cfg.arm.name != "none" and not (is_twin(cfg) and has_box(cfg.arm.surface)):
+        raise UserError(
+            f"arm: {type(task).__name__} needs the pose of a box, which arm={cfg.arm.name} does not report; arm=twin "
+            "arm.surface=box is allowed"
         )
     if cfg.arm.name != "none":
         space = Space(robot)
@@ -121,6 +127,11 @@ def make_request(cfg):
     check_number("arm.soft_start_s", soft_start_s, "[0, inf)")
     draw = make_draw(trained, robot, center) if cfg.simulator.name != "none" else None
     return Request(robot, task, center, source, policy, starts, goals, draw, soft_start_s)
+
+
+def has_box(surface):
+    """Return whether this setting of arm.surface is a box."""
+    return surface == "box" or (hasattr(surface, "get") and surface.get("box") is not None)
 
 
 @contextmanager

@@ -76,6 +76,10 @@ class ConstrainedReward(Reward):
         for name in self._names:
             if name != "limit_margin" and not task.touches:
                 raise UserError(f"costs.{name}: {type(task).__name__} touches nothing; limit_margin is allowed")
+            if name == "impact_speed" and not hasattr(task, "normals"):
+                raise UserError(
+                    f"costs.impact_speed: {type(task).__name__} touches no plane; excess_force is allowed"
+                )
         return (*self._reward.terms(task), *self._names)
 
     def judge(

@@ -91,6 +91,7 @@ def rollout(
         goal=task.goal_positions(goals), distance=distance, reward=reward, reward_smooth=reward_smooth,
         q_left=np.zeros(count), limited=np.zeros(count), collision=np.full(count, "", dtype=object),
         force=np.zeros((*shape, 2)) if task.touches else None,
+        box=np.zeros((*shape, 11)) if task.moves_box else None,
     )  # fmt: skip
     contacts = CollisionCheck(robot, table=None, may_touch=task.may_touch)
     for first in range(0, count, arms.width):
@@ -126,6 +127,8 @@ def _run(
         out.q[now, k], out.dq[now, k], out.ee[now, k], out.tau[now, k] = state.q, state.dq, state.ee, state.tau
         if out.force is not None:
             out.force[now, k] = task.forces(state, goals)
+        if out.box is not None:
+            out.box[now, k] = task.boxes(state, goals)
         before = out.dq[now, k]
         hit = np.where(over | state.stopped, -1, contacts.first_contact(state.q))
         for i in np.flatnonzero(hit >= 0):

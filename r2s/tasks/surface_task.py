@@ -10,14 +10,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from r2s.compiled import njit
 from r2s.control.controller import Controller
 from r2s.control.impedance import Impedance, cartesian_impedance
 from r2s.errors import UserError, check_number
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.impedance import FORCE_MAX, K_DEFAULT, arm_pose
+from r2s.physics.impedance import FORCE_MAX, K_DEFAULT, arm_tips
 from r2s.physics.inverse_dynamics import InverseDynamics
-from r2s.physics.kinematics import POSE
 from r2s.physics.push_limit import push_limit
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
@@ -319,7 +317,7 @@ class SurfaceTask(BaseTask):
         """Return place (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's centre at q (m, n) rad."""
         if self.parameters is None:
             raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
-        return _tips(np.ascontiguousarray(q), self.parameters)
+        return arm_tips(np.ascontiguousarray(q), self.parameters)
 
     def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m,) ones: the reward takes forces in N and distances in m."""
@@ -347,15 +345,3 @@ def near(error: np.ndarray, coarse: float, fine: float) -> np.ndarray:
 def rough(ddq: np.ndarray) -> np.ndarray:
     """Return (m,) 0.03 sum tanh(|ddq| / 10 rad/s^2) of ddq (m, n)."""
     return 0.03 * np.tanh(np.abs(ddq) / 10.0).sum(1)
-
-
-@njit(cache=True, error_model="numpy")
-def _tips(q, parameters):
-    """Return place (m, 3) m and Jacobian (m, 3, n) of the tip at q (m, n) rad; parameters of an impedance."""
-    m, n = q.shape
-    places, out = np.empty((m, 3)), np.empty((m, 3, n))
-    frames, jacobian = np.empty((n, POSE)), np.empty((6, n))
-    for i in range(m):
-        arm_pose(q[i], parameters, frames, jacobian, places[i])
-        out[i] = jacobian[:3]
-    return places, out

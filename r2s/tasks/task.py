@@ -38,6 +38,8 @@ class State:
             speed, or sensors are exact.
         force: (m, 3) N, what the tool exerts, in base axes: true in simulation and on twins, else what the arm
             reports. It is for rewards and measures, not for observations. None: unknown.
+        box: (m, 6), centre m and first axis in the base frame of the box that the tool pushes, as perceived; None:
+            there is none.
     """
 
     t: np.ndarray
@@ -51,6 +53,7 @@ class State:
     limited: np.ndarray
     noise: np.ndarray | None = None
     force: np.ndarray | None = None
+    box: np.ndarray | None = None
 
     def measured(self) -> "State":
         """Return the state as the sensors measure it: what a policy or a controller uses."""
@@ -77,6 +80,7 @@ class Episodes:
         limited: (E,), share of the cycles in which the safety filter changed the command.
         collision: (E,) str, time and bodies of the contact that ended the episode; "" without contact.
         force: (E, T, 2) N, exerted against a surface and asked for; None: the task asks for none.
+        box: (E, T, 11), see `Task.boxes`; None: the task moves none.
     """
 
     t: np.ndarray
@@ -92,6 +96,7 @@ class Episodes:
     limited: np.ndarray
     collision: np.ndarray
     force: np.ndarray | None = None
+    box: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,7 @@ class Task(Protocol):
         measure_table: the measures that `measures` returns, and how they are shown (r2s/tasks/measures.py).
         may_touch: pairs of body names that may touch, or of one and "table"; other contacts end an episode.
         touches: whether the tool touches a surface, so that simulated arms need one (`Dynamics.surface`).
+        moves_box: whether that surface is a box that it pushes, so that arms must perceive one (`State.box`).
         push_limit: of force and speed of its contacts; None: they are not limited.
     """
 
@@ -154,6 +160,8 @@ class Task(Protocol):
     def may_touch(self) -> tuple[tuple[str, str], ...]: ...  # noqa: D102
     @property
     def touches(self) -> bool: ...  # noqa: D102
+    @property
+    def moves_box(self) -> bool: ...  # noqa: D102
     @property
     def push_limit(self) -> PushLimit | None: ...  # noqa: D102
 
@@ -222,6 +230,10 @@ class Task(Protocol):
         """Return (m, 2) N, the force against a surface and the requested one; None: the task requests none."""
         ...
 
+    def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Return (m, 11): `State.box`, its yaw error rad, the tip's height above the table m, the box's edges m."""
+        ...
+
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
         """Return the dynamics with the nominal surroundings, for predictions."""
         ...
@@ -268,6 +280,7 @@ class BaseTask:
     speed_noise: float | None = None
     may_touch: tuple[tuple[str, str], ...] = ()
     touches = False
+    moves_box = False
     controller: Controller | None = None
     push_limit: PushLimit | None = None
 
@@ -315,6 +328,10 @@ class BaseTask:
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray | None:
         """Return None: the task asks for no force."""
         return None
+
+    def boxes(self, state: State, goals: np.ndarray) -> np.ndarray:
+        """Raise TypeError: the task moves no box."""
+        raise TypeError(f"{type(self).__name__} moves no box")
 
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
         """Return the dynamics: there is nothing around the arm."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from r2s.arm.twins.draws import ENCODER, drag
 from r2s.compiled import njit
-from r2s.physics.contact import GUESS, ROUNDS, add_contact, contact_torque, finish_contact, next_guess, start_guess
+from r2s.physics.contact import ROUNDS, add_contact, contact_torque, finish_contact, next_guess, start_guess
+from r2s.physics.contact_layout import GUESS
 from r2s.physics.linear_algebra import packed_element
 from r2s.physics.robot import SIM_DT
 

@@ -1,12 +1,32 @@
-"""The surface of a twin: drawn from its seed around its nominal place, and touched in every cycle."""
+"""The surface of a twin: drawn from its seed around its nominal place, and touched in every cycle.
+
+A box is drawn from the seed as well, and stands elsewhere in each episode.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from r2s.errors import UserError, nearest
-from r2s.physics.contact import COLUMNS, DEFLECTION, DEPTH, FORCE, NORMAL, RADIUS, ROWS, TIP, contact_columns, near
+from r2s.physics import box
+from r2s.physics.box import TableFrame, check_size, standing_box, table_frame
+from r2s.physics.contact import near
+from r2s.physics.contact_layout import (
+    AXES,
+    COLUMNS,
+    DEFLECTION,
+    DEPTH,
+    FORCE,
+    NORMAL,
+    POINT,
+    RADIUS,
+    ROWS,
+    TIP,
+    box_pose,
+    contact_columns,
+)
 from r2s.physics.kinematics import POSE, link_frames
 from r2s.physics.newton_euler import links_of
 from r2s.physics.payload import ee_pose
@@ -16,6 +36,15 @@ from r2s.physics.tip import Tip, default_plane, tilted
 
 PLACE, TILT = 5e-3, np.radians(5.0)  # m, rad, by which the surface lies elsewhere than its nominal place
 STIFFNESS = 2e3, 1e5  # N/m, from foam to wood under a tip of 10 mm
+CAMERA = 33, 1e-3, np.radians(0.5)  # cycles between two images, and noise of a box's pose, m and rad
+
+
+@dataclass(frozen=True)
+class BoxSurface:
+    """A box: where its table is, and a drawn box at its nominal place."""
+
+    frame: TableFrame
+    surface: Surface
 
 
 class Touch:
@@ -29,18 +58,33 @@ class Touch:
         robot: the arm. surface: None: no surface.
     """
 
-    def __init__(self, robot: Robot, surface: Surface | None):
+    def __init__(self, robot: Robot, surface: Surface | BoxSurface | None):
         n = robot.n
+        self._table = surface.frame if isinstance(surface, BoxSurface) else None
+        surface = surface.surface if isinstance(surface, BoxSurface) else surface
         self.there, self.contact = surface is not None, np.zeros(COLUMNS)
         self.jacobian, self.frames, self.axes = np.zeros((ROWS, n)), np.zeros((n, POSE)), np.zeros((n, 3))
         self.links = links_of(robot, robot.mass, robot.com, robot.inertia)
         self._ee = ee_pose(robot)[0]
         if surface is not None:
             self.contact[:] = contact_columns(robot, surface)
+        self._first = self.contact.copy()
 
-    def start(self, q: np.ndarray) -> float:
-        """Return the depth, m, of the tip at rest at q (n,) rad; it has not slid there."""
-        self.contact[DEFLECTION:] = 0.0
+    def start(self, q: np.ndarray, seed: list[int]) -> float:
+        """Return the depth, m, of the tip at rest at q (n,) rad; it has not slid there. A box is placed anew.
+
+        seed: of the episode.
+        """
+        self.contact[DEFLECTION:] = self._first[DEFLECTION:]
+        if self._table is not None:
+            self._camera = np.random.default_rng([*seed, 1])
+            most = np.array([[box.SPREAD, box.SPREAD, np.radians(box.YAW)]])  # U about the nominal place
+            planar = np.random.default_rng(seed).uniform(-most, most)
+            pose = self._table.moved(box_pose(self._first)[None], planar)[0]
+            up = self._table.axes[2]
+            axes = np.stack([pose[3:], np.cross(up, pose[3:]), up], axis=1)
+            self.contact[POINT : POINT + 3], self.contact[AXES : AXES + 9] = pose[:3], axes.ravel()
+            self._image = -1
         return float(self.contact[DEPTH]) if self.near(q, np.zeros_like(q)) else -np.inf
 
     def near(self, q: np.ndarray, dq: np.ndarray) -> bool:
@@ -50,6 +94,17 @@ class Touch:
         link_frames(self.links, q, self.frames, self.axes)
         last = self.frames[-1]
         return near(self.contact, (last[:3], last[3:]), self.frames[:, :3], self.axes, dq, SIM_DT, self.jacobian)
+
+    def perceived(self, cycle: int) -> np.ndarray | None:
+        """Return the pose (6,) of the box in the camera's last image; None without a box."""
+        if self._table is None:
+            return None
+        every, m, rad = CAMERA
+        if cycle // every != self._image:
+            noise = np.array([[m, m, rad]]) * self._camera.standard_normal(3)
+            self._seen = self._table.moved(box_pose(self.contact)[None], noise)[0]
+            self._image = cycle // every
+        return self._seen
 
     def wrench(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what the arm exerts on the surface: joint torque (n,) Nm, wrench (6,) N, Nm at the end effector."""
@@ -62,10 +117,12 @@ class Touch:
         return torque, np.concatenate([force, np.cross(arm, force)])
 
 
-def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | None:
+def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surface | BoxSurface | None:
     """Return a twin's surface near its nominal place; U: uniform.
 
-    surface: False: none. True: a table below the tip at home. {point: m, normal}: that place.
+    surface: False: none. True: a table below the tip at home. {point: m, normal}: that place. box: a box of
+    `r2s.physics.box.SIZE` on a table before the tip at home; {box: [3 edges m]}, with or without point and normal:
+    another box or place.
 
     Raises:
         UserError: another value, a robot without a tool, or a surface inside the arm.
@@ -74,6 +131,8 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
         return None
     if robot.tool is None:
         raise UserError(f"arm.surface: {robot.name} has no tool that could touch it; give robot.tool=FILE")
+    if surface == "box" or (isinstance(surface, Mapping) and "box" in surface):
+        return _draw_box(robot, {"box": list(box.SIZE)} if surface == "box" else dict(surface), rng)
     point, normal = default_plane(robot) if surface is True else _place(surface)
     # point: U(-5, 5) mm along the normal; normal: tilted by U(0, 5) degrees; stiffness: log U(2e3, 1e5) N/m
     about, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(0, TILT)
@@ -95,10 +154,21 @@ def draw_surface(robot: Robot, surface: Any, rng: np.random.Generator) -> Surfac
     )
 
 
+def _draw_box(robot: Robot, settings: dict[str, Any], rng: np.random.Generator) -> BoxSurface:
+    """Return a box with the ranges of r2s/physics/box.py."""
+    size = settings.pop("box")
+    point, normal = _place(settings) if settings else (None, None)
+    edges, frame = check_size("arm.surface.box", size, box.TABLE[1]), table_frame(robot, point, normal)
+    mass, stiffness = (float(np.exp(rng.uniform(*np.log(pair)))) for pair in (box.MASS, box.STIFFNESS))  # log U
+    pairs = {"table": box.TABLE, "friction": box.TIP, "damping": box.DAMPING, "bristle": box.BRISTLE}
+    law = {name: float(rng.uniform(*pair)) for name, pair in pairs.items()}
+    return BoxSurface(frame, standing_box(frame, np.zeros(3), edges, mass=mass, stiffness=stiffness, **law))
+
+
 def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return point, m, and normal of the nominal place."""
     if not isinstance(surface, Mapping):
-        raise UserError(f"arm.surface: expected false, true or {{point: [3], normal: [3]}}, got {surface!r}")
+        raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):
         if key not in ("point", "normal"):
             raise UserError(f"arm.surface: unknown key '{key}'{nearest(str(key), ('point', 'normal'))}")

@@ -45,6 +45,7 @@ class TwinBase:
         extra_delay_s: s, delay of commands in addition to the variant's own; whole milliseconds.
         surface: what the robot's tool may touch, drawn from the seed: False: nothing. True: a table below the tip at
             home. {point: (3,) m, normal: (3,)}: a plane within 5 mm and 5 degrees of that place, in the base frame.
+            box: a box on a table; see `draw_surface`.
 
     Raises:
         UserError: an argument is out of its range.
@@ -95,7 +96,7 @@ class TwinBase:
             raise ArmStopped(f"move_to: expected {self.robot.n} finite joint angles, got {q}")
         self._reflexes.state(q, np.zeros(self.robot.n))
         stays = np.abs(q - self._q).max() < STAYS  # where it presses, as under the arm's own position control
-        if (depth := self._touch.start(q)) > 0 and not stays:
+        if (depth := self._touch.start(q, [self._seed, 5, self._episode, self._stream])) > 0 and not stays:
             raise ArmStopped(f"move_to: the tool's tip would be {1e3 * depth:.1f} mm inside the surface")
         self._cycle = 0
         self._update_payload()
@@ -116,6 +117,7 @@ class TwinBase:
         return ArmState(
             self._cycle * SIM_DT, q.copy(), dq.copy(), tau_J.copy(), self._last_command.copy(),
             tau_ext_hat_filtered=external, O_F_ext_hat_K=wrench, m_ee=0.0, m_load=float(self._declared[0]),
+            box=self._touch.perceived(self._cycle),
         )  # fmt: skip
 
     def command(self, tau: np.ndarray) -> None:

@@ -62,6 +62,8 @@ def log_arms(
         arm = _Arm(stream, base, model, sequence, [at_rate(e.t, FRAMES_HZ) for e in sequence], starts, colour)
         _motion(arm)
         (_paths if sequence[0].moves else _goals)(arm)
+        if sequence[0].box is not None:
+            _boxes(arm, -robot.gravity)
         _plots(arm, label, error)
 
 
@@ -108,6 +110,17 @@ def _goals(arm: _Arm) -> None:
     arm.send("trail", style, rr.LineStrips3D.columns(strips=trail), per_episode=False)
     goals = rr.Points3D.columns(positions=np.stack([e.goal for e in arm.episodes]))
     arm.send("goal", rr.Points3D.from_fields(colors=rgb(GOAL), radii=GOAL_RADIUS), goals, per_episode=True)
+
+
+def _boxes(arm: _Arm, up: np.ndarray) -> None:
+    """Log the box that the arm pushes on a level table; up: (3,), of any length."""
+    rows = np.concatenate([e.box[f] for e, f in zip(arm.episodes, arm.frames, strict=True) if e.box is not None])
+    first, up = rows[:, 3:6], up / np.linalg.norm(up)
+    axes = np.stack([first, np.cross(up, first), np.broadcast_to(up, first.shape)], axis=-1)
+    arm.send("box", rr.Transform3D(), rr.Transform3D.columns(translation=rows[:, :3], mat3x3=axes), per_episode=False)
+    solid = rr.components.FillMode.Solid
+    shape = rr.Boxes3D(half_sizes=[0.5 * rows[0, 8:]], colors=rgb(arm.colour), fill_mode=solid)
+    arm.stream.log(f"{arm.base}/box", shape, static=True)
 
 
 def _paths(arm: _Arm) -> None:

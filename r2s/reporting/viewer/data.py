@@ -23,6 +23,7 @@ class Episode:
 
     Attributes:
         t: (T,) s. q: (T, n) rad. ee: (T, 3) m. goal: (3,) m, or (T, 3) of a path. tau: (T, n) Nm, commanded.
+        box: (T, 11) of `Task.boxes`, a box that the arm pushes; None: without.
     """
 
     t: np.ndarray
@@ -30,6 +31,7 @@ class Episode:
     ee: np.ndarray
     goal: np.ndarray
     tau: np.ndarray
+    box: np.ndarray | None = None
 
     @property
     def moves(self) -> bool:
@@ -38,8 +40,8 @@ class Episode:
 
     @property
     def distance(self) -> np.ndarray:
-        """(T,) m from the end effector to the goal, or to the path's current point."""
-        return np.linalg.norm(self.ee - self.goal, axis=-1)
+        """(T,) m from the end effector, or from the box, to the goal, or to the path's current point."""
+        return np.linalg.norm((self.ee if self.box is None else self.box[:, :3]) - self.goal, axis=-1)
 
     @property
     def duration(self) -> float:
@@ -103,7 +105,8 @@ def external_overlay(r: Recording) -> dict[str, Overlay]:
 
 def first(e: "Episodes") -> list[Episode]:
     """Return the first `SHOWN` episodes."""
-    return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i]) for i in range(min(SHOWN, len(e.goal)))]
+    boxes = [None] * len(e.goal) if e.box is None else e.box
+    return [Episode(e.t, e.q[i], e.ee[i], e.goal[i], e.tau[i], boxes[i]) for i in range(min(SHOWN, len(e.goal)))]
 
 
 def saved_episodes(run: Path) -> dict[str, list[Episode]]:

@@ -1,0 +1,84 @@
+"""Domain randomization of a box that is pushed: `dr=box`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from r2s.errors import UserError, check_number
+from r2s.learning.randomization import UniformRandomization
+from r2s.physics.box import TableFrame, check_size, standing_box, table_frame
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.robot import Robot
+
+RANGES = "mass", "table", "friction", "damping", "bristle"
+
+
+@dataclass(frozen=True)
+class BoxRandomization:
+    """Arms as of `UniformRandomization`, each with a box of its own.
+
+    mass ~ log U(mass); stiffness ~ log U(stiffness); table, friction, damping, bristle ~ U
+    x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw) about the nominal place
+
+    Attributes:
+        robot, center, phi_relative, inertia_relative, payload: see `UniformRandomization`.
+        size: (3,) m, edges. mass: kg, table, friction (with the tip), stiffness: N/m, damping: s/m, bristle: m, all
+            [least, most], see `Surface`.
+        spread: m. yaw: degrees. point: (3,) m, normal: (3,), of the table; None: of `table_frame`.
+
+    Raises:
+        UserError: a range that is none, a box that would tilt, or no tool.
+    """
+
+    robot: Robot
+    center: Dynamics
+    phi_relative: float
+    inertia_relative: float
+    size: Sequence[float]
+    mass: Sequence[float]
+    table: Sequence[float]
+    friction: Sequence[float]
+    stiffness: Sequence[float]
+    damping: Sequence[float]
+    bristle: Sequence[float]
+    spread: float
+    yaw: float
+    point: Sequence[float] | None = None
+    normal: Sequence[float] | None = None
+    payload: Sequence[float] | None = None
+
+    @cached_property
+    def _arms(self) -> UniformRandomization:
+        return UniformRandomization(self.robot, self.center, self.phi_relative, self.inertia_relative, self.payload)
+
+    @cached_property
+    def _frame(self) -> TableFrame:
+        return table_frame(self.robot, self.point, self.normal)
+
+    def __post_init__(self):
+        _ = self._arms, self._frame  # raise for wrong settings
+        for name in ("stiffness", *RANGES):
+            pair = getattr(self, name)
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
+            for value in pair:
+                check_number(f"dr.{name}", value, "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
+            if pair[0] > pair[1]:
+                raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
+        check_size("dr.size", self.size, self.table[1])
+        check_number("dr.spread", self.spread, "[0, inf)")
+        check_number("dr.yaw", self.yaw, "[0, 180]")
+
+    def __call__(self, rng: np.random.Generator, m: int) -> Dynamics:
+        """Return the dynamics of m arms."""
+
+        def drawn(low: float, high: float) -> np.ndarray:
+            return rng.uniform(low, high, m)
+
+        law = {name: drawn(*getattr(self, name)) for name in RANGES[1:]}
+        law |= {name: np.exp(drawn(*np.log(getattr(self, name)))) for name in ("mass", "stiffness")}
+        most = np.array([self.spread, self.spread, np.radians(self.yaw)])
+        box = standing_box(self._frame, rng.uniform(-most, most, (m, 3)), self.size, **law)
+        return replace(self._arms(rng, m), surface=box)

@@ -1,0 +1,167 @@
+"""`algo=pusher`: a model-based pusher of `task=push`, without learning, to measure policies against.
+
+Quasi-static: a frictionless push at a face point p along its inward normal n moves a box by v = n and w = (p x n) /
+r^2 (the ellipsoid of r2s/physics/sliding.py), whatever its mass and friction. Of many points on the four faces the
+pusher takes the one whose motion reduces the error |e|^2 + r^2 e_yaw^2 fastest (steepest descent), less what the way
+to it around the box costs. It has no memory and plans anew in every control period.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from r2s.errors import UserError
+from r2s.physics.box import EXPECTED
+from r2s.physics.dynamics import Dynamics
+from r2s.physics.inverse_dynamics import InverseDynamics
+from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface
+from r2s.tasks.push import BOX, ERROR, TIP, TIP_RATE, PushTask
+
+POINTS, EDGE = 9, 0.75  # points per face, and share of a half edge that they span
+CLEAR = 0.02  # m, between tip and box on the way around it
+NEAR = 0.012  # m, error of the place before a face from which the tip pushes
+WAY = 0.4  # 1/m, price of the way, in shares of the steepest descent
+DONE = 0.008  # m, error at which it leaves the box alone
+SPEED, TRAVEL, SLOW_M = 0.1, 0.15, 0.02  # m/s, of a push and on the way; m, error from which a push slows down
+GAIN = 0.25  # of the law's damping, feedback of the tip's speed: 25 Hz and the latency allow little more
+
+
+class Pusher:
+    """The pusher for B arms; `action` as in `r2s.learning.networks.Policy`.
+
+    Args:
+        robot, task: the arm and its task, under control=cartesian_impedance. dynamics: model of one arm, whose
+            friction it compensates.
+
+    Raises:
+        UserError: another task or controller.
+    """
+
+    def __init__(self, robot: Robot, task: PushTask, dynamics: Dynamics):
+        control = task.control(robot)
+        if not isinstance(task, PushTask) or control.name != "cartesian_impedance" or control.action_dim != 3:
+            raise UserError(
+                f"algo: pusher cannot do {type(task).__name__} under control={control.name}; task=push with "
+                "control=cartesian_impedance and its targets as actions is allowed"
+            )
+        self._task, self._dynamics, self._n = task, dynamics, robot.n
+        self._axes, self._scale = task.table.axes, control.action_scale
+        self._stiffness, self._load = (
+            task.spring,
+            EXPECTED["mass"] * EXPECTED["table"] * np.linalg.norm(robot.gravity),
+        )
+        jacobian = task.tip(robot.q_home[None])[1][0]
+        mobility = jacobian @ np.linalg.solve(
+            InverseDynamics(robot, dynamics).mass(robot.q_home[None])[0], jacobian.T
+        )
+        self._damping = 2.0 * np.sqrt(self._stiffness * 3.0 / np.trace(mobility))  # N s/m, critical
+        self._centre = task.table.inside(task.centre)
+        half = 0.5 * np.array(task.size)
+        self._half, self._reach = half[:2], float(Surface(half, half, 1.0, half=half).reach)
+        self._points, self._normals = _face_points(self._half)
+
+    @torch.no_grad()
+    def action(self, observation: Tensor) -> Tensor:
+        """Return actions (B, 3) in [-1, 1] for observations (B, d)."""
+        rows, n = observation.numpy().astype(np.float64), self._n
+        own = rows[:, 3 * n + 1 :]
+        tip, rate, box, error = own[:, TIP], own[:, TIP_RATE], own[:, BOX], own[:, ERROR]
+        plans = [self._plan(*row) for row in zip(tip, box, error, strict=True)]
+        velocity, pushes = (np.array(each) for each in zip(*plans, strict=True))
+        velocity[:, 2] = 4.0 * (self._centre[2] - tip[:, 2])
+        force = self._damping * (velocity + GAIN * (velocity - rate)) + self._friction(rows[:, :n], velocity)
+        force[:, :2] += self._load * pushes
+        target = tip + force / self._stiffness - self._centre
+        return torch.from_numpy(np.clip(target @ self._axes / self._scale, -1.0, 1.0).astype(np.float32))
+
+    def _friction(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """Return the force (B, 3) N that overcomes the joints' friction at a velocity (B, 3) m/s of the tip."""
+        jacobian = self._task.tip(q)[1]
+        inverse = np.linalg.pinv(jacobian)
+        torque = self._dynamics.friction(np.einsum("bnk,bk->bn", inverse, velocity))
+        return np.einsum("bnk,bn->bk", inverse, torque)
+
+    def _plan(self, tip: np.ndarray, box: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the velocity (3,) m/s of the tip along the table, and the direction (2,) of a push, else 0."""
+        c, s = np.cos(box[2]), np.sin(box[2])
+        rotation = np.array([[c, s], [-s, c]])  # from the table to the box
+        at, e = rotation @ (tip[:2] - box[:2]), np.array([*(rotation @ error[:2]), self._reach * error[2]])
+        radius, r = self._task.tip_radius, self._reach
+        size = float(np.linalg.norm(e))
+        if size < DONE:
+            return np.zeros(3), np.zeros(2)
+        p, n = self._points, self._normals
+        twist = np.column_stack([n, (p[:, 0] * n[:, 1] - p[:, 1] * n[:, 0]) / r])
+        descent = twist @ e / (np.linalg.norm(twist, axis=1) * size)
+        before = p - (radius + 0.3 * CLEAR) * n
+        contact = p - radius * n
+        off = np.linalg.norm(at - contact, axis=1)
+        best = int(np.argmax(descent - WAY * off))
+        across = np.array([-n[best, 1], n[best, 0]])
+        aside, gap, push = abs((at - p[best]) @ across), -(at - contact[best]) @ n[best], np.zeros(2)
+        if aside < NEAR and gap < 2 * CLEAR:
+            push = rotation.T @ n[best]
+            way = SPEED * min(1.0, size / SLOW_M) * n[best] - 3.0 * ((at - p[best]) @ across) * across
+        else:
+            towards = self._around(at, before[best]) - at
+            far = float(np.linalg.norm(towards))
+            way = min(TRAVEL, 6.0 * far) * towards / max(far, 1e-9)
+        return np.array([*(rotation.T @ way), 0.0]), push
+
+    def _around(self, at: np.ndarray, to: np.ndarray) -> np.ndarray:
+        """Return the next point (2,) m of a way from `at` to `to` that keeps clear of the box, all in its frame."""
+        edge = self._half + self._task.tip_radius
+        clear = edge + CLEAR
+        corners = clear * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        if not _crosses(at, to, edge + 0.2 * CLEAR):
+            return to
+        inside = edge + 0.2 * CLEAR - np.abs(at)
+        if (inside > 0).all():  # touching a face: leave along its normal first
+            k = int(np.argmin(inside))
+            out = at.copy()
+            out[k] = np.sign(at[k]) * clear[k]
+            return out
+        seen = [k for k in range(4) if not _crosses(at, corners[k], edge + 0.2 * CLEAR)] or list(range(4))
+        ways = [np.linalg.norm(corners[k] - at) + self._left(corners, k, to, edge) for k in seen]
+        return corners[seen[int(np.argmin(ways))]]
+
+    def _left(self, corners: np.ndarray, first: int, to: np.ndarray, edge: np.ndarray) -> float:
+        """Return the length, m, of the shortest way along the corners from one of them to a point."""
+        lengths = []
+        for step in (1, -1):
+            k, length = first, 0.0
+            for _ in range(3):
+                if not _crosses(corners[k], to, edge + 0.2 * CLEAR):
+                    break
+                after = (k + step) % 4
+                length, k = length + float(np.linalg.norm(corners[after] - corners[k])), after
+            lengths.append(length + float(np.linalg.norm(to - corners[k])))
+        return min(lengths)
+
+
+def _face_points(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (k, 2) m on the faces of a rectangle with half edges (2,) m, and inward normals (k, 2)."""
+    points, normals = [], []
+    for axis in range(2):
+        for side in (-1.0, 1.0):
+            for share in np.linspace(-EDGE, EDGE, POINTS):
+                point, normal = np.empty(2), np.zeros(2)
+                point[axis], point[1 - axis], normal[axis] = side * half[axis], share * half[1 - axis], -side
+                points.append(point)
+                normals.append(normal)
+    return np.array(points), np.array(normals)
+
+
+def _crosses(a: np.ndarray, b: np.ndarray, half: np.ndarray) -> bool:
+    """Return whether the line from a to b (2,) m passes inside a rectangle with half edges (2,) m."""
+    low, high = 0.0, 1.0
+    for k in range(2):
+        step = b[k] - a[k]
+        if abs(step) < 1e-12:
+            if abs(a[k]) >= half[k]:
+                return False
+            continue
+        one, two = (-half[k] - a[k]) / step, (half[k] - a[k]) / step
+        low, high = max(low, min(one, two)), min(high, max(one, two))
+    return low < high - 1e-9

@@ -1,0 +1,69 @@
+"""Columns of a contact and of a guess, which contact.py and sliding.py share, and how a surface fills them."""
+
+import numpy as np
+
+from r2s.errors import UserError
+from r2s.physics.payload import ee_pose
+from r2s.physics.robot import Robot
+from r2s.physics.surface import Surface
+
+# Columns of a contact: surface (see `Surface`), tool, and what a step writes
+K, EXPONENT, DAMPING, MU, BRISTLE, POINT, NORMAL, TIP, RADIUS = 0, 1, 2, 3, 4, 5, 8, 11, 14
+# HALF: 0 for a plane. AXES: row by row. NORMAL: of a box, where the tip is
+HALF, AXES, DEFLECTION, FORCE, DEPTH = 15, 18, 27, 30, 33
+# Of a box that moves on a table (sliding.py); MASS 0: the surface is fixed. WEIGHT: N. TABLE: friction coefficient.
+# REACH: m, moment over force of the table's friction. UP: normal of the table. VELOCITY, SPIN: of the centre, m/s,
+# and about UP, rad/s. STRAIN: elastic deflection on the table (4), m; the last one is REACH times an angle. ARM: from
+# the centre to the contact, m. LOAD: N, friction of the table in sliding.
+MASS, INERTIA, WEIGHT, TABLE, REACH, UP = range(DEPTH + 1, DEPTH + 7)
+VELOCITY, SPIN, STRAIN, ARM, LOAD = UP + 3, UP + 6, UP + 7, UP + 11, UP + 14
+COLUMNS = LOAD + 1
+ROWS = 4  # of the Jacobian: normal, and the tangential part of x, y and z
+# Columns of a guess. RATE: of the depth, and SLIDE (3): tangential velocity, at the beginning of the step. NEXT and
+# SPEED: their guess for its end. BEGIN: m, where the path begins. LINEAR and SLID (3): force and velocity found.
+RATE, SLIDE, BEGIN, NEXT, SPEED, NORMAL_FORCE, SLOPE = 0, 1, 4, 5, 6, 7, 8
+SPRING, DAMPER, LINEAR, SLID = 9, 10, 11, 12
+# Of a box: velocity of the tip at the beginning (3), force if the tip goes on so (3) N, its decrease per change of
+# that velocity (9) N s/m, velocity and spin at the end (4), and the guess of the speed on the table
+TIP_BEGIN, FORCE_BEGIN, RESISTANCE = SLID + 3, SLID + 6, SLID + 9
+BOX_END, BOX_SPEED = RESISTANCE + 9, RESISTANCE + 13
+GUESS = BOX_SPEED + 1
+
+
+def contact_columns(robot: Robot, surface: Surface) -> np.ndarray:
+    """Return (..., COLUMNS) of a surface and the robot's tool, before the first step.
+
+    Raises:
+        UserError: the robot has no tool, or a value of the surface is out of its range.
+    """
+    if robot.tool is None:
+        raise UserError(f"robot.tool: {robot.name} has no tool that could touch the surface; give robot.tool=FILE")
+    surface.check()
+    place, axes = ee_pose(robot)
+    law = surface.coefficient, surface.exponent, surface.damping, surface.friction, surface.bristle
+    box = np.zeros(3) if surface.half is None else surface.half, np.eye(3) if surface.axes is None else surface.axes
+    lead = np.broadcast_shapes(
+        *(np.shape(a) for a in law), surface.point.shape[:-1], surface.normal.shape[:-1], np.shape(box[0])[:-1],
+        np.shape(box[1])[:-2], np.shape(0.0 if surface.mass is None else surface.mass), np.shape(surface.table),
+    )  # fmt: skip
+    out = np.zeros((*lead, COLUMNS))
+    for k, value in enumerate(law):
+        out[..., k] = value
+    out[..., POINT : POINT + 3], out[..., NORMAL : NORMAL + 3] = surface.point, surface.normal
+    out[..., TIP : TIP + 3], out[..., RADIUS] = place + axes @ robot.tool.tip, robot.tool.radius
+    if surface.half is not None:
+        out[..., HALF : HALF + 3] = surface.half
+        axes = np.asarray(surface.axes)
+        out[..., AXES : AXES + 9] = axes.reshape(*axes.shape[:-2], 9)
+    if surface.mass is not None and surface.half is not None:
+        out[..., MASS], out[..., TABLE], out[..., UP : UP + 3] = surface.mass, surface.table, surface.normal
+        out[..., WEIGHT] = out[..., MASS] * np.linalg.norm(robot.gravity)
+        out[..., INERTIA] = out[..., MASS] * (np.square(surface.half[..., :2]).sum(-1) / 3.0)
+        out[..., REACH] = surface.reach
+    out[..., DEPTH] = -np.inf
+    return out
+
+
+def box_pose(contact: np.ndarray) -> np.ndarray:
+    """Return (..., 6), centre m and first axis of the box in contacts (..., COLUMNS)."""
+    return np.concatenate([contact[..., POINT : POINT + 3], contact[..., AXES : AXES + 9 : 3]], axis=-1)

@@ -1,0 +1,245 @@
+"""A box that slides on a table when a tip pushes it: three velocities more in the implicit contact of contact.py.
+
+Friction of the table: the limit surface of a body on a plane as an ellipsoid (Goyal, Ruina and Papadopoulos, Wear
+143, 1991; Lynch, Maekawa and Tanie, IROS 1992). With the velocity v of the centre, the spin w and u = (v, r w), the
+force on (v, r w) is -mu N u / |u|; r = moment / force is the mean distance of the base's points from the centre
+(uniform pressure). At rest it is elastic up to the same limit: the deflection z follows dz/dt = u - |u| z / `RIGID`,
+with backward Euler, and the force is -mu N z / RIGID. In sliding both are the same.
+
+Why not MuJoCo's solver for this body: one compiled law then serves training, twins and engines, joint friction holds
+against the box in the same solution, and arms without a box do not change. The box stays on its base: it neither
+tilts nor lifts (`check_size` in box.py), the vertical force of the tip only loads the base, and the tip does not feel
+the table.
+
+The tip's force F of a step depends linearly on both velocities, and the box's velocity after the step linearly on F.
+So the box is eliminated: F0 - K d, with d the change of the tip's velocity relative to the box, and the mobility h W
+of the box at the contact give F = (1 + h K W)^-1 (F0 + K d_0 - K d_tip), with d_0 the change of the box's velocity
+without F. The joints meet this softer contact.
+"""
+
+import numpy as np
+
+from r2s.compiled import njit
+from r2s.physics.contact_layout import (
+    ARM,
+    AXES,
+    BOX_END,
+    BOX_SPEED,
+    DAMPER,
+    FORCE,
+    FORCE_BEGIN,
+    INERTIA,
+    LOAD,
+    MASS,
+    NORMAL,
+    POINT,
+    REACH,
+    RESISTANCE,
+    SLOPE,
+    SPIN,
+    STRAIN,
+    TABLE,
+    TIP_BEGIN,
+    UP,
+    VELOCITY,
+    WEIGHT,
+)
+
+RIGID = 1e-6  # m, elastic deflection of a box on its table
+STILL = 1e-6  # m/s, at which an untouched box has come to rest: its friction stops it within 1 ms from 4e-3 m/s
+ROUNDS = 30  # most guesses of the speed
+CLOSE = 1e-4  # of the speed, at which they end
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(a, b, out):
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, error_model="numpy")
+def load_box(contact, x, y, z):
+    """Write the lever of a contact at x, y, z m, and the friction of the table under the force of the last step."""
+    a, b, c = contact[POINT], contact[POINT + 1], contact[POINT + 2]
+    contact[ARM], contact[ARM + 1], contact[ARM + 2] = x - a, y - b, z - c
+    down = 0.0
+    for k in range(3):
+        down += contact[FORCE + k] * contact[UP + k]
+    contact[LOAD] = contact[TABLE] * max(contact[WEIGHT] + down, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def contact_point_velocity(contact, motion, out):
+    """Write the velocity (3,) m/s of the box at the contact; motion: velocity of the centre (3,) and spin."""
+    _cross(contact[UP : UP + 3], contact[ARM : ARM + 3], out)
+    for k in range(3):
+        out[k] = motion[k] + motion[3] * out[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _grip(contact, speed, h):
+    """Return spring N/m and damper N s/m of the table's friction: -(spring z + damper u') with u' after the step."""
+    stiff = contact[LOAD] / RIGID / (1.0 + h * speed / RIGID)
+    return stiff, h * stiff
+
+
+@njit(cache=True, error_model="numpy")
+def _free_change(contact, speed, h, out):
+    """Write what a step changes of the box's motion (4,) without a tip's force; return mobilities times h, s/kg."""
+    spring, damper = _grip(contact, speed, h)
+    reach, strain = contact[REACH], contact[STRAIN : STRAIN + 4]
+    along = h / (contact[MASS] + h * damper)
+    about = h / (contact[INERTIA] + h * damper * reach * reach)
+    for k in range(3):
+        out[k] = -along * (damper * contact[VELOCITY + k] + spring * strain[k])
+    out[3] = -about * reach * (damper * reach * contact[SPIN] + spring * strain[3])
+    return along, about
+
+
+@njit(cache=True, error_model="numpy")
+def _pushed(contact, force, change, along, about, out):
+    """Write the box's motion (4,) after a step under the force (3,) N on the tip."""
+    up, lever = contact[UP : UP + 3], np.empty(3)
+    _cross(up, contact[ARM : ARM + 3], lever)
+    upwards, moment = 0.0, 0.0
+    for k in range(3):
+        upwards += force[k] * up[k]
+        moment += force[k] * lever[k]
+    for k in range(3):
+        out[k] = contact[VELOCITY + k] + change[k] - along * (force[k] - upwards * up[k])
+    out[3] = contact[SPIN] + change[3] - about * moment
+
+
+@njit(cache=True, error_model="numpy")
+def _speed(contact, motion):
+    turning = contact[REACH] * motion[3]
+    return np.sqrt(motion[0] ** 2 + motion[1] ** 2 + motion[2] ** 2 + turning * turning)
+
+
+@njit(cache=True, error_model="numpy")
+def _next_speed(contact, old, found, h):
+    """Return the next guess of the speed. Along a line, found = free old / (old + d) with d = h load / mass."""
+    if old <= 0.0:
+        return found
+    slowing = h * contact[LOAD] / contact[MASS]
+    return min(max(found + slowing * (found - old) / old, 0.25 * found), 4.0 * found)
+
+
+@njit(cache=True, error_model="numpy")
+def start_box(contact, guess):
+    """Write the guess that the box keeps its speed."""
+    guess[BOX_SPEED] = _speed(contact, contact[VELOCITY : VELOCITY + 4])
+
+
+@njit(cache=True, error_model="numpy")
+def yielding(contact, force, h, guess):
+    """Write force (3,) N and resistance (3, 3) N s/m of the contact with a box that yields.
+
+    force: (3,) N, on the tip if its velocity relative to the box does not change.
+    """
+    change, lever, point = np.empty(4), np.empty(3), np.empty(3)
+    along, about = _free_change(contact, guess[BOX_SPEED], h, change)
+    up, n, slope, damper = contact[UP : UP + 3], contact[NORMAL : NORMAL + 3], guess[SLOPE], guess[DAMPER]
+    _cross(up, contact[ARM : ARM + 3], lever)
+    contact_point_velocity(contact, change, point)
+    a, ahead = np.empty((3, 3)), 0.0
+    for i in range(3):
+        ahead += n[i] * point[i]
+    begin, resistance = guess[FORCE_BEGIN : FORCE_BEGIN + 3], guess[RESISTANCE : RESISTANCE + 9].reshape(3, 3)
+    for i in range(3):
+        begin[i] = force[i] + damper * point[i] + (slope - damper) * n[i] * ahead
+        for j in range(3):
+            resistance[i, j] = (slope - damper) * n[i] * n[j] + (damper if i == j else 0.0)
+    for i in range(3):  # 1 + K W
+        for j in range(3):
+            a[i, j] = 1.0 if i == j else 0.0
+            for k in range(3):
+                mobility = about * lever[k] * lever[j] - along * up[k] * up[j] + (along if k == j else 0.0)
+                a[i, j] += resistance[i, k] * mobility
+    _divide(a, begin, resistance)
+
+
+@njit(cache=True, error_model="numpy")
+def _divide(a, vector, matrix):
+    """Replace a vector (3,) and a matrix (3, 3) by a^-1 times them (Cramer)."""
+    inverse = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            k, m, p, q = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
+            inverse[i, j] = a[k, p] * a[m, q] - a[k, q] * a[m, p]
+    size = a[0, 0] * inverse[0, 0] + a[0, 1] * inverse[1, 0] + a[0, 2] * inverse[2, 0]
+    old, kept = vector.copy(), matrix.copy()
+    for i in range(3):
+        vector[i] = 0.0
+        for j in range(3):
+            vector[i] += inverse[i, j] * old[j] / size
+            matrix[i, j] = 0.0
+            for k in range(3):
+                matrix[i, j] += inverse[i, k] * kept[k, j] / size
+
+
+@njit(cache=True, error_model="numpy")
+def yielded(contact, tip, h, guess, point):
+    """Write the box's velocity (3,) m/s at the contact for a tip's velocity (3,) m/s after the step; return an error.
+
+    The error is that of the guessed speed of the box, as a share of the table's friction.
+    """
+    force, change = np.empty(3), np.empty(4)
+    for i in range(3):
+        force[i] = guess[FORCE_BEGIN + i]
+        for j in range(3):
+            force[i] -= guess[RESISTANCE + 3 * i + j] * (tip[j] - guess[TIP_BEGIN + j])
+    old, motion = guess[BOX_SPEED], guess[BOX_END : BOX_END + 4]
+    along, about = _free_change(contact, old, h, change)
+    _pushed(contact, force, change, along, about, motion)
+    contact_point_velocity(contact, motion, point)
+    found = _speed(contact, motion)
+    guess[BOX_SPEED] = _next_speed(contact, old, found, h)
+    return h * abs(found - old) / (RIGID + h * max(found, old))
+
+
+@njit(cache=True, error_model="numpy")
+def move_box(contact, motion, h):
+    """Move the box by a step with the motion (4,) after it, and write its motion and elastic deflection."""
+    share, length = 1.0 / (1.0 + h * _speed(contact, motion) / RIGID), 0.0
+    for k in range(4):
+        rate = motion[k] if k < 3 else contact[REACH] * motion[3]
+        contact[STRAIN + k] = share * (contact[STRAIN + k] + h * rate)
+        contact[VELOCITY + k] = motion[k]
+        length += contact[STRAIN + k] ** 2
+    if length > RIGID * RIGID:
+        for k in range(4):
+            contact[STRAIN + k] *= RIGID / np.sqrt(length)
+    for k in range(3):
+        contact[POINT + k] += h * motion[k]
+    angle = h * motion[3]
+    if angle != 0.0:
+        up, column, side = contact[UP : UP + 3], np.empty(3), np.empty(3)
+        cos, sin = np.cos(angle), np.sin(angle)
+        for j in range(2):  # the third axis is UP
+            for i in range(3):
+                column[i] = contact[AXES + 3 * i + j]
+            _cross(up, column, side)
+            for i in range(3):
+                contact[AXES + 3 * i + j] = cos * column[i] + sin * side[i]
+
+
+@njit(cache=True, error_model="numpy")
+def slide(contact, h):
+    """Move the box by a step under the force on the tip in the contact, which is known."""
+    force, motion, change = contact[FORCE : FORCE + 3], np.empty(4), np.empty(4)
+    touched = force[0] != 0.0 or force[1] != 0.0 or force[2] != 0.0
+    speed = _speed(contact, contact[VELOCITY : VELOCITY + 4])
+    if not touched and speed < STILL:
+        contact[VELOCITY : VELOCITY + 4] = 0.0
+        contact[STRAIN : STRAIN + 4] = 0.0
+        return
+    for _ in range(ROUNDS):
+        along, about = _free_change(contact, speed, h, change)
+        _pushed(contact, force, change, along, about, motion)
+        found = _speed(contact, motion)
+        if abs(found - speed) <= CLOSE * found + 1e-9:
+            break
+        speed = _next_speed(contact, speed, found, h)
+    move_box(contact, motion, h)
