@@ -134,7 +134,7 @@ def by_family(arms: dict[str, dict]) -> pd.DataFrame:
             "friction - offset, median joint, %": f"{np.median([r['friction'] for r in own]):.2g}",
             "worst joint, median arm, %": f"{np.median(worst):.2g}",
             "worst joint, worst arm, %": f"{worst.max():.2g}",
-            "edges, worst, mNm": f"{max(np.nanmax(r['edges']) for r in own):.2g}",
+            "edges, worst, mNm": f"{max(np.nanmax(r['edges']) for r in own):.0f}",
             "0.5 s, mm": f"{np.mean([r['ee'] for r in own]):.1f} of {np.mean([r['true ee'] for r in own]):.1f}",
             "0.5 s over the truth's, median": f"{np.median([r['ee'] / r['true ee'] for r in own]):.2f}",
             "friction within, %": f"{100 * np.mean([r['within'] for r in own]):.0f}",

@@ -150,7 +150,7 @@ def test_a_simulated_arm_reports_its_contact(panda):
 @pytest.mark.parametrize(
     ("surface", "message"),
     [
-        ("table", r"^arm\.surface: expected false, true or \{point: \[3\], normal: \[3\]\}, got 'table'$"),
+        ("table", r"^arm\.surface: expected false, true, box or \{point: \[3\], normal: \[3\]\}, got 'table'$"),
         (
             {"point": [0, 0, 0], "normall": [0, 0, 1]},
             r"^arm\.surface: unknown key 'normall'; did you mean 'normal'\?$",

@@ -40,7 +40,7 @@ NEVER |= {"yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.jit.load", "
 ALWAYS = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False)}
 SERVES = {"bind", "serve_grpc", "serve_web", "serve_web_viewer", "HTTPServer", "ThreadingHTTPServer", "create_server"}
 NO_SOCKET = ("batch", "_batch", "_arms", "inspect.signature(make)")  # whose bind is another
-HOSTS = ("self.address", "candidate", "'127.0.0.1'", "LOOPBACK")  # the first two: r2s/arm/emulator/server.py checks
+HOSTS = ("self.address", "'127.0.0.1'", "LOOPBACK")  # the first is that of the server's socket
 
 
 def calls(path):

@@ -174,9 +174,10 @@ def test_ramps_give_the_edges_of_the_dead_zone(found, truth):
 
 
 def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motion):
-    """Its nominal edge is no command: not reached, an interval up to the bound, and an edge that it was held against.
+    """It is not reached, has an interval up to the bound, and the edge that it was held against.
 
-    Joint 2 holds against all that is tried (less what delay and lag keep back of a ramp), joint 1 is not ramped up.
+    Joint 2 holds against all that is tried, less what delay and lag keep back of a ramp. Joint 1 is not ramped up: it
+    gets the edge of its other direction.
     """
     breaks = truth.breakaway.copy()
     breaks[1] = -6.0, 6.0
@@ -190,14 +191,14 @@ def test_a_joint_that_was_never_let_go_is_said_to_be_so(arm, truth, wrong, motio
     assert result.edges.unknown["joint 1, positive"] == "not ramped"
     assert re.fullmatch(r"not reached: held against 1\.(4[6-9]|5) Nm", result.edges.unknown["joint 2, negative"])
     edges, offset = result.dynamics.breakaway, result.dynamics.offset
-    assert edges[0, 1] == 0.25  # nominal, whatever the offset
+    np.testing.assert_allclose(edges[0, 1], -edges[0, 0])
     held = result.edges.held[1] + offset[1]
     np.testing.assert_allclose(edges[1], held)
     space, saved = result.saved
     names = ["breakaway_negative[2]", "breakaway_positive[2]", "breakaway_positive[1]"]
     at = [space.names.index(name) for name in names]
     assert not saved.identifiable[at].any()
-    np.testing.assert_allclose(saved.low[at], [-40, held[1], min(max(offset[0], 0), 0.25)])
+    np.testing.assert_allclose(saved.low[at], [-40, held[1], min(max(offset[0], 0), edges[0, 1])])
     np.testing.assert_allclose(saved.high[at], [held[0], 40, 40])  # tau_max
     one = [space.names.index(name) for name in ("breakaway_negative[1]", "breakaway_positive[3]")]
     assert np.all(saved.high[one] - saved.low[one] > 0.05)  # one ramp says nothing of the next one

@@ -324,8 +324,13 @@ def fit_breakaway(s: State) -> State:
     beyond = np.abs(edges.held + arm.offset[:, None]) > np.abs(arm.breakaway)
     command = np.where(np.isnan(edges.command) & beyond & (edges.held != 0), edges.held, edges.command)
     arm = replace(space, breakaway_command=command).dynamics(space.from_unit(s.u))
-    arm = replace(arm, breakaway=StaticFriction(s.robot, s.ramps, edges).breakaway(arm))
-    command = np.where(edges.count > 0, arm.breakaway - arm.offset[:, None], command)
+    breakaway = StaticFriction(s.robot, s.ramps, edges).breakaway(arm)
+    # a direction without a usable ramp, such as of a joint that slid before its command rose: stiction is about alike
+    # in both directions
+    blind = (edges.count == 0) & (edges.held == 0) & (edges.count[:, ::-1] > 0)
+    breakaway = np.where(blind, -breakaway[:, ::-1], breakaway)
+    command = np.where((edges.count > 0) | blind, breakaway - arm.offset[:, None], command)
+    arm = replace(arm, breakaway=breakaway)
     return replace(s, edges=edges, space=replace(space, breakaway_command=command), dynamics=arm)
 
 

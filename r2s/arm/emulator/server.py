@@ -14,6 +14,7 @@ from r2s.arm.realtime import realtime_section
 from r2s.errors import UserError
 from r2s.physics.robot import SIM_DT
 
+LOOPBACK = "127.0.0"
 IDLE_MS = 20  # between states of an idle arm in lock-step; the clients do not need 1 kHz there
 ANSWER_S = 0.9 * SIM_DT  # least time from a state to the next one, in real time; our choice, a box keeps 1 ms
 BACKOFF_S = (1e-3, 0.4)  # range of the time between states before a motion's first answer; clients time out at 1 s
@@ -251,7 +252,7 @@ def open_port() -> socket.socket:
     """
     for k in range(1, 255):
         try:
-            return socket.create_server((f"127.0.0.{k}", fci.PORT))
+            return socket.create_server((f"{LOOPBACK}.{k}", fci.PORT))
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
     raise UserError(f"emulator: port {fci.PORT} is not free on any loopback address ({reason})")
