@@ -26,7 +26,7 @@ ELSEWHERE = {  # what this file does not type, and why
     r"python benchmarks/": "takes minutes to hours; its page names the machine that it ran on",
     r"python examples/": "test_envs.py and test_gym.py run them for some hundred steps",
     r"python( -m r2s| run.py)$": "names of doors: test_wheel.py, and every other command",
-    r"(python run.py|r2s) (list|look|export)( RUN| runs/train/NAME)?$": "named alone: test_look.py, test_export.py",
+    r"(python run.py|r2s) (list|look|check|export)( RUN| runs/train/NAME)?$": "named alone: test_look.py, test_export.py",
     r"(python bundle/r2s_runtime.py|g\+\+) ": "test_export.py; the loop itself needs an arm",
     r"pytest -m gazebo$": "needs Gazebo",
     r"sudo |export R2S_GAZEBO_ROOT=": "packages of the system, as root; the shell",
@@ -86,7 +86,7 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(page, recording, tmp
         wanted = [t for t in TRACKERS if any(w.startswith("tracker=") and t in w for w in words)]
         if [t for t in wanted if not find_spec(t)]:
             continue  # an extra that is not installed here
-        if words[0] not in ("list", "look", "export", "convert", "engines", "--help"):
+        if words[0] not in ("list", "look", "check", "export", "convert", "engines", "--help"):
             words += TOY
             name = next((w.removeprefix("name=") for w in words if w.startswith("name=")), None)
             named = name and f"runs/identify/{name}/ramps.npz" in page.read_text()
