@@ -59,6 +59,14 @@ def resting(q, **changed):
     return State(**arm | rest | changed)
 
 
+def test_an_action_of_torque_is_a_share_of_what_the_task_may_command():
+    """An action of 1 commands the torque limit, task.torque_fraction of tau_max; an impedance has the same."""
+    task = make_task(torque_fraction=0.6)
+    by_torque = task.controlled_by(torque(PANDA, task))
+    for limit in (task.torque_limit(PANDA), by_torque.torque_limit(PANDA), by_torque.control(PANDA).action_scale):
+        np.testing.assert_allclose(limit, 0.6 * PANDA.tau_max)
+
+
 @pytest.mark.parametrize("stiffness", [2e3, 1e5])
 def test_the_reference_on_the_true_model_ends_within_a_newton(stiffness):
     """On the softest and on the most rigid surface, before the step and at the end, without a jump at the step.

@@ -51,6 +51,14 @@ def pushed(task):
     return make_evaluation(PANDA, task, make_draw(), episodes=8, nthread=1)(Pusher(PANDA, task, TRUE))
 
 
+def test_an_action_of_torque_is_a_share_of_what_the_task_may_command():
+    """An action of 1 commands the torque limit, task.torque_fraction of tau_max; an impedance has the same."""
+    task = make_task(torque_fraction=0.6)
+    by_torque = task.controlled_by(torque(PANDA, task))
+    for limit in (task.torque_limit(PANDA), by_torque.torque_limit(PANDA), by_torque.control(PANDA).action_scale):
+        np.testing.assert_allclose(limit, 0.6 * PANDA.tau_max)
+
+
 def test_the_reference_pushes_boxes_to_their_goals(task, pushed):
     """Of arms with 10 % wrong friction, boxes of 0.3 to 1.5 kg; no box starts at its goal."""
     row = task.measures(pushed)

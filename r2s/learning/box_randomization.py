@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from r2s.errors import UserError, check_number
-from r2s.learning.randomization import UniformRandomization
+from r2s.errors import check_number
+from r2s.learning.randomization import UniformRandomization, check_pair
 from r2s.physics.box import TableFrame, check_size, standing_box, table_frame
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
@@ -60,13 +60,7 @@ class BoxRandomization:
     def __post_init__(self):
         _ = self._arms, self._frame  # raise for wrong settings
         for name in ("stiffness", *RANGES):
-            pair = getattr(self, name)
-            if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
-            for value in pair:
-                check_number(f"dr.{name}", value, "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
-            if pair[0] > pair[1]:
-                raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
+            check_pair(name, getattr(self, name), "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
         check_size("dr.size", self.size, self.table[1])
         check_number("dr.spread", self.spread, "[0, inf)")
         check_number("dr.yaw", self.yaw, "[0, 180]")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -138,6 +138,16 @@ class ForceRandomization:
         return self.share * self.center.level * rng.uniform(-1.0, 1.0, (m, self.robot.n))
 
 
+def check_pair(name: str, pair: Any, allowed: str) -> None:
+    """Raise UserError unless dr.NAME is [least, most], both `allowed`, such as "[0, inf)"."""
+    if not isinstance(pair, list | tuple) or len(pair) != 2:
+        raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
+    for value in pair:
+        check_number(f"dr.{name}", value, allowed)
+    if pair[0] > pair[1]:
+        raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
+
+
 @dataclass(frozen=True)
 class ContactRandomization:
     """Arms as of `UniformRandomization`, each with a plane of its own around a nominal one.
@@ -191,14 +201,8 @@ class ContactRandomization:
     def __post_init__(self):
         _ = self._arms, self._plane, self._identified  # raise for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
-            pair = getattr(self, name)
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
-            if not isinstance(pair, list | tuple) or len(pair) != 2:
-                raise UserError(f"dr.{name}: expected [least, most], got {pair!r}")
-            for value in pair:
-                check_number(f"dr.{name}", value, low)
-            if pair[0] > pair[1]:
-                raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
+            check_pair(name, getattr(self, name), low)
         check_number("dr.place", self.place, "[0, inf)")
         check_number("dr.tilt", self.tilt, "[0, 45]")
 

@@ -10,7 +10,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from r2s.control.controller import Controller
 from r2s.control.impedance import Impedance, cartesian_impedance
 from r2s.errors import UserError, check_number
 from r2s.physics.box import (
@@ -31,9 +30,9 @@ from r2s.physics.robot import Robot
 from r2s.physics.tip import Tip
 from r2s.tasks.measures import MeasureTable
 from r2s.tasks.push_measures import GOOD_M, GOOD_RAD, PUSH, push_measures
-from r2s.tasks.reach import SPEED_NOISE, ReachTask
 from r2s.tasks.surface_task import near, rough
-from r2s.tasks.task import BaseTask, Episodes, State
+from r2s.tasks.task import Episodes, State
+from r2s.tasks.tip_task import TipTask
 
 POSE, START = slice(0, 6), 6  # columns of a goal: pose of the box, then the start posture
 BEHIND = 0.04  # m, between tip and box at the start
@@ -53,7 +52,7 @@ TIP, TIP_RATE, BOX, ERROR = slice(0, 3), slice(3, 6), slice(6, 9), slice(12, 15)
 
 
 @dataclass(frozen=True)
-class PushTask(BaseTask):
+class PushTask(TipTask):
     """Push a box to a pose; a `Task` (r2s/tasks/task.py) from conf/task/push.yaml.
 
     A goal is the row (6 + n,): pose of the box there (`State.box`), and the start posture rad, with the tip behind
@@ -67,7 +66,7 @@ class PushTask(BaseTask):
         pose_noise: m and degrees, standard deviation of the perceived pose in simulation.
         point, normal: nominal place of the box on the table, m in the base frame; None: see `table_frame`.
         displacement: m, of the tip's target by an action of 1 under the task's own cartesian impedance.
-        tool, torque_fraction, cutoff_hz, speed_noise, pool: see `SurfaceTask`.
+        tool, pool: see `SurfaceTask`. torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         tip_radius, frame, own, parameters: m, of the tool; of the table; own controller and its parameters; see
             `with_model`.
     """
@@ -85,7 +84,7 @@ class PushTask(BaseTask):
     normal: tuple[float, float, float] | None = None
     displacement: float = 0.25
     tool: str | None = None
-    torque_fraction: float | tuple[float, ...] = 0.3
+    torque_fraction: float | tuple[float, ...] = 0.5
     cutoff_hz: float = 100.0
     speed_noise: float | None = None
     pool: int = 1024
@@ -104,7 +103,7 @@ class PushTask(BaseTask):
     )
 
     def __post_init__(self):
-        self._as_reach()  # raises for a wrong rate
+        self.as_reach()  # raises for a wrong rate
         check_size("task.size", self.size, TABLE[1])
         for name in ("away", "pose_noise"):
             pair = getattr(self, name)
@@ -119,11 +118,6 @@ class PushTask(BaseTask):
         check_number("task.spread", self.spread, "[0, inf)")
         check_number("task.displacement", self.displacement, "(0, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
-
-    def _as_reach(self) -> ReachTask:
-        return ReachTask(
-            self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
-        )
 
     @property
     def height(self) -> float:
@@ -143,21 +137,11 @@ class PushTask(BaseTask):
                 f"task.size: a tip of {radius:g} m, {length:g} m from the flange, pushes boxes of "
                 f"{radius / PUSHED_AT:.3g} to {length / (1 - PUSHED_AT):.3g} m height, got {self.size[2]:g} m"
             )
-        noise = self.speed_noise
-        if noise is None:
-            noise = SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
-        task = replace(self, speed_noise=noise, tip_radius=radius, frame=table_frame(robot, self.point, self.normal))
-        own = cartesian_impedance(robot, task, dynamics, displacement=self.displacement)
+        frame = table_frame(robot, self.point, self.normal)
+        task = replace(self, speed_noise=self.noise_for(dynamics), tip_radius=radius, frame=frame)
+        share = self.torque_fraction
+        own = cartesian_impedance(robot, task, dynamics, torque_fraction=share, displacement=self.displacement)
         return replace(task, own=own, parameters=own.parameters)
-
-    def control(self, robot: Robot) -> Controller:
-        """Return the controller: by default `control=cartesian_impedance` with the task's displacement."""
-        return self.controller or self.own or super().control(robot)
-
-    def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the largest target torque."""
-        limit = self.control(robot).torque_limit if self.controller or self.own else None
-        return self._as_reach().torque_limit(robot) if limit is None else limit
 
     @property
     def paper_weights(self) -> np.ndarray:
@@ -167,16 +151,12 @@ class PushTask(BaseTask):
     @property
     def spring(self) -> float:
         """The stiffness, N/m, of the spring of the task's own controller."""
-        if self.parameters is None:
-            raise UserError("task: PushTask needs a model of the arm; call with_model first")
-        return float(self.parameters[K_DEFAULT])
+        return float(self.of_model("parameters")[K_DEFAULT])
 
     @property
     def table(self) -> TableFrame:
         """The frame of the table."""
-        if self.frame is None:
-            raise UserError("task: PushTask needs a model of the arm; call with_model first")
-        return self.frame
+        return self.of_model("frame")
 
     @property
     def centre(self) -> np.ndarray:
@@ -190,10 +170,6 @@ class PushTask(BaseTask):
     def expected(self, robot: Robot, dynamics: Dynamics) -> Dynamics:
         """Return the dynamics with a box of middling mass and friction at its nominal place."""
         return replace(dynamics, surface=standing_box(self.table, np.zeros(3), self.size, **EXPECTED))
-
-    def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad, home: `begin` replaces it by the goals' start postures."""
-        return np.tile(robot.q_home, (count, 1))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m, n) rad, postures with the tip behind the box."""
@@ -241,7 +217,7 @@ class PushTask(BaseTask):
 
     def tip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return place (m, 3) m and Jacobian (m, 3, n) m/rad of the tip at q (m, n) rad, in the table's frame."""
-        place, jacobian = arm_tips(np.ascontiguousarray(q), self.parameters)
+        place, jacobian = arm_tips(np.ascontiguousarray(q), self.of_model("parameters"))
         return self.table.inside(place), np.einsum("ij,mjn->min", self.table.axes, jacobian)
 
     def observation_scale(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -272,10 +248,6 @@ class PushTask(BaseTask):
         own = [state.effort / torque, state.limited[:, None]]
         rows = [state.q, state.dq, *own, place, velocity, box, goal, error, in_box, tip_in_box, fine, faces]
         return np.concatenate(rows, axis=1, dtype=np.float32)
-
-    def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward takes distances in m."""
-        return np.ones(len(goals))
 
     def forces(self, state: State, goals: np.ndarray) -> np.ndarray:
         """Return (m, 2) N, the force on the box, and the requested one, 0."""

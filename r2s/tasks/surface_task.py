@@ -20,8 +20,8 @@ from r2s.physics.push_limit import push_limit
 from r2s.physics.robot import Robot
 from r2s.physics.surface import Surface
 from r2s.physics.tip import Tip, nominal_plane
-from r2s.tasks.reach import SPEED_NOISE, ReachTask
-from r2s.tasks.task import BaseTask, ObservationTerm, State
+from r2s.tasks.task import ObservationTerm, State
+from r2s.tasks.tip_task import TipTask
 
 POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8, 9  # columns of a goal
 LAG_M = 0.01  # m, by which the tip may follow its target: damping at approach_speed, and 2 N of wrong friction
@@ -33,7 +33,7 @@ POSTURES = 12  # of a path, which the arm must reach
 
 
 @dataclass(frozen=True)
-class SurfaceTask(BaseTask):
+class SurfaceTask(TipTask):
     """A task that presses a tool's tip on a surface of roughly known place.
 
     A goal begins with the row (9 + n,): the first touched point of the nominal plane m, its normal, two forces N,
@@ -47,8 +47,7 @@ class SurfaceTask(BaseTask):
             `point`. place: m and tilt: degrees, by which the true plane may differ from the nominal one.
         point, normal: of the nominal plane in the base frame, m; None: a table below the tip at home.
         tool: tool file of the robot if robot.tool is null; the stages read it.
-        torque_fraction: share of tau_max, the largest torque of the task's own controller and of control=torque.
-        cutoff_hz, speed_noise: see `ReachTask`.
+        torque_fraction, cutoff_hz, speed_noise: see `TipTask`.
         pool: number of goals that a training draws from.
         stop: what a stop does with a force, of `r2s.physics.push_limit.STOPS`; None: release.
         model, own, parameters: the identified arm, the task's own controller and its parameters; see `with_model`.
@@ -79,7 +78,7 @@ class SurfaceTask(BaseTask):
     target_size: ClassVar[int] = 6
 
     def __post_init__(self):
-        self._as_reach()  # raises for a wrong rate
+        self.as_reach()  # raises for a wrong rate
         for name, low in (("force_rate", 1e-3), ("approach_speed", 1e-4), ("clearance", 1e-4)):
             check_number(f"task.{name}", getattr(self, name), f"[{low:g}, inf)")
         check_number("task.pool", self.pool, "[1, inf)", whole=True)
@@ -105,11 +104,6 @@ class SurfaceTask(BaseTask):
         """Largest distance, m, of the true surface from the nominal plane at a touched point."""
         return self.place + self.spread * float(np.tan(np.radians(self.tilt)))
 
-    def _as_reach(self) -> ReachTask:
-        return ReachTask(
-            self.ctrl_hz, self.episode_s, self.torque_fraction, self.cutoff_hz, speed_noise=self.speed_noise
-        )
-
     def with_model(self, robot: Robot, dynamics: Dynamics) -> Self:
         """Return the task with the model of one arm, for its controller and for the estimate of the force.
 
@@ -117,10 +111,7 @@ class SurfaceTask(BaseTask):
             UserError: the robot has no tool, or cannot exert the forces.
         """
         Tip(robot)
-        noise = self.speed_noise
-        if noise is None:
-            noise = SPEED_NOISE if np.any(dynamics.speed_noise) else 0.0
-        task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=noise)
+        task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=self.noise_for(dynamics))
         settings = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M} | self.own_settings
         own = cartesian_impedance(robot, task, dynamics, hybrid=True, **settings)
         task._check_force(own)
@@ -154,15 +145,6 @@ class SurfaceTask(BaseTask):
                     f"{self.force[1]:g} N"
                 )
 
-    def control(self, robot: Robot) -> Controller:
-        """Return the controller: by default `control=hybrid` with small displacements."""
-        return self.controller or self.own or super().control(robot)
-
-    def torque_limit(self, robot: Robot) -> np.ndarray:
-        """Return (n,) Nm, the largest target torque."""
-        limit = self.control(robot).torque_limit if self.controller or self.own else None
-        return self._as_reach().torque_limit(robot) if limit is None else limit
-
     @property
     def paper_weights(self) -> np.ndarray:
         """(k,), the weights of the reward terms."""
@@ -176,10 +158,6 @@ class SurfaceTask(BaseTask):
         """Return the dynamics with a surface of middling stiffness in the nominal plane."""
         point, normal = self.plane(robot)
         return replace(dynamics, surface=Surface(point, normal, *EXPECTED))
-
-    def starts(self, robot: Robot, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return (count, n) rad, home: `begin` replaces it by the goals' start postures."""
-        return np.tile(robot.q_home, (count, 1))
 
     def begin(self, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
         """Return (m, n) rad, postures above the first touched points."""
@@ -315,13 +293,7 @@ class SurfaceTask(BaseTask):
 
     def tip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return place (m, 3) m and Jacobian (m, 3, n) m/rad of the tip's centre at q (m, n) rad."""
-        if self.parameters is None:
-            raise UserError(f"task: {type(self).__name__} needs a model of the arm; call with_model first")
-        return arm_tips(np.ascontiguousarray(q), self.parameters)
-
-    def distance_scale(self, state: State, goals: np.ndarray) -> np.ndarray:
-        """Return (m,) ones: the reward takes forces in N and distances in m."""
-        return np.ones(len(goals))
+        return arm_tips(np.ascontiguousarray(q), self.of_model("parameters"))
 
     def tip_velocity(self, state: State) -> np.ndarray:
         """Return (m, 3) m/s, the velocity of the tip's centre in base axes."""

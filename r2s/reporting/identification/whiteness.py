@@ -72,7 +72,7 @@ def autocorrelation(t: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filtered_white(t: np.ndarray, cutoff_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, and its Z_95 sigma (L,).
+    """Return lags (L,) s up to `LAGS_S`, the autocorrelation (L,) of filtered white noise, half its 95 % interval.
 
     The filter is that of `Recording.smooth`. Sigma is Bartlett's for large lags (J. R. Stat. Soc. Suppl. 8(1), 1946).
     """

@@ -117,10 +117,9 @@ def _boxes(arm: _Arm, up: np.ndarray) -> None:
     rows = np.concatenate([e.box[f] for e, f in zip(arm.episodes, arm.frames, strict=True) if e.box is not None])
     first, up = rows[:, 3:6], up / np.linalg.norm(up)
     axes = np.stack([first, np.cross(up, first), np.broadcast_to(up, first.shape)], axis=-1)
-    arm.send("box", rr.Transform3D(), rr.Transform3D.columns(translation=rows[:, :3], mat3x3=axes), per_episode=False)
     solid = rr.components.FillMode.Solid
     shape = rr.Boxes3D(half_sizes=[0.5 * rows[0, 8:]], colors=rgb(arm.colour), fill_mode=solid)
-    arm.stream.log(f"{arm.base}/box", shape, static=True)
+    arm.send("box", shape, rr.Transform3D.columns(translation=rows[:, :3], mat3x3=axes), per_episode=False)
 
 
 def _paths(arm: _Arm) -> None:
