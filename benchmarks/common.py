@@ -17,7 +17,8 @@ sys.path.insert(0, str(ROOT))
 NUMBER = r"\d+(\.\d+)?"
 PARTS = r"part=(events|quiet|warming|load)(,(events|quiet|warming|load))*"
 ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments; scripts not listed check their own
-    **dict.fromkeys(("algorithms", "bench", "gallery"), ()),
+    "algorithms": ("page",),
+    **dict.fromkeys(("bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
     "grid": (r"\d+(,\d+)*", NUMBER),
     "press": (rf"minutes={NUMBER}", r"(rigid|elastic)_\d+"),

@@ -82,7 +82,7 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     model = SAC(
         "MlpPolicy",
         VecMonitor(Arms(arms)),
-        **{"seed": seed, "learning_rate": 2e-3, "gamma": 0.95, "tau": 0.02, "batch_size": 256},
+        **{"seed": seed, "learning_rate": 2e-3, "gamma": 0.97, "tau": 0.02, "batch_size": 256},
         **{"learning_starts": RANDOM, "buffer_size": env_steps, "ent_coef": "auto_0.01", "target_entropy": -10.0},
         policy_kwargs={"net_arch": [128, 128]},
     )

@@ -36,7 +36,7 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     critic = ValueOperator(critic, in_keys=["observation", "action"])
     critic(actor(env.reset()))  # makes the lazy layers
     loss = SACLoss(actor, critic, num_qvalue_nets=2, alpha_init=0.01, target_entropy=-10.0)
-    loss.make_value_estimator(gamma=0.95)
+    loss.make_value_estimator(gamma=0.97)
     targets, optimizer = SoftUpdate(loss, tau=0.02), torch.optim.Adam(loss.parameters(), lr=2e-3)
 
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(env_steps), batch_size=BATCH)
