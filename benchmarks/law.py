@@ -48,9 +48,9 @@ class LoggingDriver:
     def __getattr__(self, name):
         return getattr(self._driver, name)
 
-    def __call__(self, state, target, added=None):
+    def __call__(self, *cycle):
         """Return the command of a cycle."""
-        command = self._driver(state, target, added)
+        command = self._driver(*cycle)
         self.requested.append(self._driver.effort.copy())
         self.sent.append(command.copy())
         return command
