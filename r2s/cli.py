@@ -146,6 +146,7 @@ def resumed(cfg, overrides):
 def is_completed(cfg):
     """Return whether the run folder of this job is finished; if it was stopped, set `resume` to it."""
     from r2s.runs import is_done
+    from r2s.stages.build import unread
 
     if not cfg.name:
         raise UserError("skip_completed: give the run folder a name=, such as name='${algo.name}_${seed}'")
@@ -156,7 +157,7 @@ def is_completed(cfg):
     saved = loaded(folder / "config.yaml")
     if not isinstance(saved, Mapping):
         raise UserError(f"skip_completed: {folder / 'config.yaml'} is damaged: expected settings by name")
-    if other := differing(saved, cfg):
+    if other := differing(saved, cfg, counts=lambda key: unread(key, cfg) is None):
         raise UserError(f"skip_completed: {folder} has other settings: {'; '.join(other)}; give another name=")
     if is_done(folder):
         print(f"already finished: {folder}")
@@ -165,15 +166,15 @@ def is_completed(cfg):
     return False
 
 
-def differing(saved, cfg, most=3):
-    """Return how a composed config differs from the saved one of a run folder, in `most` settings at most."""
+def differing(saved, cfg, most=3, counts=lambda key: True):
+    """Return how a composed config differs from the saved one of a run folder, in `most` settings that count."""
     from omegaconf import OmegaConf
 
     from r2s.reporting.trackers.tracker import flat
 
     both: Any = [OmegaConf.to_container(c, resolve=True) for c in (saved, cfg)]
     before, now = (dict(flat({k: v for k, v in c.items() if k not in FREE})) for c in both)
-    keys = [k for k in dict.fromkeys([*before, *now]) if before.get(k) != now.get(k)]
+    keys = [k for k in dict.fromkeys([*before, *now]) if before.get(k) != now.get(k) and counts(k)]
     words = [f"{k} was {str(before.get(k, ABSENT))[:60]}, is {str(now.get(k, ABSENT))[:60]}" for k in keys[:most]]
     return words + [f"and {len(keys) - most} more"] * (len(keys) > most)
 

@@ -115,6 +115,13 @@ def test_a_page_is_made_in_a_clone_and_resumes(tmp_path):
     assert (summary["new"], summary["equal"]) == (1, 0)
     assert summary[MISSING] == len(table_cells((ROOT / "benchmarks/results/law.md").read_text()))
     assert "| law |" in (tmp_path / "results" / "report.md").read_text()
+    saved = run / "config.yaml"  # neither another page's commands nor a group that no page reads are its settings
+    saved.write_text(saved.read_text().replace("benchmarks/pipeline.py", "old.py").replace("kind: arm", "kind: old"))
+    made = saved.read_text()
+    assert "old.py" in made
+    succeed(*words)
+    assert (run / "log.txt").read_text().count("write_text") == 1
+    assert saved.read_text() == made
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert head.strip() in (run / "report.md").read_text()
 

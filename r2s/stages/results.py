@@ -21,8 +21,8 @@ CLONE = "checkout"  # in the run folder
 
 
 def reads(cfg):
-    """Return the keys of the config that this stage reads."""
-    return {"results"}
+    """Return the keys of the config that this stage reads; commands of other pages may change meanwhile."""
+    return {"results.page", "results.data", f"results.pages.{cfg.results.page}"}
 
 
 def commands_of(settings):
