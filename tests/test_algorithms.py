@@ -23,7 +23,7 @@ from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
 
 from r2s.errors import UserError
 from r2s.learning.ddpg import DDPG
-from r2s.learning.learner import Learner
+from r2s.learning.learner import KERNELS, Learner
 from r2s.learning.networks import Critics
 from r2s.learning.policy import export_onnx, load_policy, save_policy
 from r2s.learning.sac import SAC
@@ -288,9 +288,23 @@ def test_compiled_learns_the_same(kind, backend, monkeypatch):
     torch.testing.assert_close(bits(plain), bits(compiled), rtol=1e-4, atol=1e-5)
 
 
+def test_compiling_takes_no_more_processes_than_threads(monkeypatch):
+    """Jobs of a sweep share the cores; torch's own default is a process per core in each job."""
+    algo, seen = make(TQC), []
+    monkeypatch.setattr(torch, "compile", lambda method, **how: method)
+    monkeypatch.setattr(
+        algo, "losses", lambda *given: seen.append(inductor.compile_threads) or TQC.losses(algo, *given)
+    )
+    before = inductor.compile_threads
+    assert algo.compile(B)
+    assert seen == [min(torch.get_num_threads(), KERNELS)]
+    assert inductor.compile_threads == before
+
+
 def test_without_a_compiler_one_warning(tmp_path, monkeypatch):
     """The learner stays as it is and learns on."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    torch.compiler.reset()  # forget what other tests of this process have compiled
     algo = make(DDPG)
     before = bits(algo).clone()
     none = inductor.patch({"cpp.cxx": (None, str(tmp_path / "none"))})

@@ -14,6 +14,8 @@ from torch.nn import functional as F
 from r2s.errors import UserError, check_number
 from r2s.learning.networks import Actor, Critics, Normalizer, Policy
 
+KERNELS = 4  # C++ files of a compiled update, at most
+
 
 class Learner(nn.Module, ABC):
     """An off-policy actor-critic algorithm.
@@ -119,12 +121,14 @@ class Learner(nn.Module, ABC):
     def compile(self, batch_size: int) -> bool:  # type: ignore[override]
         """Compile the losses and their gradients for this batch size, before the first update.
 
-        This takes 5 to 20 s, less if the machine has cached it. On a GPU it captures a graph. If compilation fails,
-        for example without a C++ compiler, one warning appears and the losses stay uncompiled.
+        This takes half a minute of a core, some seconds if the machine has cached it. On a GPU it captures a graph.
+        If compilation fails, for example without a C++ compiler, one warning appears and the losses stay uncompiled.
 
         Returns:
             Whether the losses are compiled.
         """
+        from torch._inductor import config as inductor
+
         mode = "reduce-overhead" if self.action_scale.is_cuda else "default"
         eager = {name: getattr(self, name) for name in self.compiled}
         before = copy.deepcopy(self.state_dict())
@@ -133,10 +137,12 @@ class Learner(nn.Module, ABC):
         batch = {k: torch.zeros(batch_size, size, device=self.action_scale.device) for k, size in sizes.items()}
         batch |= {k: torch.zeros(batch_size, device=self.action_scale.device) for k in ("reward", "terminated")}
         devices = [self.action_scale.device] if self.action_scale.is_cuda else []
+        # by default torch starts a compiling process per core, in each of as many jobs of a sweep
+        workers = {} if devices else {"compile_threads": min(torch.get_num_threads(), KERNELS)}
         try:
             for name, method in eager.items():
                 setattr(self, name, torch.compile(method, dynamic=False, mode=mode))
-            with torch.random.fork_rng(devices):  # the update draws noise
+            with inductor.patch(workers), torch.random.fork_rng(devices):  # the update draws noise
                 self.update(batch)
         except RuntimeError as error:
             why = (str(error).strip().splitlines() or [type(error).__name__])[0]
