@@ -7,7 +7,6 @@ it only writes. Run folders: runs/train/algo_*, of the peers runs/bench/algo_*.
 """
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -20,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from algorithms_peers import final_distances
-from common import RESULTS, ROOT, conf, load_training, markdown, markdown_rows, write_page
+from common import RESULTS, ROOT, conf, load_training, markdown, markdown_rows, run_scripts, write_page
 
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import UniformRandomization
@@ -55,14 +54,7 @@ def train_all() -> None:
             folder = BENCH / f"algo_{peer}_{seed}"
             if not (folder / "summary.json").is_file():
                 jobs.append(["benchmarks/algorithms_peers.py", peer, str(seed), str(MINUTES), str(folder)])
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    running: list[subprocess.Popen] = []
-    while jobs or running:
-        while jobs and len(running) < cores:
-            env = os.environ | {"OMP_NUM_THREADS": "1"}
-            running.append(subprocess.Popen([sys.executable, *jobs.pop(0)], cwd=ROOT, env=env))
-        if (first := running.pop(0)).wait():
-            sys.exit(f"failed: {' '.join(map(str, first.args))}")
+    run_scripts(jobs)
 
 
 def read_peers(like: list[Trained]) -> dict[str, list[Trained]]:

@@ -136,11 +136,16 @@ def stamp(command: str) -> str:
 
 def run_parallel(jobs: Iterable[Sequence[str]]) -> None:
     """Run commands of run.py with one thread each on all cores of this process; skip finished ones."""
+    run_scripts(["run.py", *job, "threads=1", "skip_completed=true"] for job in jobs)
+
+
+def run_scripts(jobs: Iterable[Sequence[str]]) -> None:
+    """Run scripts with their arguments, as many at a time as this process has cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     waiting, running = list(jobs), []
     while waiting or running:
         while waiting and len(running) < cores:
-            command = [sys.executable, "run.py", *waiting.pop(0), "threads=1", "skip_completed=true"]
+            command = [sys.executable, *waiting.pop(0)]
             running.append(subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}))
         if (first := running.pop(0)).wait():
             sys.exit(f"failed: {' '.join(map(str, first.args))}")
