@@ -35,8 +35,8 @@ class DDPG(DeterministicLearner):
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Do one gradient step; return the losses."""
-        out = self.losses(self.normalized(batch))
-        self.descend(out["loss_critic"] + out["loss_actor"])
+        out, gradients = self.gradients(batch)
+        self.descend(out, self.trained, gradients)
         polyak(self.targets, self.critics, self.tau)
         polyak(self.target_actor, self.actor, self.tau)
-        return {k: v.detach() for k, v in out.items()}
+        return out

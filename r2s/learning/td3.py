@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from r2s.errors import check_number
-from r2s.learning.learner import DeterministicLearner, polyak
+from r2s.learning.learner import DeterministicLearner, differentiate, polyak
 
 
 class TD3(DeterministicLearner):
@@ -26,7 +26,7 @@ class TD3(DeterministicLearner):
     """
 
     last_actor_loss: Tensor
-    compiled = ("_critic_loss", "_actor_loss")
+    compiled = ("_critic_gradients", "_actor_gradients")
 
     def __init__(
         self,
@@ -58,18 +58,25 @@ class TD3(DeterministicLearner):
 
     def update(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Do one gradient step; return the losses: between actor updates, the last actor loss."""
-        batch = self.normalized(batch)
-        loss = critic = self._critic_loss(batch, torch.randn_like(batch["action"]))
+        critics, actor = list(self.critics.parameters()), list(self.actor.parameters())
+        out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
         due = self.updates % self.policy_delay == 0  # also in the first update, so that every logged row has a loss
         if due:
-            actor = self._actor_loss(batch)
-            self.last_actor_loss = actor.detach().clone()  # a captured graph overwrites its outputs
-            loss = critic + actor
-        self.descend(loss)
-        if due:
+            more, of_actor = self._actor_gradients(batch)
+            self.last_actor_loss = more["loss_actor"].clone()  # a captured graph overwrites its outputs
+            self.descend(out | more, [*critics, *actor], [*gradients, *of_actor])
             polyak(self.targets, self.critics, self.tau)
             polyak(self.target_actor, self.actor, self.tau)
-        return {"loss_critic": critic.detach(), "loss_actor": self.last_actor_loss}
+        else:
+            self.descend(out, critics, gradients)
+        return out | {"loss_actor": self.last_actor_loss}
+
+    def _critic_gradients(self, batch: Mapping[str, Tensor], noise: Tensor):
+        losses = {"loss_critic": self._critic_loss(self.normalized(batch), noise)}
+        return differentiate(losses, list(self.critics.parameters()))
+
+    def _actor_gradients(self, batch: Mapping[str, Tensor]):
+        return differentiate({"loss_actor": self._actor_loss(self.normalized(batch))}, list(self.actor.parameters()))
 
     def _critic_loss(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         with torch.no_grad():
