@@ -23,7 +23,7 @@ import torch
 from common import ROOT, conf
 
 from r2s.learning.evaluate import REPORT, SELECTION, make_evaluation
-from r2s.learning.train import Loop
+from r2s.learning.train import Loop, fastest_matmul
 from r2s.tasks.rollout import HOLD_S
 
 ALGO = conf("algo/base") | conf("algo/tqc")
@@ -174,7 +174,7 @@ def main() -> None:
     """Train once and write its folder."""
     library, seed, minutes, folder = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), Path(sys.argv[4])
     torch.set_num_threads(1)
-    torch.set_float32_matmul_precision("medium")  # as conf/config.yaml
+    torch.set_float32_matmul_precision(fastest_matmul(torch.device("cpu")))  # as conf/config.yaml
     torch.manual_seed(seed)
     {"torchrl": train_torchrl, "sb3": train_sb3}[library](seed, 60.0 * minutes).write(folder)
 

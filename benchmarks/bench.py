@@ -27,6 +27,7 @@ from rich.table import Table
 from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.learning.env import TaskEnv
 from r2s.learning.randomization import UniformRandomization
+from r2s.learning.replay import Replay
 from r2s.learning.tqc import TQC
 from r2s.learning.train import keep_memory, matmul_precision
 from r2s.physics.robot import SIM_DT
@@ -107,6 +108,28 @@ def environment(robot, dynamics, threads: int) -> tuple[float, float]:
             bare.rollout(task.substeps, tau, control_spec=spec, record=("qpos",))
 
     return duel(ours, peer, arms * steps)
+
+
+def replay(robot) -> tuple[float, float]:
+    """Compare the replay buffer with TorchRL's: transitions of 32 arms added, 256 drawn, times/s."""
+    from tensordict import TensorDict
+    from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+    torch.set_num_threads(1)
+    buffer, count, rows = Replay(100_000), 200, random_batch(robot, 32)
+    theirs = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
+
+    def ours() -> None:
+        for _ in range(count):
+            buffer.extend(rows)
+            buffer.sample(256)
+
+    def peer() -> None:
+        for _ in range(count):
+            theirs.extend(TensorDict(rows, batch_size=[32]))
+            theirs.sample()
+
+    return duel(ours, peer, count)
 
 
 def torchrl_update(algo: TQC, batch: Mapping[str, torch.Tensor], lr: float) -> Callable[[], object]:
@@ -232,18 +255,14 @@ def against_sb3(robot, threads: int, mode: Mode, sb3: Sb3) -> tuple[float, float
 
     sb3-contrib has no compiled mode: both have the same precision of products, and its update is eager.
     """
-    from tensordict import TensorDict
-    from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-
     torch.set_num_threads(threads)
-    algo, count = make_tqc(robot, mode, 256), 50
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
-    replay.extend(TensorDict(random_batch(robot, 2000), batch_size=[2000]))
+    algo, buffer, count = make_tqc(robot, mode, 256), Replay(100_000), 50
+    buffer.extend(random_batch(robot, 2000))
 
     def ours() -> None:
         with matmul_precision(mode.matmul):
             for _ in range(count):
-                algo.update(replay.sample())
+                algo.update(buffer.sample(256))
 
     return duel(ours, lambda: sb3.update(threads, count, mode.matmul), count)
 
@@ -267,6 +286,7 @@ def main() -> None:
     cores = os.cpu_count() or 1
     keep_memory()  # same as in training
     rows, sb3 = {"hidden twin / real time, cycles/s, 1 thread": twin(robot)}, Sb3()
+    rows["replay buffer / TorchRL's, add 32 and draw 256, times/s"] = replay(robot)
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"
         rows[f"physics with friction / bare Batch, steps/s, {at}"] = friction(robot, dynamics, threads)

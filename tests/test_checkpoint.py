@@ -8,15 +8,13 @@ import pandas as pd
 import pytest
 import torch
 from conftest import conf
-from tensordict import TensorDict
 from test_cli import r2s, started, succeed
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import RandomSampler
 
 from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
 from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import UniformRandomization
+from r2s.learning.replay import Replay
 from r2s.learning.tqc import TQC
 from r2s.learning.train import Budget, Loop, generators, set_generators, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
@@ -118,42 +116,52 @@ def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
     assert again.stderr.strip().endswith("is finished")
 
 
-def filled(replay, seen, count):
-    """Put transitions number seen to seen + count - 1 into the buffer, each with its number."""
-    for k in range(seen, seen + count):
-        replay.extend(TensorDict({"action": torch.tensor([[float(k)]])}, batch_size=[1]))
+def add(replay, count, at_once):
+    """Put the next `count` transitions into the buffer, each with its number, `at_once` of them in a call."""
+    numbers = torch.arange(replay.seen, replay.seen + count, dtype=torch.float32)
+    for part in numbers.split(at_once):
+        replay.extend({"action": part[:, None]})
 
 
-def new_buffer(size):
-    return TensorDictReplayBuffer(storage=LazyTensorStorage(size), sampler=RandomSampler(), batch_size=64)
+@pytest.mark.parametrize("at_once", [1, 3, 10, 27])
+def test_a_buffer_holds_the_last_transitions(at_once):
+    """Number k in row k % size, however many are added in a call; samples reach all of them and nothing else."""
+    replay = Replay(10)
+    for count in (4, 5, 27, 1, 13):
+        add(replay, count, at_once)
+        last = torch.arange(max(0, replay.seen - 10), replay.seen)
+        assert len(replay) == len(last)
+        assert torch.equal(replay.transitions(int(last[0]), replay.seen)["action"][:, 0], last.float())
+        assert set(replay.sample(1000)["action"][:, 0].tolist()) == set(last.tolist())
 
 
 @pytest.mark.parametrize("gaps", [[3] * 9, [7] * 5, [4, 9, 1, 10, 3], [10] * 3, [25, 1, 33, 2], [6, 30, 5]])
 def test_a_buffer_comes_back_to_the_row_at_any_gap(gaps, tmp_path):
     """Row for row, cursor and draws included; the files hold the buffer and less than one chunk more."""
-    size, seen, replay, longest = 10, 0, new_buffer(10), 4
+    size, replay, longest = 10, Replay(10), 4
     checkpoint = Checkpoint(tmp_path)
     for gap in gaps:
-        filled(replay, seen, gap)
-        seen += gap
-        checkpoint.save({}, replay, seen, size)
+        add(replay, gap, 1)
+        checkpoint.save({}, replay)
         chunks = [torch.load(f, weights_only=True)["action"] for f in tmp_path.glob("replay_*.pt")]
         longest = min(max(longest, gap), size)
-        assert sum(map(len, chunks)) <= min(seen, size - 1 + longest)
-        again, back = new_buffer(size), Checkpoint(tmp_path)
-        assert back.load(again, size)["seen"] == seen
+        assert sum(map(len, chunks)) <= min(replay.seen, size - 1 + longest)
+        again, back = Replay(size), Checkpoint(tmp_path)
+        assert back.load(again)["seen"] == again.seen == replay.seen
         for step in range(2):  # as it was saved, and after more transitions
             draws = []
             for buffer in (replay, again):
                 torch.manual_seed(0)
-                draws.append(buffer.sample()["action"])
+                draws.append(buffer.sample(64)["action"])
             assert torch.equal(*draws)
-            assert torch.equal(replay[:]["action"], again[:]["action"])
+            first = replay.seen - len(replay)
+            kept = [buffer.transitions(first, replay.seen)["action"] for buffer in (replay, again)]
+            assert torch.equal(*kept)
             if step == 0:
-                filled(replay, seen, 4)
-                filled(again, seen, 4)
-        back.save({}, again, seen + 4, size)  # goes on from what it loaded
-        seen, checkpoint = seen + 4, back
+                add(replay, 4, 1)
+                add(again, 4, 4)
+        back.save({}, again)  # goes on from what it loaded
+        checkpoint = back
 
 
 def on_gpu(path, to):
@@ -195,15 +203,28 @@ def test_noise_of_a_gpu_goes_on_where_it_stopped():
     assert torch.equal(first, torch.randn(5, device=gpu))
 
 
-def train_until_it_breaks(env, algo):
+def train_briefly(env, algo, concurrent=False):
+    evaluate = make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1)
+    loop = Loop(batch_size=16, learning_starts=80, concurrent=concurrent)
+    train(env, algo, evaluate, loop, Budget(None, 1200))
+
+
+def test_arms_that_step_beside_the_updates_give_the_same_run(panda):
+    """Bit for bit what steps and updates in turn give: networks, optimizer and arms."""
+    ends = []
+    for concurrent in (False, True):
+        env = make_env(panda)
+        torch.manual_seed(0)
+        algo = make_algo(env)
+        train_briefly(env, algo, concurrent)
+        assert algo.updates > 200
+        ends.append((algo.state_dict(), env.read()["observation"]))
+    torch.testing.assert_close(*ends, rtol=0, atol=0)
+
+
+def train_until_it_breaks(env, algo, concurrent=False):
     with pytest.raises(FloatingPointError) as caught:
-        train(
-            env,
-            algo,
-            make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1),
-            Loop(batch_size=16, learning_starts=80),
-            Budget(None, 4000),
-        )
+        train_briefly(env, algo, concurrent)
     return str(caught.value)
 
 
@@ -222,10 +243,11 @@ def break_goal(env, step):
     return env
 
 
-def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda):
+@pytest.mark.parametrize("concurrent", [False, True])
+def test_a_number_that_is_not_finite_in_a_step_stops_the_run(panda, concurrent):
     """NaN in the physics: the message names value, arm and time."""
     env = break_goal(make_env(panda), 250)
-    message = train_until_it_breaks(env, make_algo(env))
+    message = train_until_it_breaks(env, make_algo(env), concurrent)
     assert "observation of arm 2 is nan" in message
     assert message.endswith("after 996 env steps")
 

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
-from torchrl.data import TensorDictReplayBuffer
 
 from r2s.errors import UserError
 from r2s.files import atomic_write
+from r2s.learning.replay import Replay
 
 
 class Checkpoint:
@@ -33,23 +32,19 @@ class Checkpoint:
         path = self.folder / "state.pt"
         return load_tensors(path, "resume")["seen"] if path.is_file() else 0
 
-    def save(self, state: dict[str, Any], replay: TensorDictReplayBuffer, seen: int, size: int) -> None:
-        """Write the state and the transitions since the last call; remove chunks that the buffer has overwritten.
-
-        Args:
-            state: of the training.
-            replay: buffer with the last `size` of `seen` transitions, number k in row k % size.
-        """
+    def save(self, state: dict[str, Any], replay: Replay) -> None:
+        """Write the state and the transitions since the last call; remove chunks that the buffer has overwritten."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        begin = max(self._chunks[-1] if self._chunks else 0, seen - size)
-        save_tensors(self._path(seen), replay[torch.arange(begin, seen) % size].to_dict())
-        chunks = [*(end for end in self._chunks if end > seen - size), seen]
+        seen, first = replay.seen, replay.seen - len(replay)
+        begin = max(self._chunks[-1] if self._chunks else 0, first)
+        save_tensors(self._path(seen), replay.transitions(begin, seen))
+        chunks = [*(end for end in self._chunks if end > first), seen]
         save_tensors(self.folder / "state.pt", state | {"seen": seen, "chunks": [self._path(k).name for k in chunks]})
         self._chunks = chunks
         for path in {*self.folder.glob("replay_*.pt")} - {*map(self._path, chunks)}:
             path.unlink()
 
-    def load(self, replay: TensorDictReplayBuffer, size: int) -> dict[str, Any] | None:
+    def load(self, replay: Replay) -> dict[str, Any] | None:
         """Fill `replay`, an empty buffer, with the saved transitions and return the state; None without a checkpoint.
 
         Every transition has the row that it had, so a seed draws the same batches.
@@ -62,13 +57,12 @@ class Checkpoint:
             return None
         state = load_tensors(path, "resume")
         seen, self._chunks = state["seen"], [int(Path(c).stem.removeprefix("replay_")) for c in state["chunks"]]
-        replay.writer.load_state_dict({"_cursor": max(0, seen - size) % size})
+        replay.seen = first = max(0, seen - replay.size)
         for end in self._chunks:
             rows = load_tensors(self._path(end), "resume")
-            count = len(rows["action"])
-            overwritten = max(0, seen - size - (end - count))
-            if overwritten < count:
-                replay.extend(TensorDict(rows, batch_size=[count])[overwritten:])
+            overwritten = max(0, first - (end - len(rows["action"])))
+            if overwritten < len(rows["action"]):
+                replay.extend({name: row[overwritten:] for name, row in rows.items()})
         return state
 
     def _path(self, end: int) -> Path:

@@ -3,28 +3,32 @@
 The budget is wall-clock minutes or environment steps, whichever ends first; the curriculum follows the share spent.
 With env_steps alone a seed gives the same run bit for bit at a fixed number of threads, stopped and resumed or not.
 With minutes the curriculum follows the clock.
+
+The arms step while the learner updates, in a thread of their own: updates draw from the transitions before that step.
+On one core both take turns, with the same result. Sharing one team of threads instead would serve neither: those of
+OpenMP spin for milliseconds after an update, on the cores that the physics needs then, and on a busy machine each of
+their barriers waits for a thread that the system has put aside.
 """
 
 import copy
 import ctypes
-import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import RandomSampler
+from torch import Tensor
 
 from r2s.errors import UserError, check_number
 from r2s.learning.checkpoint import Checkpoint
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
+from r2s.learning.replay import Replay
 from r2s.tasks.task import Episodes
 
 LOG_UPDATES = 1000  # updates between two rows of metrics.csv
@@ -68,8 +72,9 @@ class Loop:
         explore_end: the standard deviation of exploration falls geometrically to this share at the end of the budget.
         eval_env_steps: environment steps between two evaluations; the last evaluation is at the end.
         compile: compile the losses first; the budget includes this time.
+        concurrent: step the arms in a thread of their own.
         matmul: precision of matrix products in updates, see torch.set_float32_matmul_precision. "medium" rounds their
-            factors to bfloat16 if the processor multiplies those faster.
+            factors to bfloat16 if the processor has instructions for it; "auto": see `fastest_matmul`.
 
     Raises:
         UserError: a value is out of range.
@@ -84,6 +89,7 @@ class Loop:
     explore_end: float = 1.0
     eval_env_steps: int = 80_000
     compile: bool = False
+    concurrent: bool = False
     matmul: str = "highest"
 
     def __post_init__(self):
@@ -97,8 +103,8 @@ class Loop:
         check_number("evaluation.env_steps", self.eval_env_steps, "[1, inf)", whole=True)
         if not isinstance(self.compile, bool):
             raise UserError(f"compile: expected true or false, got {self.compile!r}")
-        if self.matmul not in ("medium", "high", "highest"):
-            raise UserError(f"matmul: expected medium, high or highest, got {self.matmul!r}")
+        if self.matmul not in ("auto", "medium", "high", "highest"):
+            raise UserError(f"matmul: expected auto, medium, high or highest, got {self.matmul!r}")
 
     def lr_share(self, spent: float) -> float:
         """Return the factor of the learning rate when this share of the budget is spent."""
@@ -143,7 +149,6 @@ def train(
         FloatingPointError: an action, observation, reward or loss is not finite.
     """
     keep_memory()
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it logs every storage that it allocates
     run = Training(env, algo, evaluate, loop)
     if checkpoint:
         run.restore(checkpoint)
@@ -151,11 +156,12 @@ def train(
         env.weights = env.reward.weights(env.task, spent, run.factor)
         algo.set_lr(loop.lr_share(spent))
         algo.set_exploration(loop.explore_end**spent)
-        run.step(spent)
-        if run.env_steps < loop.learning_starts:
+        learns = run.env_steps >= loop.learning_starts
+        with run.step(spent):
+            for _ in range(loop.updates_per_step if learns else 0):
+                losses = run.update()
+        if not learns:
             continue
-        for _ in range(loop.updates_per_step):
-            losses = run.update()
         if run.updates % LOG_UPDATES < loop.updates_per_step or run.updates == loop.updates_per_step:
             callbacks.log(run.metrics(losses))
         if run.env_steps >= run.next_eval:
@@ -183,11 +189,12 @@ class Training:
         self.evaluation: dict[str, Any] = {}
         self._terms: list[np.ndarray] = []  # mean reward terms of each step since the last row of metrics
         self._device = algo.action_scale.device
+        self._matmul = fastest_matmul(self._device) if loop.matmul == "auto" else loop.matmul
         if loop.compile:
-            with matmul_precision(loop.matmul):
+            with matmul_precision(self._matmul):
                 algo.compile(loop.batch_size)
-        storage = LazyTensorStorage(loop.replay_size, device=self._device)
-        self._replay = TensorDictReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=loop.batch_size)
+        self._replay = Replay(loop.replay_size, self._device)
+        self._submit = ThreadPoolExecutor(1).submit if loop.concurrent else run_now
         self._state = env.reset()
 
     @property
@@ -195,14 +202,18 @@ class Training:
         """Wall-clock time of the training, stopped runs included."""
         return time.perf_counter() - self._began
 
-    def step(self, spent: float) -> None:
-        """Step all arms and store the transitions; `spent`: share of the budget."""
+    @contextmanager
+    def step(self, spent: float) -> Iterator[None]:
+        """Step all arms while the block runs, then store the transitions; `spent`: share of the budget."""
         env, state = self._env, self._state
         observation = state["observation"].to(self._device)
         random = self.env_steps < self._loop.learning_starts
         state["action"] = env.action_spec.rand() if random else self._algo.explore(observation).cpu()
         with self._dated_errors():
-            step, self._state = env.step_and_maybe_reset(state)
+            pending = self._submit(env.step_and_maybe_reset, state)
+        yield
+        with self._dated_errors():
+            step, self._state = pending.result()
         self._replay.extend(_transition(step))
         terms = step["next", "reward_terms"].mean(0).numpy()
         self.factor = env.reward.adapt(self.factor, spent, terms, env.nsim)
@@ -212,9 +223,9 @@ class Training:
     def update(self) -> dict[str, torch.Tensor]:
         """Do one gradient update on a batch with the present reward weights; return the losses."""
         weights = torch.from_numpy(self._env.weights.astype(np.float32)).to(self._device)
-        batch = self._replay.sample()
-        batch["reward"] = batch["reward_terms"] @ weights
-        with self._dated_errors(), matmul_precision(self._loop.matmul):
+        batch = self._replay.sample(self._loop.batch_size)
+        batch["reward"] = batch.pop("reward_terms") @ weights
+        with self._dated_errors(), matmul_precision(self._matmul):
             losses = self._algo.update(batch)
         self.updates += 1
         return losses
@@ -246,11 +257,11 @@ class Training:
         }
         state |= {"terms": torch.tensor(np.array(self._terms))} | generators(self._device)
         state |= {"algo": self._algo.state_dict(), "env": _tensors(self._env.state()), "state": self._state.to_dict()}
-        checkpoint.save(state, self._replay, self.env_steps, self._loop.replay_size)
+        checkpoint.save(state, self._replay)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue from a checkpoint, if there is one."""
-        saved = checkpoint.load(self._replay, self._loop.replay_size)
+        saved = checkpoint.load(self._replay)
         if saved is None:
             return
         self._algo.load_state_dict(saved["algo"])
@@ -269,6 +280,13 @@ class Training:
             yield
         except FloatingPointError as error:
             raise FloatingPointError(f"{error}, after {self.env_steps} env steps{when}") from None
+
+
+def run_now(function: Callable[..., Any], *given: Any) -> Future:
+    """Do what an executor's `submit` does, at once."""
+    done: Future = Future()
+    done.set_result(function(*given))
+    return done
 
 
 def generators(device: torch.device) -> dict[str, torch.Tensor]:
@@ -292,6 +310,16 @@ def keep_memory() -> None:
         libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     except (OSError, AttributeError):
         pass  # another C library: only slower
+
+
+def fastest_matmul(device: torch.device) -> str:
+    """Return the precision of `matmul_precision` with the fastest updates: bfloat16 where matrix units multiply it.
+
+    With AVX-512 alone, rounding the factors costs networks of 128 to 256 units as much as faster products save
+    (benchmarks/results/speed.md).
+    """
+    units = device.type == "cuda" or torch.cpu.get_capabilities().get("amx_bf16", False)
+    return "medium" if units else "highest"
 
 
 @contextmanager
@@ -318,16 +346,13 @@ def _arrays(node: Any) -> Any:
     return node.numpy() if isinstance(node, torch.Tensor) else node
 
 
-def _transition(step) -> TensorDict:
-    """Return the part of a step that updates use, flat."""
+def _transition(step) -> dict[str, Tensor]:
+    """Return the part of a step that updates use."""
     after = step["next"]
-    return TensorDict(
-        {
-            "observation": step["observation"],
-            "action": step["action"],
-            "next_observation": after["observation"],
-            "reward_terms": after["reward_terms"],
-            "terminated": after["terminated"][:, 0].float(),
-        },
-        batch_size=step.batch_size,
-    )
+    return {
+        "observation": step["observation"],
+        "action": step["action"],
+        "next_observation": after["observation"],
+        "reward_terms": after["reward_terms"],
+        "terminated": after["terminated"][:, 0].float(),
+    }

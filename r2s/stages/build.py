@@ -303,11 +303,11 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 100)
 
 
-def set_threads(cfg):
-    """Set torch's threads and seed; the physics takes cfg.threads itself."""
+def set_threads(cfg, threads=None):
+    """Set torch's threads, by default cfg.threads, and its seed; the physics takes its threads itself."""
     import torch
 
-    torch.set_num_threads(cfg.threads or os.cpu_count() or 1)
+    torch.set_num_threads(threads or cfg.threads or os.cpu_count() or 1)
     torch.manual_seed(cfg.seed)
 
 

@@ -1,6 +1,7 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
 import copy
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ WHY = {
 }
 CALIBRATION = ("parameters.yaml", "posterior.npz")  # files of an identification that a training copies
 SURFACE = ("contact.yaml", "contact_posterior.npz")  # likewise, of dr.surface=
+UPDATE_THREADS = 4  # at most; networks of 128 units have no work for more
 
 
 def reads(cfg):
@@ -83,6 +85,7 @@ def make_parts(cfg):
     check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
     if learns:
         n_envs, loop, settings = split_algo(cfg)
+        learning, stepping = share_threads(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
     robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
@@ -92,8 +95,8 @@ def make_parts(cfg):
     reward = part(cfg.reward, "reward")
     if limits := {k: v for k, v in plain(cfg.get("costs") or {}).items() if v is not None}:
         reward = ConstrainedReward(reward, robot, limits)
-    set_threads(cfg)
-    env = TaskEnv(robot, task, draw, n_envs, nthread=cfg.threads, seed=cfg.seed, stagger=True, reward=reward)
+    set_threads(cfg, learning)
+    env = TaskEnv(robot, task, draw, n_envs, nthread=stepping, seed=cfg.seed, stagger=True, reward=reward)
     evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)
     action_scale = torch.from_numpy(task.control(robot).action_scale)
     algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
@@ -172,6 +175,17 @@ def conclude(cfg, run, parts, selection):
     print_measures(console(), task.measure_table, rows, f"{title(cfg)}; on goals without selection")
 
 
+def all_threads(cfg):
+    """Return the threads of a training."""
+    return cfg.threads or os.cpu_count() or 1
+
+
+def share_threads(cfg):
+    """Return the threads of updates and those of the arms' physics, which run at the same time."""
+    learning = max(1, min(UPDATE_THREADS, all_threads(cfg) // 2))
+    return learning, max(1, all_threads(cfg) - learning)
+
+
 def split_algo(cfg):
     """Return number of arms, `Loop` and the learner's settings of conf/algo."""
     from r2s.learning.train import Loop
@@ -181,6 +195,7 @@ def split_algo(cfg):
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
     loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
     loop |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
+    loop |= {"concurrent": all_threads(cfg) > 1}
     return n_envs, Loop(**loop), settings
 
 
