@@ -12,7 +12,7 @@ from torchrl.modules.distributions import TanhNormal
 from torchrl.objectives import TQCLoss
 
 from r2s.learning.learner import sample_tanh
-from r2s.learning.tqc import TQC, QuantileHuber
+from r2s.learning.tqc import TQC, quantile_huber
 
 D, N, B = 11, 3, 64
 HIDDEN = (32, 24)
@@ -138,7 +138,7 @@ def test_losses_and_gradients_are_torchrls(settings):
 
 
 def all_pairs(quantiles, target):
-    """Return the quantile Huber loss with every pair written out, as in TQCLoss, in double precision."""
+    """Return the quantile Huber loss as TQCLoss writes it, in double precision."""
     theta, y = quantiles.double(), target.double()
     delta = y[None, :, None, :] - theta[..., None]
     huber = torch.where(delta.abs() <= 1, 0.5 * delta.square(), delta.abs() - 0.5)
@@ -148,9 +148,9 @@ def all_pairs(quantiles, target):
 
 
 def compare(quantiles, target):
-    """Assert that value and gradient are those of all pairs; the tolerance is single precision's."""
-    quantiles, target = quantiles.clone().requires_grad_(True), target.sort(-1).values
-    value = QuantileHuber.apply(quantiles, target)
+    """Assert that value and gradient are those of `all_pairs`; the tolerance is single precision's."""
+    quantiles = quantiles.clone().requires_grad_(True)
+    value = quantile_huber(quantiles, target)
     (gradient,) = torch.autograd.grad(value, quantiles)
     expected = all_pairs(quantiles, target)
     (expected_gradient,) = torch.autograd.grad(expected, quantiles)
@@ -160,26 +160,18 @@ def compare(quantiles, target):
 
 @pytest.mark.parametrize("spread", [1e-3, 0.3, 1.0, 30.0, 1e4])
 @pytest.mark.parametrize("shift", [0.0, 1.0, -2000.0])
-def test_the_fast_quantile_loss_is_all_pairs(spread, shift):
-    """Prefix sums give the loss and gradient of all pairs at any spread, also far from zero."""
+def test_the_quantile_loss_is_that_of_the_paper(spread, shift):
+    """Loss and gradient at any spread, also far from zero."""
     torch.manual_seed(2)
     compare(shift + spread * torch.randn(3, 16, 9), shift + spread * torch.randn(16, 23))
 
 
-def test_ties_are_all_pairs_too():
-    """Quantiles on a target, and exactly 1 from it, where the loss changes its form, are no exception."""
+def test_ties_are_no_exception():
+    """Quantiles on a target, and exactly 1 from it, where the loss changes its form."""
     torch.manual_seed(3)
     compare(torch.randint(-3, 4, (2, 50, 7)).float(), torch.randint(-3, 4, (50, 11)).float())
     compare(torch.zeros(2, 4, 5), torch.zeros(4, 6))
     compare(torch.ones(1, 1, 1), torch.zeros(1, 1))
-
-
-def test_the_kept_gradient_is_the_derivative():
-    """In double precision torch's own gradient check passes."""
-    torch.manual_seed(4)
-    quantiles = torch.randn(2, 5, 6, dtype=torch.float64, requires_grad=True)
-    target = 1.5 * torch.randn(5, 8, dtype=torch.float64).sort(-1).values
-    assert torch.autograd.gradcheck(lambda q: 3.0 * QuantileHuber.apply(q, target), (quantiles,))
 
 
 def test_the_density_of_a_squashed_gaussian():

@@ -1,8 +1,7 @@
 """Truncated Quantile Critics (Kuznetsov et al. 2020, arXiv:2005.04269).
 
-The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). Two parts are
-written differently, for speed on two cores: the critics are one batched network instead of a vmap, and the quantile
-loss uses prefix sums over the sorted targets instead of all pairs.
+The losses equal those of `torchrl.objectives.TQCLoss`; the tests compare values and gradients (1e-5). For speed the
+critics are one batched network instead of a vmap.
 """
 
 from collections.abc import Mapping
@@ -48,55 +47,24 @@ class TQC(EntropyLearner):
             discount = self.gamma * (1.0 - batch["terminated"])
             target = batch["reward"][:, None] + discount[:, None] * atoms
         quantiles = self.critics(batch["observation"], batch["action"])
-        critic = QuantileHuber.apply(quantiles, target)
+        critic = quantile_huber(quantiles, target)
 
         action, log_prob = sample_tanh(self.actor(batch["observation"]), noise[1])
         value = self.critics.frozen(batch["observation"], action).mean((0, 2))
         return {"loss_critic": critic} | self.entropy_losses(alpha, value, action, log_prob)
 
 
-class QuantileHuber(torch.autograd.Function):
-    """Quantile Huber loss of quantiles (C, B, N) and sorted targets (B, M), as in TQCLoss: sum over C of the mean.
+def quantile_huber(quantiles: Tensor, target: Tensor) -> Tensor:
+    """Return the quantile Huber loss (Dabney et al. 2018, arXiv:1710.10044): sum over C of the mean over all pairs.
 
-    With delta = y_j - theta_i, the loss of a pair is |tau_i - [delta < 0]| huber(delta). Its derivative with respect
-    to theta is |tau_i - [delta < 0]| clip(-delta, -1, 1). The targets are sorted, so the pairs of one theta form four
-    intervals: delta below -1, to 0, to 1, above. Prefix sums of y and y^2 give the exact sum over each interval, with
-    three searches instead of N M pairs.
+    A pair with difference delta = target - quantile costs |tau - [delta < 0]| huber(delta); tau is the fraction of
+    the quantile, huber(delta) is delta^2 / 2 within 1 and |delta| - 1/2 beyond.
+
+    Args:
+        quantiles: (C, B, N). target: (B, M).
     """
-
-    @staticmethod
-    def forward(ctx, quantiles: Tensor, target: Tensor) -> Tensor:
-        """Return the scalar loss and save its gradient for `backward`."""
-        count, b, n = quantiles.shape
-        m = target.shape[-1]
-        # Sums of squares cancel in single precision: center the targets of each row and sum in double.
-        center = target.double().mean(-1, keepdim=True)
-        y = target.double() - center
-        theta = quantiles.transpose(0, 1).reshape(b, -1).double() - center
-        zero = y.new_zeros(b, 1)
-        first = torch.cat([zero, y.cumsum(-1)], -1)
-        second = torch.cat([zero, y.square().cumsum(-1)], -1)
-        low = torch.searchsorted(y, theta - 1.0)
-        mid = torch.searchsorted(y, theta)
-        high = torch.searchsorted(y, theta + 1.0, right=True)
-        s_low, s_mid, s_high = (first.gather(-1, k) for k in (low, mid, high))
-        q_low, q_mid, q_high = (second.gather(-1, k) for k in (low, mid, high))
-
-        def square(k: Tensor, s: Tensor, q: Tensor) -> Tensor:  # sum of (y - theta)^2 / 2 over k targets
-            return 0.5 * (q - 2.0 * theta * s + k * theta.square())
-
-        under = low * (theta - 0.5) - s_low + square(mid - low, s_mid - s_low, q_mid - q_low)
-        over = square(high - mid, s_high - s_mid, q_high - q_mid)
-        over = over + (first[:, -1:] - s_high) - (m - high) * (theta + 0.5)
-        d_under = low + (mid - low) * theta - (s_mid - s_low)
-        d_over = (high - mid) * theta - (s_high - s_mid) - (m - high)
-        fraction = ((torch.arange(n, dtype=y.dtype, device=y.device) + 0.5) / n).repeat(count)
-        loss = ((1.0 - fraction) * under + fraction * over).sum() / (n * m * b)
-        gradient = ((1.0 - fraction) * d_under + fraction * d_over) / (n * m * b)
-        ctx.save_for_backward(gradient.reshape(b, count, n).transpose(0, 1).to(quantiles.dtype))
-        return loss.to(quantiles.dtype)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """Return the saved gradient times the upstream one."""
-        return ctx.saved_tensors[0] * grad, None
+    n = quantiles.shape[-1]
+    tau = ((torch.arange(n, device=quantiles.device) + 0.5) / n)[:, None]
+    delta = target[:, None, :] - quantiles[..., None]
+    within = delta.clamp(-1.0, 1.0)
+    return (torch.where(delta < 0.0, 1.0 - tau, tau) * within * (delta - 0.5 * within)).mean((1, 2, 3)).sum()
