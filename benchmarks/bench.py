@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +24,9 @@ from common import MACHINE, NEW, ROBOT, ROOT, conf, default_task
 from rich.console import Console
 from rich.table import Table
 
+from r2s.adaptation.adapters import AdapterContext
+from r2s.adaptation.estimator import Estimator
+from r2s.adaptation.wrench import WrenchObserver
 from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.learning.env import TaskEnv
 from r2s.learning.randomization import UniformRandomization
@@ -32,6 +35,7 @@ from r2s.learning.tqc import TQC
 from r2s.learning.train import keep_memory, matmul_precision
 from r2s.physics.robot import SIM_DT
 from r2s.physics.simulator import Simulator
+from r2s.physics.surface import Tool
 from r2s.tasks.reach import ReachTask
 
 REPEATS = 15
@@ -280,12 +284,28 @@ def twin(robot) -> tuple[float, float]:
     return float(np.median(rates)), 1 / SIM_DT
 
 
+def observers(robot, dynamics) -> tuple[float, float]:
+    """Compare the observer of the external wrench with the online estimator of a payload, cycles/s."""
+    arm = replace(robot, tool=Tool(np.array([0.0, 0.0, 0.1]), 0.01))
+    t = SIM_DT * np.arange(5000)[:, None]
+    rate, size = np.linspace(2.0, 5.0, robot.n), 0.3  # rad/s, rad
+    q, dq = robot.q_home + size * np.sin(rate * t), size * rate * np.cos(rate * t)
+    tau = 0.05 * robot.tau_max * np.cos(3.0 * t)
+    wrench, estimator = WrenchObserver(arm, dynamics), Estimator(*AdapterContext(arm, dynamics).corrected)
+
+    def repeated(observe: Callable[..., object]) -> Callable[[], object]:
+        return lambda: [observe(*cycle) for cycle in zip(q, dq, tau, strict=True)]
+
+    return duel(repeated(wrench), repeated(estimator), len(t))
+
+
 def main() -> None:
     """Run all comparisons and print one table."""
     robot, dynamics = ROBOT, NEW
     cores = os.cpu_count() or 1
     keep_memory()  # same as in training
     rows, sb3 = {"hidden twin / real time, cycles/s, 1 thread": twin(robot)}, Sb3()
+    rows["wrench observer / online estimator, cycles/s, 1 thread"] = observers(robot, dynamics)
     rows["replay buffer / TorchRL's, add 32 and draw 256, times/s"] = replay(robot)
     for threads in sorted({1, cores}):
         at = f"{threads} thread{'s' * (threads > 1)}"
