@@ -207,7 +207,7 @@ def pictures() -> list[str]:
 
 NOISE = """\
 A policy trained without noise vibrates on an elastic twin; noise up to 0.05 rad/s in training removes this. 0.1 rad/s
-was too much to learn with."""
+was too much to learn with (development twin, one seed a row)."""
 
 
 def main() -> None:
@@ -216,7 +216,7 @@ def main() -> None:
     identified = f"{stamp(command)} 20 s of motion and ramps per twin, {TWIN_STEPS:,} env steps, no DR."
     sections = {
         "Hidden twins": (identified, twins_tables() if len(transfers()) else []),
-        "Noise against gears that swing": (NOISE, noise_table()),
+        "Noise against gears that swing": (f"{stamp('python benchmarks/transfer.py noise')} {NOISE}", noise_table()),
         "One twin, four goals": ("", pictures()),
     }
     page = RESULTS / "transfer.md"
