@@ -103,7 +103,7 @@ class Learner(nn.Module, ABC):
     def gradients(self, batch: Mapping[str, Tensor], *noise: Any) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
         """Return `losses` of a batch in SI units and the gradient of their sum by each of `trained`.
 
-        Losses and gradient are one function, so that they are compiled to one graph; `backward` would be a second one.
+        They are one function, so that they are compiled to one graph; `backward` would be a second one.
         """
         return differentiate(self.losses(self.normalized(batch), *noise), self.trained)
 
