@@ -62,7 +62,7 @@ PAPER = np.array([1.0, 1.0, 0.0, 0.0, 0.0])  # weights of the terms that make eq
 
 WEIGHTS = tuple((name, "[0, inf)") for name in TERMS[1:])
 PATIENCE = 50_000  # env steps in which the penalty factor grows e-fold at twice max_filter_rate
-MAX_FACTOR = 4.0  # largest penalty factor
+MAX_FACTOR = 2.5  # largest penalty factor; 34 trainings of tqc stayed below 2.2, at 4 ddpg and td3 stop moving
 
 
 class Reward:
