@@ -498,22 +498,22 @@ def test_the_same_policy_in_dart(trained, root):
     ],
 )
 def test_a_policy_through_the_client_that_drives_hardware(trained, arm, package, tmp_path):
-    """The whole way, in lock-step against the emulator of the control box: twice the same to the bit.
-
-    A policy of so few steps may drift towards the table, where its driver stops it; nothing else may.
-    """
+    """The whole way, in lock-step against the emulator of the control box: no stop, and twice the same to the bit."""
     pytest.importorskip(package)
-    root = tmp_path / "runs"
-    runs, stops = [], []
+    root, gentle = tmp_path / "runs", tmp_path / "gentle"
+    shutil.copytree(trained, gentle)
+    saved = torch.load(gentle / "policy.pt", weights_only=True)
+    for name in ("actor.body.4.weight", "actor.body.4.bias"):  # a tenth: it would drift into the fence of the table
+        saved["state"][name] *= 0.1
+    torch.save(saved, gentle / "policy.pt")
+    runs = []
     for k in range(2):
         words = [f"arm={arm}", "simulator=none", "evaluation.episodes=1", f"name={arm}_{k}"]
-        succeed("stage=transfer", f"policy={trained}", f"root={root}", *words, *TOY)
+        succeed("stage=transfer", f"policy={gentle}", f"root={root}", *words, *TOY)
         folder = root / "transfer" / f"{arm}_{k}"
-        stops.append((folder / "stops.txt").read_text())
-        with np.load(folder / f"episodes_{arm}.npz") as saved:
-            runs.append({key: saved[key] for key in saved.files})
-    assert stops[0] == stops[1]
-    assert stops[0] == "none\n" or "would come too near" in stops[0]
+        assert (folder / "stops.txt").read_text() == "none\n"
+        with np.load(folder / f"episodes_{arm}.npz") as episodes:
+            runs.append({key: episodes[key] for key in episodes.files})
     assert np.ptp(runs[0]["q"], axis=1).max() > 1e-3  # it moved
     for key, values in runs[0].items():
         np.testing.assert_array_equal(runs[1][key], values)

@@ -303,11 +303,16 @@ def console():
     return Console(width=None if sys.stdout.isatty() else 100)
 
 
+def all_threads(cfg):
+    """Return the threads that a stage may use."""
+    return cfg.threads or os.cpu_count() or 1
+
+
 def set_threads(cfg, threads=None):
-    """Set torch's threads, by default cfg.threads, and its seed; the physics takes its threads itself."""
+    """Set torch's threads, all by default, and its seed; the physics takes its threads itself."""
     import torch
 
-    torch.set_num_threads(threads or cfg.threads or os.cpu_count() or 1)
+    torch.set_num_threads(threads or all_threads(cfg))
     torch.manual_seed(cfg.seed)
 
 

@@ -1,13 +1,13 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
 import copy
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from r2s.errors import check_number
 from r2s.stages.build import (
+    all_threads,
     console,
     device,
     is_learner,
@@ -85,7 +85,6 @@ def make_parts(cfg):
     check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
     if learns:
         n_envs, loop, settings = split_algo(cfg)
-        learning, stepping = share_threads(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
     robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
@@ -95,6 +94,7 @@ def make_parts(cfg):
     reward = part(cfg.reward, "reward")
     if limits := {k: v for k, v in plain(cfg.get("costs") or {}).items() if v is not None}:
         reward = ConstrainedReward(reward, robot, limits)
+    learning, stepping = share_threads(cfg)
     set_threads(cfg, learning)
     env = TaskEnv(robot, task, draw, n_envs, nthread=stepping, seed=cfg.seed, stagger=True, reward=reward)
     evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)
@@ -173,11 +173,6 @@ def conclude(cfg, run, parts, selection):
     run.summary(rows | {"best on the selection goals": selection.best})
     pages.training(run, robot)
     print_measures(console(), task.measure_table, rows, f"{title(cfg)}; on goals without selection")
-
-
-def all_threads(cfg):
-    """Return the threads of a training."""
-    return cfg.threads or os.cpu_count() or 1
 
 
 def share_threads(cfg):

@@ -1,6 +1,5 @@
 """stage=transfer: the same policy on the same goals in simulators and on an arm."""
 
-import os
 import shutil
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from r2s.errors import Stopped, UserError, check_number, nearest
 from r2s.progress import Progress
 from r2s.stages.adapter_factory import make_adapter
 from r2s.stages.build import (
+    all_threads,
     console,
     is_learner,
     is_simulated,
@@ -211,7 +211,7 @@ def run_on_twins(cfg, request, open_runner):
     from r2s.arm.parallel_episodes import run_parallel_episodes
 
     with goal_progress(f"on {cfg.arm.name}") as progress:
-        workers = cfg.threads or os.cpu_count() or 1
+        workers = all_threads(cfg)
         done, stops, timing = run_parallel_episodes(
             open_runner, request.policy, request.task, request.starts, request.goals, workers, progress
         )

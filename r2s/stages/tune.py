@@ -2,7 +2,6 @@
 
 import csv
 import math
-import os
 import re
 import signal
 import subprocess
@@ -16,7 +15,7 @@ from typing import Any, Literal
 
 from r2s.errors import UserError, check_number, choices, nearest, optional_import
 from r2s.stages import train
-from r2s.stages.build import console, make_dynamics, make_robot, make_task, open_run, unread
+from r2s.stages.build import all_threads, console, make_dynamics, make_robot, make_task, open_run, unread
 from r2s.stages.parts import called, plain
 from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
@@ -282,7 +281,7 @@ def tune(cfg, overrides):
         near = nearest(str(how.measure), known)
         raise UserError(f"tune.measure: the task has no measure '{how.measure}'; allowed: {choices(known)}{near}")
     measure = known[how.measure]
-    workers = how.workers or cfg.threads or os.cpu_count() or 1
+    workers = how.workers or all_threads(cfg)
     with open_run(cfg, overrides) as run:
         study = open_study(run, cfg.seed, how.startup, "minimize" if measure.lower_is_better else "maximize")
         search(study, how, partial(make_trial, cfg, overrides, run, how.space), workers)
