@@ -20,7 +20,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {  # patterns of each script's arguments
     "algorithms": ("page",),
     **dict.fromkeys(("bench", "gallery"), ()),
     "adapters": (r"(root|task|episodes|policy|adapters)=.+", r"(rigid|elastic)_\d+"),
-    "grid": (r"\d+(,\d+)*", NUMBER),
+    "grid": ("page",),
     "press": (rf"minutes={NUMBER}", r"(rigid|elastic)_\d+"),
     "payload": (PARTS, r"(root|keep)=.+", r"variant=\w+", r"(motions|minutes)=[1-9]\d*", rf"[A-Z]+={NUMBER}", r"\d+"),
     "searches": (NUMBER,),
