@@ -528,11 +528,11 @@ from r2s.physics.dynamics import nominal_dynamics
 class Stopping(SimulatedArm):
     \"""An arm without an operator; a user stop ends its second motion.\"""
 
-    def __init__(self, robot, noise=0):
-        self.operator, self.blocked, self._motions = (lambda reason: False), None, noise
+    def __init__(self, robot, noise=0, motions=0, stop_s=0.15):
+        self.operator, self.blocked, self._motions = (lambda reason: False), None, 0
         dynamics = nominal_dynamics(robot, phi1=[1.0] * 7, phi2=[9.0] * 7, phi3=[0.0] * 7)
         super().__init__(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
-        self._motions = noise
+        self._motions, self._stop_s = noise + motions, stop_s
 
     def move_to(self, q):
         if self.blocked is not None:
@@ -541,11 +541,12 @@ class Stopping(SimulatedArm):
         return super().move_to(q)
 
     def command(self, tau):
-        if self._motions == 2 and self.read().t >= 0.15:
+        if self._motions == 2 and self.read().t >= self._stop_s:
             self.blocked = "user stop"
             raise ArmStopped(self.blocked)
         super().command(tau)
 """
+STOPPING_YAML = "_target_: stopping.Stopping\nname: stopping\nmotions: 0\nstop_s: 0.15\n"
 
 
 @pytest.fixture
@@ -553,7 +554,7 @@ def stopping(tmp_path):
     """A folder with an arm that is stopped in its second motion: `--config-dir conf arm=stopping`."""
     (tmp_path / "stopping.py").write_text(STOPPING)
     (tmp_path / "conf" / "arm").mkdir(parents=True)
-    (tmp_path / "conf" / "arm" / "stopping.yaml").write_text("_target_: stopping.Stopping\nname: stopping\n")
+    (tmp_path / "conf" / "arm" / "stopping.yaml").write_text(STOPPING_YAML)
     return tmp_path
 
 
@@ -580,6 +581,42 @@ def test_a_stopped_arm_ends_a_transfer_with_3(trained, stopping):
     with np.load(folder / "episodes_stopping.npz") as saved:
         assert len(saved["q"]) == 2
     assert (folder / "stops.txt").read_text() == "episode 2, 0.15 s: user stop\n"
+
+
+def test_a_pipeline_moves_a_physical_arm_with_one_command_at_a_time():
+    """Twins and emulated arms are as many as the transfers; a physical arm accepts one client."""
+    step = {"identified": ["stage=transfer"], "nominal": ["stage=transfer"]}
+    assert pipeline.at_once(step, moves=True) == [{label: words} for label, words in step.items()]
+    assert pipeline.at_once(step, moves=False) == [step]
+
+
+def test_an_arm_that_stops_in_its_last_episode_moves_in_no_later_job(trained, stopping):
+    """All goals began, but no operator agreed to another motion: a sweep ends before its second job."""
+    words = [
+        "stage=transfer",
+        f"policy={trained.resolve()}",
+        "arm=stopping",
+        "simulator=none",
+        "evaluation.episodes=2",
+    ]
+    done = r2s("-m", "--config-dir", "conf", *words, *TOY, "seed=0,1", at=stopping)
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert re.search(r"^stopped: 2 of 2 goals done on arm=stopping: user stop; see ", done.stderr, flags=re.M)
+    assert len(list((stopping / "runs" / "transfer").iterdir())) == 1
+
+
+def test_an_estimate_of_a_stopped_arm_ends_with_3(stopping):
+    """The estimate of the motion before the stop is written, and the recording's name says that it is not whole."""
+    words = ["stage=estimate", "data=arm", "arm=stopping", "arm.motions=1", "arm.stop_s=1.0", "name=a"]
+    done = r2s("--config-dir", "conf", *words, "data.seconds=2.0", at=stopping)
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert re.search(r"^stopped: while the arm was recorded: user stop; the estimate", done.stderr, flags=re.M)
+    folder = stopping / "runs" / "estimate" / "a"
+    assert json.loads((folder / "meta.json").read_text())["status"] == "stopped"
+    assert (folder / "estimate.csv").is_file()
+    assert not (folder / "recording.npz").exists()
+    with np.load(folder / "recording_until_stop.npz") as part:
+        assert len(part["t"]) == 1000
 
 
 def test_a_stopped_arm_ends_an_identification_with_3(stopping):

@@ -9,6 +9,7 @@ import yaml
 from test_cli import TOY, r2s, succeed
 from test_press import DR_CONF, PANDA, TRUE
 
+from r2s.arm.interface import ArmStopped
 from r2s.arm.presses import LOADS, PAUSE_S, press_plan, record_presses
 from r2s.arm.twins.make_twin import make_twin
 from r2s.errors import UserError
@@ -45,6 +46,22 @@ def test_presses_load_the_surface_along_paths():
     # the model is of another arm: within 4 N, less than the range of 14 N
     ends = [[pressed[k, begin : begin + 200].mean(), pressed[k, -200:].mean()] for k in (0, 1)]
     np.testing.assert_allclose(ends, [[low, high], [high, low]], atol=4.0)
+
+
+def test_late_commands_in_any_path_end_the_presses():
+    """The arm got 90 % of its commands in time in the first path, all in the second: no recording."""
+    plan = replace(press_plan(PANDA, TRUE), episode_s=4.0)
+    twin, paths = make_twin(PANDA, surface=True), []
+    read, move_to, twin.realtime = twin.read, twin.move_to, True
+
+    def place(q):
+        paths.append(q)
+        return move_to(q)
+
+    twin.read = lambda: replace(read(), control_command_success_rate=0.9 if len(paths) == 1 else 1.0)
+    twin.move_to = place
+    with pytest.raises(ArmStopped, match=r"^the arm got 90\.0 % of its commands in time, at least 99 % are needed$"):
+        record_presses(twin, plan, TRUE, 2)
 
 
 def test_too_few_presses_are_one_line():

@@ -40,9 +40,11 @@ from r2s.arm.driver import ADDED, DAMP_S, Driver
 from r2s.arm.emulator.control import MAX_MISSED, Fault
 from r2s.arm.interface import ArmState, StopRequested
 from r2s.arm.lifeline import Lifeline
+from r2s.arm.policy_runner import PolicyRunner
 from r2s.arm.recorder import record
-from r2s.arm.stop_request import GRACE_S, handled_signals, watched
+from r2s.arm.stop_request import GRACE_S, PARENT, handled_signals, requested, watched
 from r2s.arm.twins.rigid_twin import RigidTwin
+from r2s.errors import Stopped
 from r2s.excitation.motion import Excitation
 from r2s.physics.rigid_body import Kinematics
 from r2s.physics.robot import SIM_DT, load_robot
@@ -426,3 +428,45 @@ def test_a_signal_ends_a_run_as_stopped(name, tmp_path):
     assert json.loads((folder / "meta.json").read_text())["status"] == "stopped"
     with np.load(folder / "train_until_stop.npz") as rows:
         assert len(rows["t"]) >= 500
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_after_the_last_motion_ends_the_run(name):
+    """What follows would open the arm again, so the request is not lost."""
+    with pytest.raises(Stopped, match=rf"^{name}; no motion was running$"), handled_signals():
+        os.kill(os.getpid(), getattr(signal, name))
+    with handled_signals():  # a later arm starts without a request
+        assert requested() is None
+
+
+def test_a_request_before_the_first_episode_halts_the_runner():
+    """The runner has a state to show, the arm has not moved, and the reason stays."""
+    arm = RigidTwin(PANDA, 3)
+    with watched(lambda: "the parent has ended"), handled_signals():
+        runner = PolicyRunner(arm, TASK, np.ones(7))
+        runner.place(PANDA.q_home[None], 0)
+    assert (runner.halted, runner.done) == ("the parent has ended", 0)
+
+
+@pytest.mark.slow
+def test_the_end_of_a_parent_ends_the_motion_of_its_step(tmp_path):
+    """A killed process, such as stage=pipeline, leaves no recording behind that moves an arm."""
+    words = ["stage=identify", "data=arm", "arm=panda_emulated", "name=a", f"root={tmp_path}", "data.seconds=20"]
+    start = f"""import os, subprocess, sys
+env = os.environ | {{{PARENT!r}: str(os.getpid())}}
+with open({str(tmp_path / "log")!r}, "w") as log:
+    step = subprocess.Popen([sys.executable, "run.py", *{words!r}], stderr=log, env=env)
+print(step.pid, flush=True)
+step.wait()"""
+    with subprocess.Popen([sys.executable, "-c", start], cwd=ROOT, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        step, log = int(parent.stdout.readline()), tmp_path / "log"
+        while not re.search(r"record train motion.* [1-9]", log.read_text()):
+            time.sleep(0.1)
+        parent.kill()
+    until = time.monotonic() + 60.0
+    meta = tmp_path / "identify" / "a" / "meta.json"
+    while json.loads(meta.read_text())["status"] == "running" and time.monotonic() < until:
+        time.sleep(0.1)
+    assert json.loads(meta.read_text())["status"] == "stopped", (step, log.read_text())
+    assert "SIGTERM" in log.read_text()

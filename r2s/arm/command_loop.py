@@ -186,6 +186,7 @@ class CommandLoop:
 
     def _check_request(self) -> None:
         if (reason := requested()) is not None:
+            self.state = self.arm.read()  # a runner shows the state of an episode that did not begin
             serve()
             raise StopRequested(reason)
 

@@ -72,6 +72,7 @@ class PolicyRunner:
         speeds: (1, T, n) rad/s after each control step of the last episode, smoothed over 1 kHz cycles.
         halted: reason for which no further episode runs: the operator did not agree after a stop, or a request to
             stop. None: not halted.
+        blocked: stop that ended the last episode and that no operator has agreed to yet; None: no stop is pending.
 
     Args:
         arm: an arm that waits for its commands.
@@ -105,6 +106,7 @@ class PolicyRunner:
         self.done = 0
         self.speeds = np.zeros((1, task.steps, arm.robot.n))
         self.halted: str | None = None
+        self.blocked: str | None = None
 
     def place(self, starts: np.ndarray, first: int) -> State:
         """Move to starts (1, n) rad and begin episode `first` there.
@@ -142,6 +144,7 @@ class PolicyRunner:
         if not self._stopped and reason is not None:  # the episode ended before the driver brought the arm to rest
             self._record_stop(f"{self._loop.state.t:.2f} s", reason)
         self.halted = self.halted or requested()
+        self.blocked = self._arm.blocked if isinstance(self._arm, Operated) else None
         speeds = smooth_speeds(self._angles, self._substeps)[: self.speeds.shape[1]]
         self.speeds[:] = 0.0  # a stopped arm is at rest
         self.speeds[0, : len(speeds)] = speeds

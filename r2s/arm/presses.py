@@ -102,10 +102,10 @@ def record_presses(
                     timing.cycle(loop.clock, loop.state)
             loop.settle()
             loop.end()
+            timing.check(arm)
             ends.append(len(log))
             if progress is not None:
                 progress(k + 1, count)
-        timing.check(arm)
     except ArmStopped as stop:
         if len(ends) > 1:
             stop.recording = _recording(log, ends, robot.name)

@@ -98,7 +98,7 @@ class RealtimeRunner:
     `with RealtimeRunner(...) as arms`: the process opens the arm, and always stops and closes it at the end.
 
     Attributes:
-        robot: the arm's. stops, timing, done, speeds, halted: see `PolicyRunner`.
+        robot: the arm's. stops, timing, done, speeds, halted, blocked: see `PolicyRunner`.
 
     Args:
         open_arm: returns the arm or a context manager of it; runs in the arm's process, so it must be picklable.
@@ -118,6 +118,7 @@ class RealtimeRunner:
         self.done = 0
         self.speeds = np.zeros((1, task.steps, robot.n))
         self.halted: str | None = None
+        self.blocked: str | None = None
         self._kinematics, self._section = Kinematics(robot), ExitStack()
         self._operator: Callable[[str], bool] | None = None
         command, state = task.control(robot).command_size, 4 + 5 * robot.n + sum(signal_sizes(robot.n).values())
@@ -192,7 +193,7 @@ class RealtimeRunner:
         """Stop the arm; return (1,), whether the arm or the driver had already stopped the episode."""
         self._channel.end.write(np.ones(1))
         self._section.close()
-        self.stops, stopped, timing, self.speeds, self.halted = self._receive("ended")
+        self.stops, stopped, timing, self.speeds, self.halted, self.blocked = self._receive("ended")
         self._note_halt()
         self.timing = replace(timing, policy=self.timing.policy)
         return np.array([stopped])
@@ -291,7 +292,7 @@ def _run_episode(runner: PolicyRunner, starts: np.ndarray, first: int, line: Con
                 time.sleep(POLL_S)
         finally:
             stopped = bool(runner.end()[0])
-    line.send(("ended", (runner.stops, stopped, runner.timing, runner.speeds, runner.halted)))
+    line.send(("ended", (runner.stops, stopped, runner.timing, runner.speeds, runner.halted, runner.blocked)))
 
 
 def _newest_commands(runner: PolicyRunner, channel: Channel, last: int) -> Iterator[np.ndarray | None]:

@@ -16,6 +16,8 @@ from r2s.errors import Stopped
 
 # a closed terminal, Ctrl-C, Ctrl-\, kill and systemd, Ctrl-Z; SIGKILL and SIGSTOP cannot be handled
 SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP)
+PARENT = "R2S_PARENT"  # environment variable: pid of the process whose end ends every motion of this one
+FOLLOW_S = 0.1  # s between two looks at the parent
 GRACE_S = 2.0  # s for a motion to end by itself: driver and `rest` take at most 0.5 s each. Then KeyboardInterrupt
 
 
@@ -29,6 +31,7 @@ class _Request:
 
 
 _request = _Request()
+_parent = int(os.environ.pop(PARENT, 0))  # not for the processes that this one starts
 
 
 def requested() -> str | None:
@@ -66,6 +69,14 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
+def _follow(over: threading.Event) -> None:
+    """Send this process SIGTERM when its parent ends before `over` is set."""
+    while not over.wait(FOLLOW_S):
+        if os.getppid() != _parent:
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+
+
 def _leave_terminal() -> None:
     """Discard output to a terminal: after SIGHUP it is closed, and writing to it would end the run with an error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -80,7 +91,9 @@ def handled_signals(forward: Callable[[int], None] = lambda number: None) -> Ite
     """Turn SIGNALS into a request while an arm is open in this process.
 
     If no motion has taken the request after GRACE_S, the main thread gets a KeyboardInterrupt; it leaves this context
-    as `Stopped` with the name of the signal. Outside the main thread Python allows no handlers; nothing changes.
+    as `Stopped` with the name of the signal. So does a request that no motion has taken when the block ends: what
+    follows may move the arm again. The end of the process in PARENT counts as SIGTERM. Outside the main thread Python
+    allows no handlers; nothing changes.
 
     Args:
         forward: called with the number of each signal, in the handler.
@@ -109,11 +122,18 @@ def handled_signals(forward: Callable[[int], None] = lambda number: None) -> Ite
 
     before = {number: signal.signal(number, request) for number in SIGNALS}
     before[signal.SIGALRM] = signal.signal(signal.SIGALRM, insist)
+    over = threading.Event()
+    if _parent:
+        threading.Thread(target=_follow, args=(over,), daemon=True, name="follow").start()
     try:
         yield
     except KeyboardInterrupt:
         raise Stopped(f"{_request.reason or 'interrupted'}; no motion was running") from None
+    else:
+        if _request.reason is not None and not _request.served:
+            raise Stopped(f"{_request.reason}; no motion was running")
     finally:
+        over.set()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -49,9 +49,10 @@ def estimate(cfg, overrides):
     surface = identified_surface(cfg, robot)
     inputs = [str(located(cfg.data.path))] if recording is not None else []
     with open_run(cfg, overrides, inputs) as run:
+        stopped = None
         if recording is None:
-            recording = record_arm(cfg, robot)
-            recording.save(run.folder / "recording.npz")
+            recording, stopped = record_arm(cfg, robot)
+            recording.save(run.folder / ("recording_until_stop.npz" if stopped else "recording.npz"))
         estimator = Estimator(*AdapterContext(robot, dynamics, posterior, unloaded).corrected)
         observer, threshold_from = wrench_observer(cfg, robot, dynamics, surface)
         print(
@@ -91,6 +92,8 @@ def estimate(cfg, overrides):
         write_estimate_recording(run.folder / "recording.rrd", robot, recording, rows, wrench)
         print(format_estimate(last))
         print(format_contacts(touched))
+        if stopped:
+            raise Stopped(f"while the arm was recorded: {stopped}; the estimate is of the motion before")
     print(f"written: {run.folder}")
 
 
@@ -148,7 +151,11 @@ def given_recording(cfg, robot):
 
 
 def record_arm(cfg, robot):
-    """Return the recording of an arm that moves for data.seconds, or along data.excitation."""
+    """Return the recording of an arm that moves for data.seconds or along data.excitation, and why it stopped.
+
+    Raises:
+        Stopped: a signal stopped the arm, or it stopped before it moved.
+    """
     from r2s.arm.interface import ArmStopped, StopRequested
     from r2s.arm.recorder import record
     from r2s.excitation.fourier import fourier
@@ -169,9 +176,9 @@ def record_arm(cfg, robot):
         if stop.recording is None or isinstance(stop, StopRequested):
             raise Stopped(f"while the arm was recorded: {stop}") from None
         progress.close(f"stopped: {stop}")
-        return stop.recording
+        return stop.recording, str(stop)
     progress.close(f"{out.duration:.1f} s of motion")
-    return out
+    return out, None
 
 
 def summary(last, changes):

@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+from r2s.arm.stop_request import PARENT
 from r2s.compiled import RELAYED
 from r2s.errors import Stopped, UserError, check_number
 from r2s.stages import identify, train, transfer
@@ -82,7 +83,8 @@ def run_step(words: dict[str, list[str]]) -> None:
     try:
         for label, typed in words.items():
             print(f"  {label:<10} $ {PROGRAM} {' '.join(typed)}", file=sys.stderr, flush=True)
-            env, piped = os.environ | {"PYTHONUNBUFFERED": "1", RELAYED: "1"}, subprocess.PIPE
+            relayed = {"PYTHONUNBUFFERED": "1", RELAYED: "1", PARENT: str(os.getpid())}
+            env, piped = os.environ | relayed, subprocess.PIPE
             process = subprocess.Popen([*command_prefix(), *typed], stdout=piped, stderr=piped, text=True, env=env)
             running[label] = process
             threads[label] = [Thread(target=do, args=(label, process), daemon=True) for do in (relay, show)]
@@ -102,6 +104,11 @@ def run_step(words: dict[str, list[str]]) -> None:
                 process.terminate()
         for thread in (t for both in threads.values() for t in both):
             thread.join(timeout=5)
+
+
+def at_once(step: dict[str, list[str]], *, moves: bool) -> list[dict[str, list[str]]]:
+    """Return the commands of a step in groups that run in parallel; commands that move one arm run alone."""
+    return [{label: words} for label, words in step.items()] if moves else [step]
 
 
 def command_prefix() -> list[str]:
@@ -289,7 +296,8 @@ def pipeline(cfg, overrides):
             print(f"{k}/{len(steps)} {what}", file=sys.stderr)
             if touches(cfg) and step is steps[-2]:
                 add_friction(cfg, surface, step, overrides)
-            run_step(step)
+            for words in at_once(step, moves=step is steps[-1] and not is_simulated(cfg)):
+                run_step(words)
         trained = {m: root / "train" / f"{name}_{m}" for m in MODELS}
         transferred = {ROWS.get(m, f"{m} model"): root / "transfer" / f"{name}_{m}" for m in labels(cfg)[1]}
         rows = {}

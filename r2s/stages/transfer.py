@@ -168,6 +168,7 @@ class ArmResult:
         tried: (k,) numbers of the goals that began. episodes: (k) of them, None without any.
         stops: reasons why episodes ended early. timing: of the 1 kHz cycles, None if unknown.
         halted: reason why the remaining goals did not run; None: all ran.
+        blocked: stop that ended the last episode of an arm with an operator; None: it did not stop.
     """
 
     tried: Any = ()
@@ -175,6 +176,7 @@ class ArmResult:
     stops: Any = ()
     timing: Any = None
     halted: Any = None
+    blocked: Any = None
 
 
 def run_on_arm(cfg, request, runner, predicted):
@@ -201,7 +203,8 @@ def run_on_arm(cfg, request, runner, predicted):
         done = rollout(request.policy, runner, request.task, request.starts[tried], request.goals[tried], progress)
     stops = [replace(stop, episode=int(tried[stop.episode])) for stop in runner.stops]
     tried = tried[: runner.done]  # goals that did not begin are no failures
-    return ArmResult(tried, select_episodes(done, slice(len(tried))), stops, runner.timing, runner.halted)
+    episodes = select_episodes(done, slice(len(tried)))
+    return ArmResult(tried, episodes, stops, runner.timing, runner.halted, runner.blocked)
 
 
 def run_on_twins(cfg, request, open_runner):
@@ -308,7 +311,7 @@ def transfer(cfg, overrides):
         print_measures(console(), task.measure_table, rows, f"{request.source.name} on {len(goals)} goals")
         if warning := rest_warning(rows, name):
             print(warning)
-        if result.halted is not None:
+        if (why := result.halted or result.blocked) is not None:  # no later job moves a blocked arm
             count = len(result.tried)
-            raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {result.halted}; see {run.folder}")
+            raise Stopped(f"{count} of {len(goals)} goals done on arm={name}: {why}; see {run.folder}")
     print(f"written: {run.folder}")
