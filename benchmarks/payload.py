@@ -19,7 +19,7 @@ Rows go to ROOT/bench/payload_PART.csv, each only once; runs on different twins 
 Tables of the requested twins go to benchmarks/results/payload.md.
 
 For tuning, keep=FOLDER keeps recordings (2 MB per motion; none of `load`), so that repeated estimation takes a sixth
-of the time. A word in capitals sets a constant of r2s/adaptation: LEAST_KG=0.05 OUTLIER=2; rows then go to files with
+of the time. A word in capitals sets a constant of r2s/adaptation: HUBER=1.0 OUTLIER=2; rows then go to files with
 these words in their names, and the script only prints the tables.
 """
 

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from conftest import conf
 
+from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimator, nearest_body
 from r2s.adaptation.kalman import Filter, update
@@ -30,6 +31,7 @@ from r2s.adaptation.offline_estimation import (
 )
 from r2s.adaptation.payload_jump import MEAN
 from r2s.adaptation.tuning import HUBER, SPAN
+from r2s.adaptation.wrench import wrench_noise
 from r2s.errors import UserError
 from r2s.identification.link_inertia import pseudo_inertia
 from r2s.physics.actuation import Motors
@@ -486,6 +488,21 @@ def test_a_pause_widens_the_estimate_by_the_clock():
     assert after[10.0][0] > 0.1 * noise.prior[0] ** 2  # the payload may have been changed unseen
 
 
+def test_what_counts_as_nothing_is_in_proportion_to_the_arm():
+    """A force, a wrist's friction and a mass: 0.25 N, 3 mNm and 20 g for a Panda, a tenth for a tenth of it."""
+    tenth = replace(robot(), payload_max=(0.3, 0.15), tau_max=0.1 * robot().tau_max)
+    still = replace(truth(), phi=0.0 * truth().phi)
+    for r, share in ((robot(), 1.0), (tenth, 0.1)):
+        noise, arm = wrench_noise(r, still), make_arm_model(r, still)
+        assert noise.floor == pytest.approx(0.25 * share)
+        np.testing.assert_allclose(noise.friction - tuning.WRENCH_FRICTION * arm.level, 3e-3 * share)
+        estimator = Estimator(arm, default_noise(arm))
+        estimator.internals[0].P[:] = 0.0
+        for grams, seen in ((19.0, False), (21.0, True)):
+            estimator.internals[0].x[0] = 1e-3 * grams * share
+            assert estimator.payload.any() == seen
+
+
 def test_payload_limits_are_those_of_the_arm():
     """The configuration says them, else torque limits and reach do; a Panda's are 3 kg and 15 cm within a fifth."""
     assert robot().payload_max == (3.0, 0.15)
@@ -493,7 +510,8 @@ def test_payload_limits_are_those_of_the_arm():
     strong = load_robot(tau_max=[870.0, 870, 870, 870, 120, 120, 120])
     assert strong.payload_max[0] == pytest.approx(10 * load_robot().payload_max[0])
     heavy = replace(robot(), payload_max=(10.0, 0.3))
-    small, large = (default_noise(make_arm_model(r, truth())).prior[:BODY] for r in (robot(), heavy))
-    np.testing.assert_allclose(large[:4] / small[:4], [10 / 3, *[20 / 3] * 3])
+    small, large = (default_noise(make_arm_model(r, truth())) for r in (robot(), heavy))
+    np.testing.assert_allclose((large.prior / small.prior)[:4], [10 / 3, *[20 / 3] * 3])
+    assert (small.rest_drift, large.rest_drift) == pytest.approx((0.02, 0.02 * (10 / 3) ** 2))  # kg^2/s
     with pytest.raises(UserError, match=r"robot\.payload_max"):
         load_robot(payload_max=-1.0)

@@ -5,8 +5,9 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
+import pandas as pd
 import pytest
-from conftest import conf
+from conftest import ROOT, conf
 from omegaconf import OmegaConf
 
 from r2s.adaptation.adapters import AdapterContext, observer, rls
@@ -29,7 +30,7 @@ from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.payload import dynamics_with_payload, payload_of
 from r2s.physics.robot import SIM_DT, load_robot
-from r2s.stages.adapter_factory import make_adapter
+from r2s.stages.adapter_factory import free_recordings, make_adapter
 from r2s.tasks.reach import ReachTask
 
 PAYLOAD = payload_of({"mass": 1.0, "centre": [0.02, -0.01, 0.05]}, (3.0, 0.15))
@@ -319,3 +320,23 @@ def test_an_arm_that_stops_itself_stops_its_adapter():
     with pytest.raises(ArmStopped):
         run(loop, None)
     assert fails.cycles < 1000
+
+
+@pytest.mark.parametrize(
+    ("rate", "seconds", "why"), [(500, 6, ""), (125, 6, "200 Hz, got 125 Hz"), (500, 3, "5 s of")]
+)
+def test_the_recordings_of_a_calibration_are_read_as_its_config_says(tmp_path, capsys, rate, seconds, why):
+    """Named columns, joints in the order of the list; one too slow or too short is left out with a line."""
+    t, joints = np.arange(0, seconds, 1 / rate), [f"arm_{name}" for name in "gfedcba"]
+    q = PANDA.q_home + 0.2 * np.sin(t[:, None] + np.arange(7))
+    table = {"time": t} | {f"q_{name}": q[:, j] for j, name in enumerate(joints)}
+    table |= {f"tau_{name}": 1.0 + q[:, j] for j, name in enumerate(joints)}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    columns = {"t": "time"} | {x: [f"{x}_{name}" for name in joints] for x in ("q", "tau")} | {"dq": None}
+    data = conf("data/recording") | {"path": str(tmp_path / "log.csv"), "torque": "commanded", "columns": columns}
+    OmegaConf.save({"robot": OmegaConf.load(ROOT / "conf/robot/panda.yaml"), "data": data}, tmp_path / "config.yaml")
+    free = free_recordings(tmp_path)
+    assert len(free) == (not why)
+    assert why in capsys.readouterr().out
+    if free:
+        np.testing.assert_allclose(free[0].q, q, atol=1e-9)

@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -15,9 +16,12 @@ from r2s.errors import UserError
 from r2s.identification.contact.contact_file import load_contact, save_contact
 from r2s.identification.contact.estimate import Arm, identify_contact
 from r2s.identification.contact.exchange import linearized, mujoco_contact, sdf_surface
+from r2s.identification.contact.start import external_force
 from r2s.identification.contact.tip import TipMotion
+from r2s.identification.contact.validation import press_errors
 from r2s.identification.parameter_file import save_parameters
 from r2s.identification.parameters import ParameterEstimate
+from r2s.identification.residuals import torque_residual
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.surface import Surface, Tool
 from r2s.recordings.recording import Recording
@@ -81,6 +85,35 @@ def test_the_held_out_press_is_predicted(found):
     """The last place was not fitted: its force, loading and unloading, follows from the others."""
     assert found.validation.summary()["seconds"] > 1.0
     assert max(found.validation.rmse(side) for side in (-1.0, 1.0)) < 1.0
+
+
+def test_seconds_of_contact_do_not_depend_on_the_distance_of_rows(arm, recording, monkeypatch):
+    """A recording of hours has rows farther apart; here at 25 per second."""
+    seconds = []
+    for most in (torque_residual.MOST_ROWS, 25 * recording.duration):
+        monkeypatch.setattr(torque_residual, "MOST_ROWS", most)
+        torque = torque_residual.TorqueResidual(arm.space, recording)
+        seconds.append(torque.row_s * external_force(torque, arm.x)[2].sum())
+    assert seconds[0] == pytest.approx(seconds[1], rel=0.05)
+
+
+def test_the_moments_that_count_do_not_depend_on_the_size_of_the_force():
+    """All forces and torques times a hundred: the same moments, and errors times a hundred."""
+    rng, (T, n, scales) = np.random.default_rng(0), (200, 3, (1.0, 100.0))
+    depth, tau, error = rng.uniform(0, 1, T), rng.normal(size=(T, n)), rng.normal(size=(T, n))
+    kept, rows = [], np.ones((T, n), dtype=bool)
+    for scale in scales:
+        contact = lambda *_, f=scale: (f * tau * depth[:, None], f * depth, depth, depth)  # noqa: E731
+        problem = SimpleNamespace(
+            motion=SimpleNamespace(instants=np.arange(T), t=np.arange(T), filtered=lambda x: x),
+            tip=SimpleNamespace(contact_of=contact), space=SimpleNamespace(plane=lambda u: (u, u), law=lambda u: u),
+            error=scale * error, directions=np.zeros((T, n, 1)), best_arm=lambda u: np.zeros(1), rows=rows,
+            sigma=np.full((T, n), 0.05 * scale), torque=SimpleNamespace(row_s=0.01),
+        )  # fmt: skip
+        kept.append(press_errors(problem, np.zeros(8), [np.ones(T, dtype=bool)]))
+    assert 0 < len(kept[0].t) < T
+    np.testing.assert_array_equal(kept[0].t, kept[1].t)
+    assert kept[1].rmse() == pytest.approx(100 * kept[0].rmse())
 
 
 def test_a_seed_gives_the_same_surface(arm, recording, found):

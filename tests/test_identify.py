@@ -17,6 +17,7 @@ from r2s.errors import UserError
 from r2s.excitation.fourier import fourier
 from r2s.identification.friction.breakaway import SIDES
 from r2s.identification.friction.repeatability import certainty
+from r2s.identification.friction.stiction import choose_stiction
 from r2s.identification.identify import identify
 from r2s.identification.link_inertia import inertia_scale
 from r2s.identification.posterior import _inside, posterior
@@ -27,11 +28,12 @@ from r2s.identification.result import _settle
 from r2s.identification.search.least_squares import LeastSquares
 from r2s.identification.settings import Settings
 from r2s.identification.terms import search_space
-from r2s.physics.dynamics import nominal_dynamics
+from r2s.physics.dynamics import STICTION_MODELS, nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.recordings.ramps import Ramps
 from r2s.recordings.readers import read
 from r2s.recordings.recording import Recording
+from r2s.reporting.identification.tables import error_tables
 
 ARM = """
 <mujoco model="threelink">
@@ -256,6 +258,19 @@ def test_the_truth_predicts_to_within_sensor_noise(arm, truth, wrong, motion):
     errors = prediction_errors(arm, wrong, truth, motion, **WINDOW)
     assert max(errors["position_rmse_mrad"]) < 2.0
     assert errors["ee_error_mm"]["0.1"] < 0.5
+
+
+def test_motion_in_blocks_shorter_than_a_replay_leaves_its_entries_out(arm, truth, wrong, motion):
+    """As a held-out phase of a period of 1 s: torque and the shorter horizon count, and stiction stays as it is."""
+    blocks = motion.select(motion.t % 0.5 < 0.35)
+    errors = prediction_errors(arm, wrong, truth, blocks, **WINDOW)
+    assert set(errors["ee_error_mm"]) == {"0.1"}
+    assert "position_rmse_mrad" not in errors
+    assert "open-loop position RMSE, mrad" not in error_tables(arm, {"validation": errors})
+    for largest in (None, 1.5):
+        kept = choose_stiction(arm, truth, blocks, largest, print, window_s=0.4, stride=10, nthread=1)
+        assert STICTION_MODELS[int(kept["model"])] == truth.stiction_model
+        np.testing.assert_array_equal(kept["breakaway"], truth.breakaway)
 
 
 def test_a_replay_without_noise_is_the_recording(arm, truth):

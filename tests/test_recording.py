@@ -158,6 +158,19 @@ def test_gaps_split_and_lone_rows_go():
     assert "t must be in seconds" in message(sine(np.arange(50) * 1e6).split_at_gaps, 0.05)
 
 
+@pytest.mark.parametrize("rate", [10, 20, 30, 60, 1000])
+def test_a_lost_frame_is_no_pause_and_a_second_is_one(rate):
+    """At any rate of the log, with a clock that is rounded; a limit of the user's counts up to round-off."""
+    t = 7.3 + np.arange(5 * rate) / rate
+    t = np.delete(t, [2 * rate])
+    assert len(sine(t).split_at_gaps().stretches) == 1
+    t[3 * rate :] += 1.0
+    assert len(sine(t).split_at_gaps().stretches) == 2
+    whole = sine(7.3 + np.arange(5 * rate) / rate)
+    assert len(whole.split_at_gaps(1 / rate).stretches) == 1
+    assert "t must be in seconds" in message(sine(1e3 * np.arange(50) / 1e3).split_at_gaps)
+
+
 def test_resample_keeps_to_the_logged_clock_and_to_its_trajectory():
     t = jittered_time()
     r = sine(t, trajectory=np.arange(len(t)) // 1000)
@@ -416,7 +429,7 @@ def test_missing_velocity_is_derived_on_the_logged_time_of_each_trajectory(tmp_p
         got = read(write(tmp_path / "log.csv", table), torque="measured", columns=columns)
         assert len(got.stretches) == 2
         assert np.abs(got.dq - r.dq).max() < 0.01 * OMEGA
-    whole = read(tmp_path / "log.csv", torque="measured", max_gap_s=None)
+    whole = read(tmp_path / "log.csv", torque="measured", max_gap_s=np.inf)
     assert len(whole.stretches) == 1
     assert "no column 'speed' for dq" in message(
         read, tmp_path / "log.csv", torque="measured", columns={"dq": "speed"}

@@ -12,6 +12,7 @@ from test_identify import ARM, TORQUE, run
 from test_motor import recorded
 
 from r2s.identification.parameters import logarithmic, sizes
+from r2s.identification.terms import blocks_of
 from r2s.physics.actuation import Motors
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
 from r2s.physics.friction import COULOMB, FAMILIES
@@ -119,8 +120,8 @@ def test_another_family_keeps_the_viscous_part(family):
         np.testing.assert_allclose(family.torque(np.full(1, 2.0), other), 7.0, rtol=1e-6)
 
 
-def driven(robot, truth, every, seconds=5.0):
-    """Return a recording of commands that change every `every` ms, logged when they do."""
+def driven(robot, truth, every, seconds=5.0, share=(1.0, 1.0, 1.0)):
+    """Return a recording of commands that change every `every` ms, logged when they do; share: of the motion."""
     sim, motors = Simulator(robot, truth, 1, 1), Motors(1, robot.n, truth.delay, truth.lag)
     model, data = robot.model(gravity=False), None
     data, t = mujoco.MjData(model), 1e-3 * np.arange(round(1e3 * seconds))
@@ -130,7 +131,7 @@ def driven(robot, truth, every, seconds=5.0):
         q[k], dq[k] = sim.q[0], sim.dq[0]
         if k % every == 0:
             wave = 0.2 / np.sqrt([1, 2, 4])[:, None] * np.sin(w * now + phase)
-            data.qpos, data.qvel, data.qacc = q[k], dq[k], 100 * (wave.sum(0) - q[k]) - 10 * dq[k]
+            data.qpos, data.qvel, data.qacc = q[k], dq[k], 100 * (share * wave.sum(0) - q[k]) - 10 * dq[k]
             mujoco.mj_inverse(model, data)
             command = data.qfrc_inverse.copy()
         tau[k] = command
@@ -146,6 +147,19 @@ def test_the_delay_of_a_command_does_not_depend_on_the_rate_of_the_log(arm, ever
     truth = replace(Dynamics.of(robot, np.array([0.02, 0.0, 0.01]) * robot.tau_max[:, None], COULOMB), delay=2e-3)
     found = found_in(robot, driven(robot, truth, every), terms=["offset", "delay"])
     assert 1e3 * float(found.dynamics.delay) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_joint_at_rest_has_no_say_in_family_and_terms(arm):
+    """No candidate enters that the arm lacks, and the family is that of the arm: a resting joint has no error."""
+    robot, candidates = arm(1.0), conf("identify/default")["candidate_terms"]["commanded"]
+    phi = np.array([[0.02, 0.0, 0.01], [0.02, 0.0, 0.01], [0.2, 0.0, 0.01]]) * robot.tau_max[:, None]
+    truth = Dynamics.of(robot, phi, COULOMB)
+    recording = driven(robot, truth, 1, 8.0, share=np.array([1.0, 1.0, 0.0]))
+    assert np.ptp(recording.q[:, 2]) < 1e-3
+    found = found_in(robot, recording, family="auto", candidate_terms=candidates)
+    assert found.dynamics.family == COULOMB
+    assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
 
 
 def test_commands_between_the_rows_of_a_slow_log():

@@ -9,12 +9,12 @@ from r2s.physics.robot import SIM_DT
 
 
 @njit(cache=True, error_model="numpy")
-def detect(threshold, state):
+def detect(threshold, floor, state):
     """Compare the force with what its variance explains; a contact ends in motion only: friction hides it at rest."""
     x, P, contact = state.x, state.P, state.contact
-    floor = tuning.FORCE_FLOOR**2
-    a, b, c = P[0, 0] + floor, P[1, 0], P[2, 0]
-    d, e, f = P[1, 1] + floor, P[2, 1], P[2, 2] + floor
+    square = floor**2
+    a, b, c = P[0, 0] + square, P[1, 0], P[2, 0]
+    d, e, f = P[1, 1] + square, P[2, 1], P[2, 2] + square
     l21, l31 = b / a, c / a  # L D L^T of the force's covariance
     d2 = d - l21 * b
     l32 = (e - l31 * b) / d2

@@ -17,7 +17,7 @@ from r2s.adaptation.kalman import AT_REST, Filter, Noise, pause, update
 from r2s.adaptation.momentum import BODY
 from r2s.adaptation.momentum_residual import MomentumResidual, ResidualState, update_residual
 from r2s.adaptation.payload_jump import JUMP, MEAN, apply_jump
-from r2s.adaptation.tuning import FRICTION_CURVE, LEAST_KG, REPLACED, REST_SPANS, SETTLING_SPANS, THRESHOLD
+from r2s.adaptation.tuning import FRICTION_CURVE, LEAST_MASS, REPLACED, REST_SPANS, SETTLING_SPANS, THRESHOLD
 from r2s.errors import UserError
 from r2s.identification.posterior import Z_95
 from r2s.physics.robot import SIM_DT
@@ -57,6 +57,7 @@ class Estimator:
 
     def __init__(self, arm: ArmModel, noise: Noise):
         self._arm, self._noise, self._n = arm, noise, len(arm.level)
+        self._least = LEAST_MASS * float(arm.payload_max[0])  # kg
         self.changes: list[float] = []
         self.held = False
         self._filter = Filter.fresh(noise)
@@ -136,7 +137,7 @@ class Estimator:
     def payload(self) -> np.ndarray:
         """(10,), the payload's inertial parameters in the payload frame; zeros if its mass is not significant."""
         x = self._filter.x[:BODY]
-        return x.copy() if x[0] > max(Z_95 * np.sqrt(self._filter.P[0, 0]), LEAST_KG) else np.zeros(BODY)
+        return x.copy() if x[0] > max(Z_95 * np.sqrt(self._filter.P[0, 0]), self._least) else np.zeros(BODY)
 
     @property
     def internals(self) -> tuple[Filter, ResidualState, MomentumResidual]:
@@ -147,9 +148,9 @@ class Estimator:
         x, P, n = self._filter.x, self._filter.P, self._n
         half = Z_95 * np.sqrt(np.maximum(np.diag(P), 0.0))
         mass, centre, tensor = nearest_body(x[:BODY])
-        of_centre = np.column_stack([-centre, np.eye(3)]) / max(mass, LEAST_KG)
+        of_centre = np.column_stack([-centre, np.eye(3)]) / max(mass, self._least)
         spread = Z_95 * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", of_centre, P[:4, :4], of_centre), 0.0))
-        heavy = mass > max(half[0], LEAST_KG)
+        heavy = mass > max(half[0], self._least)
         return Estimate(
             cycle=self._cycle,
             t=self._t,

@@ -39,7 +39,9 @@ PAYLOAD_MASS, PAYLOAD_CENTRE, PAYLOAD_TENSOR = 0.5 / np.sqrt(3), 0.5 / np.sqrt(5
 WARMED = 0.07  # share of friction that may have changed by temperature since the identification
 FRICTION_DRIFT = 0.007  # 1/sqrt(s): 7 % in 100 s
 OFFSET_DRIFTED, OFFSET_DRIFT = 0.02, 0.003  # of the friction level; per sqrt(s)
-REST_DRIFT = 0.02  # kg^2/s: after 1 s the mass interval spans what stiction hides, b / (r g), 0.1 to 0.25 kg
+# 1/s, of the largest payload's square: after 1 s the mass interval spans what stiction hides, b / (r g), 0.1 to
+# 0.25 kg of a Panda's 3 kg, 0.02 kg^2/s
+REST_DRIFT = 0.02 / 3.0**2
 PAYLOAD_DRIFT = 0.003  # 1/sqrt(s), share of the payload's prior
 NOISE_ADAPTATION = 0.04  # per span: persistent innovations become noise within 0.5 s
 CORRELATION_S = 0.3  # s, of the model error
@@ -68,7 +70,7 @@ SETTLING_SPANS = round(0.5 / T)  # spans of motion after a rest, in which the pa
 REPLACED = 2.0 * chi2.isf(T / 3600.0, 4)
 
 # reported estimate (estimator.py)
-LEAST_KG = 0.02  # kg: no centre is reported for a smaller mass
+LEAST_MASS = 0.02 / 3.0  # of the largest payload, 0.02 kg of a Panda's 3 kg: no centre of a smaller mass is reported
 FRICTION_CURVE = 0.02  # share of friction: error of its speed dependence, which one factor cannot follow
 
 # feedforward (feedforward.py)
@@ -91,7 +93,8 @@ MOMENTUM_NOISE = 1.33  # of the speed noise: white noise of momenta from filtere
 # 1/s, of the high-pass of momenta; 1/s, of its mean square; times that: noise of momenta on vibrating gears
 SHAKE_BAND, SHAKE_RATE, SHAKE_SHARE = 150.0, 20.0, 2.0
 FRICTION_NOISE_S = 0.02  # s, correlation of the friction model's error
-WRENCH_FRICTION = 0.03  # of the friction level
+# of the friction level; of the least tau_max, 3 mNm for a Panda's wrist of 12 Nm
+WRENCH_FRICTION, LEAST_FRICTION = 0.03, 3e-3 / 12.0
 INERTIA_SHARE = 0.05  # of a joint's net torque: error of the inertia
 STIFFNESS = 4e4  # N/m, of what may be touched: force per motion of the tip
 FORCE_RATE, FORCE_RATE_S = 25.0, 0.03  # N/s and s: the most that this makes a force change, and its correlation
@@ -101,7 +104,8 @@ EDGE_SHARE = 0.7  # per cycle: friction of a resting joint beyond its edge is pu
 CREEP_SHARE = 0.3  # of the force variance that a creeping tip makes in a stiff environment
 MOMENT_ARM = 0.1  # m, of a force on an arm without a tool: scale of its moment
 FREE_FORCE = 0.1  # N, at the beginning of a motion
-FORCE_FLOOR = 0.25  # N, per axis: what the filter's covariance does not know
+# N per kg of the largest payload, per axis, 0.25 N for a Panda's 3 kg: what the filter's covariance does not know
+FORCE_FLOOR = 0.25 / 3.0
 CONFIRMED, RELEASED = 15, 50  # cycles above and below, after which a contact begins and ends
 RELEASE = 0.25  # of the threshold
 BLOCK_S, TAIL = 0.5, 0.2  # s, one maximum each; share of the largest maxima that give the tail

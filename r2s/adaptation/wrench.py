@@ -22,7 +22,7 @@ from scipy.stats import chi2
 from r2s.adaptation import tuning
 from r2s.adaptation.arm_model import make_arm_model
 from r2s.adaptation.estimator import Estimate, Estimator
-from r2s.adaptation.offline_estimation import at_rate, pauses
+from r2s.adaptation.offline_estimation import LEAST_HZ, at_rate, pauses
 from r2s.adaptation.wrench_filter import update_wrench
 from r2s.adaptation.wrench_state import HANGING, REST, SQUARE, TOUCHES, WrenchNoise, WrenchState
 from r2s.errors import UserError
@@ -33,6 +33,7 @@ from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.recording import Recording
 
 GAUSSIAN = float(chi2.isf(tuning.ALARMS_PER_HOUR * SIM_DT / 3600.0, 3))  # threshold of independent normal errors
+BLOCK, LEAST_BLOCKS = round(tuning.BLOCK_S / SIM_DT), 10  # rows of a block; blocks whose tail gives a threshold
 
 
 class WrenchObserver:
@@ -141,13 +142,13 @@ class WrenchObserver:
 def wrench_noise(robot: Robot, dynamics: Dynamics) -> WrenchNoise:
     """Return the uncertainty of an identified arm."""
     arm = make_arm_model(robot, dynamics)
-    friction = tuning.WRENCH_FRICTION * arm.level + 3e-3  # Nm: a wrist's
+    friction = tuning.WRENCH_FRICTION * arm.level + tuning.LEAST_FRICTION * robot.tau_max.min()
     edges = np.array(dynamics.breakaway, dtype=float)
     measured = np.abs(edges).max(1) > 0.0
     edges = np.where(measured[:, None], edges, np.column_stack([-arm.breakaway, arm.breakaway]))
     presliding = arm.presliding if "presliding" in dynamics.family.names else np.zeros(robot.n)
-    sensors = tuning.SPEED_NOISE, tuning.ANGLE_NOISE
-    return WrenchNoise(friction, np.ascontiguousarray(edges), presliding, tuning.INERTIA_SHARE, *sensors)
+    rest = tuning.INERTIA_SHARE, tuning.SPEED_NOISE, tuning.ANGLE_NOISE, tuning.FORCE_FLOOR * robot.payload_max[0]
+    return WrenchNoise(friction, np.ascontiguousarray(edges), presliding, *rest)
 
 
 def observe_recording(
@@ -203,20 +204,29 @@ def contacts(table: pd.DataFrame) -> list[dict[str, float]]:
     ]
 
 
+def unfit_for_threshold(free: Sequence[Recording]) -> str | None:
+    """Return why recordings without contact give no `contact_threshold`, too slow or too short; None if they do."""
+    if slow := [r.rate_hz for r in free if r.rate_hz < LEAST_HZ]:
+        return f"expected recordings of at least {LEAST_HZ:g} Hz, got {min(slow):.0f} Hz"
+    rows = [sum(int(np.ptp(r.t[s]) / SIM_DT + 1e-6) + 1 for s in r.stretches) for r in free]
+    if sum(count // BLOCK for count in rows) < LEAST_BLOCKS:
+        return f"expected at least {LEAST_BLOCKS * tuning.BLOCK_S:g} s of motion without contact"
+    return None
+
+
 def contact_threshold(robot: Robot, observer: WrenchObserver, free: Sequence[Recording]) -> float:
     """Return the threshold for one false alarm an hour, from recordings without contact.
 
     Raises:
-        UserError: the recordings are shorter than 5 s.
+        UserError: the recordings are shorter than 5 s, or of less than 200 Hz.
     """
-    block = round(tuning.BLOCK_S / SIM_DT)
+    if why := unfit_for_threshold(free):
+        raise UserError(f"contact threshold: {why}")
     maxima = []
     for recording in free:
         squares = observe_recording(robot, observer, recording)["square"]
         square = squares.rolling(tuning.CONFIRMED).min().fillna(0.0).to_numpy()
-        maxima += [square[k : k + block].max() for k in range(0, len(square) - block + 1, block)]
-    if len(maxima) < 10:
-        raise UserError(f"contact threshold: expected at least {10 * tuning.BLOCK_S:g} s of motion without contact")
+        maxima += [square[k : k + BLOCK].max() for k in range(0, len(square) - BLOCK + 1, BLOCK)]
     level = np.quantile(maxima, 1.0 - tuning.TAIL)
     excess = np.mean([m - level for m in maxima if m >= level])
     blocks_per_hour = 3600.0 / tuning.BLOCK_S

@@ -87,7 +87,7 @@ def update_wrench(arm, tip, noise, threshold, state, q, dq, tau):
         _predict(noise, state)
         _measure(state)
     _keep_within_edges(noise, state)
-    detect(threshold, state)
+    detect(threshold, noise.floor, state)
     weigh(arm, state)
     counts[CYCLE] += 1
     state.commands[counts[COMMAND] % SLOTS] = tau

@@ -23,7 +23,7 @@ MOTOR, MOTOR_MEAN, MOMENTUM_NOISE, DEFLECTION, SLOW_P, FAST_P, SHAKE, ROWS = ran
 
 
 class WrenchNoise(NamedTuple):
-    """Uncertainty of n joints' friction, and the sensors' noise."""
+    """Uncertainty of n joints' friction, the sensors' noise, and the error of the force."""
 
     friction: np.ndarray  # (n,) Nm, standard deviation of the friction model of a sliding joint
     edges: np.ndarray  # (n, 2) Nm, negative and positive breakaway edge, of all torques but friction
@@ -31,6 +31,7 @@ class WrenchNoise(NamedTuple):
     inertia: float  # error of the inertia: share of a joint's net torque
     speed: float  # rad/s, white noise of measured speeds
     angle: float  # rad, of measured angles
+    floor: float  # N, per axis: what the covariance of the force does not know
 
 
 class WrenchState(NamedTuple):

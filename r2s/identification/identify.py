@@ -28,7 +28,7 @@ from r2s.identification.prediction import REPLAYED_S
 from r2s.identification.problem import Problem, Report, Search, fits_torque, implicit_friction
 from r2s.identification.residuals.replay_residual import ReplayResidual
 from r2s.identification.residuals.torque_residual import TorqueResidual
-from r2s.identification.residuals.windows import cut_windows
+from r2s.identification.residuals.windows import SCATTER, cut_windows
 from r2s.identification.result import IdentificationResult, conclude
 from r2s.identification.settings import Settings
 from r2s.identification.stated import check_stated, stated_prior
@@ -229,7 +229,10 @@ def formulate(s: State) -> State:
     # replays start from unknown bristle deflections, which would spoil a good torque fit of a family with memory
     if s.commanded and not all(map(fits_torque, s.searches)) and not (memory and fits_torque(s.searches[0])):
         slowest = 0.0 if memory else CLEAR * s.nominal.dq_min  # bristles have no dead zone
-        released = None if edges is None else np.where(np.isnan(edges.command), [-np.inf, np.inf], edges.command)
+        released = None
+        if edges is not None:
+            scattered = edges.command + SCATTER * s.robot.tau_max.max() * np.array([-1.0, 1.0])
+            released = np.where(np.isnan(scattered), [-np.inf, np.inf], scattered)
         replayed = spread(s.recording, REPLAYED_S)
         windows = cut_windows(replayed, how.window_s, slowest=slowest, edges=released)
         batch = min(len(space.start) + 1, MAX_BATCH)

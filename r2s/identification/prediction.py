@@ -31,7 +31,8 @@ def prediction_errors(
     """Return one side of summary.json: torque RMSE per joint and, for commanded torque, open-loop errors.
 
     position_rmse_mrad is over replays of `window_s`; ee_error_mm is the mean end-effector distance after each of the
-    HORIZONS that the trajectories reach. Of a long recording, parts that are spread over it count.
+    HORIZONS that the trajectories reach. Of a long recording, parts that are spread over it count. Without a
+    trajectory as long as `window_s` there is no position_rmse_mrad.
     """
     space = parameter_space(robot, identified, {"offset": [-1.0, 1.0]})
     scored, sides = spread(recording, SCORED_S, SCORED_EACH_S), {"": identified, "nominal_": nominal}
@@ -42,10 +43,14 @@ def prediction_errors(
     if recording.torque != "commanded":
         return out
     recording = spread(recording, REPLAYED_S)
-    windows = cut_windows(recording, window_s)
+    try:
+        windows = cut_windows(recording, window_s)
+    except UserError:  # such as blocks of phase of a short period
+        windows = None
     for name, dynamics in sides.items():
-        error = replay(robot, dynamics, windows, nthread) - windows.q
-        out[f"{name}position_rmse_mrad"] = (1e3 * np.sqrt((error**2).mean((0, 1)))).tolist()
+        if windows is not None:
+            error = replay(robot, dynamics, windows, nthread) - windows.q
+            out[f"{name}position_rmse_mrad"] = (1e3 * np.sqrt((error**2).mean((0, 1)))).tolist()
         out[f"{name}ee_error_mm"] = open_loop_error(robot, dynamics, recording, nthread)
     return out
 

@@ -25,7 +25,7 @@ INFO = "meta/info.json"
 VERSION = "v3.0"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 QUANTILES = (1, 10, 50, 90, 99)  # %, of lerobot's stats.json
-CLOCK_TOLERANCE = 1e-4  # s, lerobot's own between a timestamp and frame_index / fps
+CLOCK_TOLERANCE = 1e-4  # s, lerobot's own between a timestamp, float32, and frame_index / fps
 FILE = "chunk-000/file-000.parquet"
 WORDS = {  # of a feature's or an element's name -> field
     **dict.fromkeys(("effort", "efforts", "torque", "torques", "tau"), "tau"),
@@ -81,7 +81,7 @@ def lerobot_table(folder: Path) -> Table:
     time = f"the clock is nominal: frame_index / {info['fps']:g} Hz"
     if clock:
         stamp = np.array(frame["timestamp"].tolist(), dtype=float).ravel()
-        if np.abs(stamp - table["t"]).max() > CLOCK_TOLERANCE:
+        if np.any(np.abs(stamp - table["t"]) > np.maximum(CLOCK_TOLERANCE, np.spacing(stamp.astype(np.float32)))):
             table["t"], time = stamp, "the clock is the dataset's timestamp"
     for field, places in read.items():
         table[field] = np.stack([values[x][:, k] * factor for x, k, factor in (places[j] for j in joints)], axis=1)

@@ -10,6 +10,7 @@ import numpy as np
 from r2s.errors import UserError, nearest
 from r2s.recordings import readers
 from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, find_columns, listed
+from r2s.recordings.gaps import longest_step
 from r2s.recordings.readers import Options, scalar
 from r2s.recordings.recording import FIELDS, Recording, save_npz
 from r2s.recordings.robot_logs import Table
@@ -64,7 +65,7 @@ def read_ramps(
     *,
     columns: Mapping[str, Spec] | None = None,
     n_joints: int | None = None,
-    max_gap_s: float = 0.05,
+    max_gap_s: float | None = None,
 ) -> Ramps:
     """Read ramps from a file of `Ramps.save`, or from a log in any format of `readers.read`.
 
@@ -76,7 +77,7 @@ def read_ramps(
         path: the file.
         columns: names in the file, see `readers.read`.
         n_joints: expected number of joints.
-        max_gap_s: a longer pause in time separates ramps.
+        max_gap_s: a longer pause in time separates ramps; None: see `longest_step`.
 
     Raises:
         UserError: no such file, a file without ramps, or a joint or sign that contradicts the command.
@@ -98,7 +99,9 @@ def _saved(table: Table) -> Ramps:
     return Ramps(motion, table["joint"], table["sign"], table["pose"])
 
 
-def _from_columns(table: Table, columns: dict[str, Spec], n_joints: int | None, gap: float, name: str) -> Ramps:
+def _from_columns(
+    table: Table, columns: dict[str, Spec], n_joints: int | None, gap: float | None, name: str
+) -> Ramps:
     """Return the ramps in the columns of a log."""
     for field in ("joint", "sign"):
         if field not in table:
@@ -116,11 +119,10 @@ def _from_columns(table: Table, columns: dict[str, Spec], n_joints: int | None, 
     for mark in marks:
         cut[1:] |= mark[1:] != mark[:-1]
     steps = np.diff(t)
-    if len(steps) and np.median(steps) > gap:
-        raise UserError(f"t must be in seconds: its median step is {np.median(steps):g}, max_gap_s is {gap:g}")
+    longest = longest_step(steps, gap)
     ramp = np.cumsum(cut)
     joint, sign = (_per_row(field, table[field], ramp) for field in ("joint", "sign"))
-    cut[1:] |= steps > gap
+    cut[1:] |= steps > longest
     trajectory = np.cumsum(cut)
     rows = np.bincount(trajectory)[trajectory] > 1  # a single row has no motion
     dropped = ("joint", "sign", *DEFAULT_COLUMNS["trajectory"])

@@ -33,7 +33,7 @@ class Options:
     torque: str | None
     columns: Mapping[str, Spec]
     n_joints: int | None = None
-    max_gap_s: float | None = None
+    max_gap_s: float | None = np.inf
     period: float | None = None
     name: str = ""
     torque_constant: np.ndarray | None = None
@@ -49,7 +49,7 @@ def read(
     torque: str | None,
     columns: Mapping[str, Spec] | None = None,
     n_joints: int | None = None,
-    max_gap_s: float | None = 0.05,
+    max_gap_s: float | None = None,
     period: float | None = None,
     name: str | None = None,
     topic: str | None = None,
@@ -69,7 +69,7 @@ def read(
             q1 q2 ..., q_1 q_2 ... or q[1] q[2] ..., from 1 or 0. `{j}` (from 1) or `{i}` (from 0) in a name is the
             joint number; a list names the joints one by one. In HDF5 a name is a path: robot/q.
         n_joints: expected number of joints.
-        max_gap_s: a longer pause in time begins a new trajectory; None: no splitting.
+        max_gap_s: a longer pause in time begins a new trajectory; None: see `longest_step`; inf: no splitting.
         period: s, see `Recording`.
         name: of the recording; the default is the file's.
         topic: of a bag, see `bag_table`.
@@ -142,7 +142,7 @@ def from_table(table: Table, how: Options) -> Recording:
         x.flags.writeable = False  # `Recording` need not copy arrays that do not change
     recording = Recording(**arrays, torque=torque, period=period, name=name, signals=signals)  # type: ignore[arg-type]
     recording = replace(recording, notes=tuple(repairs), command_period=held)
-    if how.max_gap_s is not None and not saved:
+    if how.max_gap_s != np.inf and not saved:
         recording = recording.split_at_gaps(how.max_gap_s)
     if repair:
         recording = _without_holds(recording)

@@ -11,6 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from r2s.errors import UserError, choices, nearest
 from r2s.files import atomic_write
+from r2s.recordings.gaps import longest_step
 from r2s.recordings.periodicity import TOLERANCE, find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
@@ -150,18 +151,15 @@ class Recording:
         cut = (np.diff(rows) != 1) | (np.diff(self.trajectory[rows]) != 0)
         return self.rows(rows, np.concatenate([[0], np.cumsum(cut)])[: len(rows)])
 
-    def split_at_gaps(self, max_gap_s: float) -> "Recording":
-        """Start a new trajectory after each pause longer than `max_gap_s`; drop rows with a gap on both sides."""
-        _positive("max_gap_s", max_gap_s, "s")
+    def split_at_gaps(self, max_gap_s: float | None = None) -> "Recording":
+        """Start a new trajectory after each pause; drop rows with one on both sides. See `longest_step`."""
+        if max_gap_s is not None:
+            _positive("max_gap_s", max_gap_s, "s")
         steps = self._steps()
-        if len(steps) and np.median(steps) > max_gap_s:
-            raise UserError(
-                f"most steps in time are longer than max_gap_s={max_gap_s:g} (median {np.median(steps):g}): "
-                "t must be in seconds; if it is, raise max_gap_s"
-            )
-        if not np.any(steps > max_gap_s):
+        longest = longest_step(steps, max_gap_s)
+        if not np.any(steps > longest):
             return self
-        cut = (np.diff(self.t) > max_gap_s) | (np.diff(self.trajectory) != 0)
+        cut = (np.diff(self.t) > longest) | (np.diff(self.trajectory) != 0)
         trajectory = np.concatenate([[0], np.cumsum(cut)])
         return self.rows(np.arange(len(self.t)), trajectory, drop_lone=True)
 

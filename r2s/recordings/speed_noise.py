@@ -1,6 +1,6 @@
 """Noise of an arm's velocity measurement, estimated from a recording; training adds it to the observations."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -10,15 +10,17 @@ from r2s.recordings.parts import spread
 from r2s.recordings.recording import Recording
 
 HALF_S = 0.02  # s, half window of the Savitzky-Golay cubic: position noise of 1e-5 rad leaves 3e-4 rad/s
+MAX_HALF_S = 0.05  # s, half window of coarse recordings: swings of 1 Hz change its slope by 0.1 %
 PIECE_S = 0.05  # s, length of the pieces among which the calm ones are chosen
 CALM = 0.1  # share of the pieces that counts: those with the smallest acceleration
 LONGEST_S = 600.0  # s of a recording that are used
 MAX_NOISE = 1.0  # rad/s, more than any velocity sensor adds
 MIN_ROWS = 8  # samples that a cubic needs to give a velocity
+UNEVEN = 0.25  # of the median step: a step that differs by more ends a piece, as where a sample was lost
 
 
 def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
-    """Return the standard deviation of the velocity noise (n,) rad/s; 0 if the sampling is too coarse.
+    """Return the standard deviation of the velocity noise (n,) rad/s; 0 if the sampling is too coarse, below 80 Hz.
 
     The reference velocity is the slope of a cubic through the positions (Savitzky and Golay, Analytical Chemistry
     36(8), 1964). At low acceleration that slope is accurate, and a delay of the velocity filter has no effect. So the
@@ -30,13 +32,11 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
     found: list[tuple[np.ndarray, np.ndarray]] = []
     joints = recordings[0].n_joints
     for recording in (spread(r, LONGEST_S) for r in recordings):
-        for rows in recording.stretches:
+        for rows in even(recording):
             t, q, dq = recording.t[rows], recording.q[rows], recording.dq[rows]
-            if len(t) < MIN_ROWS:
-                continue
             step = (t[-1] - t[0]) / (len(t) - 1)
-            half, piece = round(HALF_S / step), round(PIECE_S / step)
-            if 2 * half < MIN_ROWS or len(t) < 2 * half + 1 + piece or np.ptp(np.diff(t)) > 0.5 * step:
+            half, piece = max(round(HALF_S / step), MIN_ROWS // 2), max(round(PIECE_S / step), 1)
+            if half * step > MAX_HALF_S or len(t) < 2 * half + 1 + piece:
                 continue
             slope, curvature = (savgol_filter(q, 2 * half + 1, 3, deriv=k, delta=step, axis=0) for k in (1, 2))
             count = (len(t) - 2 * half) // piece
@@ -55,3 +55,16 @@ def speed_noise(recordings: Sequence[Recording]) -> np.ndarray:
             f"{MAX_NOISE:g} is allowed: is dq in rad/s, and in the order of q?"
         )
     return noise
+
+
+def even(recording: Recording) -> Iterator[slice]:
+    """Yield the rows of a recording in pieces of at least MIN_ROWS rows with even steps."""
+    for rows in recording.stretches:
+        steps = np.diff(recording.t[rows])
+        if len(steps) < MIN_ROWS:
+            continue
+        usual = np.median(steps)
+        cuts = np.flatnonzero(np.abs(steps - usual) > UNEVEN * usual) + 1
+        for piece in np.split(np.arange(rows.start, rows.stop), cuts):
+            if len(piece) >= MIN_ROWS:
+                yield slice(int(piece[0]), int(piece[-1]) + 1)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from r2s.errors import UserError
 from r2s.stages.build import part, plain
-from r2s.stages.run_config import loaded, modules
+from r2s.stages.run_config import checked, loaded, modules
 
 RECORDINGS = ("train.npz", "validation.npz")  # of an identification
 PARAMETERS = "parameters.yaml"
@@ -29,16 +29,49 @@ def calibrated(calibration, robot, trust=()):
 
 
 def free_recordings(calibration):
-    """Return the recordings without contact that an identification was made from, if they still exist."""
+    """Return the recordings without contact that an identification was made from, if they still exist.
+
+    They are read as stage=identify read them. Recordings that give no contact threshold are left out, with a line.
+    """
+    from r2s.adaptation.wrench import unfit_for_threshold
     from r2s.recordings.readers import read
 
     folder = run_folder(calibration)
     paths = [folder / name for name in RECORDINGS]
-    if not all(path.is_file() for path in paths):
-        data = loaded(folder / "config.yaml").get("data") or {} if (folder / "config.yaml").is_file() else {}
-        given = [data.get(key) for key in ("path", "validation")] if data.get("torque") == TORQUE else []
-        paths = [Path(p) for p in given if isinstance(p, str)]
-    return [read(path, torque=TORQUE) for path in paths if path.is_file()]
+    try:
+        if all(path.is_file() for path in paths):
+            free = [read(path, torque=TORQUE) for path in paths]
+        else:
+            free = _given_recordings(folder)
+        why = unfit_for_threshold(free) if free else None
+    except UserError as error:
+        free, why = [], str(error)
+    if why:
+        print(f"contact threshold: {why} (of {folder}); the default counts, for an arm without recordings")
+    return [] if why else free
+
+
+def _given_recordings(folder):
+    """Return the recordings of commanded torque in the files of a run of stage=identify, without a payload.
+
+    Raises:
+        UserError: a file cannot be read as the run's config says.
+    """
+    from omegaconf import OmegaConf
+
+    from r2s.stages.build import make_robot
+    from r2s.stages.data import read_file
+    from r2s.stages.recordings import recording_files
+
+    path = folder / "config.yaml"
+    cfg = loaded(path) if path.is_file() else OmegaConf.create()
+    if OmegaConf.select(cfg, "data.kind") != "recording" or not OmegaConf.select(cfg, "data.path"):
+        return []
+    cfg = checked(OmegaConf.masked_copy(cfg, ["robot", "data"]), path)
+    files = [file for key in ("path", "validation") for file in recording_files(cfg, key)]
+    files = [f for f in files if f.torque in (None, TORQUE) and f.payload is None and Path(f.path).exists()]
+    robot = make_robot(cfg) if files else None
+    return [r for r in (read_file(robot, file, file.path) for file in files) if r.torque == TORQUE]
 
 
 def with_declared_payload(cfg, robot, dynamics):

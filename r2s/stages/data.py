@@ -94,7 +94,7 @@ class FileData:
     validation: str | None
     ramps: str | None
     period: float | None
-    max_gap_s: float
+    max_gap_s: float | None
     columns: dict[str, str | None]
     topic: str | None
     joints: list[str] | None
@@ -106,7 +106,8 @@ class FileData:
     payload: Any = None
 
     def __post_init__(self):
-        check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
+        if self.max_gap_s is not None:
+            check_number("data.max_gap_s", self.max_gap_s, "(0, inf)")
         if self.period is not None:
             check_number("data.period", self.period, "(0, inf)")
         if self.command_hz is not None:

@@ -10,7 +10,7 @@ from r2s.identification.arm_uncertainty import Arm
 from r2s.identification.contact.problem import SLOWEST, ContactProblem, contact_problem
 from r2s.identification.contact.start import LEAST_S, first_guesses
 from r2s.identification.contact.surface_space import LOWER, NAMES, UPPER, WIDTH
-from r2s.identification.contact.validation import ROWS_HZ, Press, press_errors, presses
+from r2s.identification.contact.validation import Press, press_errors, presses
 from r2s.identification.posterior import posterior
 from r2s.identification.result import SHARPER
 from r2s.physics.surface import UNIT_DEPTH, Surface
@@ -118,8 +118,8 @@ def refined(problem: ContactProblem, u: np.ndarray) -> tuple[ContactProblem, np.
 
 def _check(problem: ContactProblem, u: np.ndarray) -> None:
     """Raise UserError if no joint slides in contact, or the surface is as stiff or soft as the bounds allow."""
-    touched = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum() / ROWS_HZ
-    if touched < LEAST_S:
+    rows = np.any([problem.rows.any(1) & press for press in presses(problem, u)], axis=0).sum()
+    if (touched := problem.torque.row_s * rows) < LEAST_S:
         raise UserError(
             f"data.contact: joints slide faster than {SLOWEST:g} rad/s for {touched:.2f} s in contact, at least "
             f"{LEAST_S:g} s are needed: friction hides the force on an arm at rest"

@@ -32,10 +32,11 @@ def first_guesses(
     """
     tool = space.robot.tool
     assert tool is not None
-    centre, force, sure = external_force(space, x, recording)
-    if sure.sum() < LEAST_S * 100:
+    torque = TorqueResidual(space, recording)
+    centre, force, sure = external_force(torque, x)
+    if (found_s := torque.row_s * sure.sum()) < LEAST_S:
         raise UserError(
-            f"data.contact: no contact found: {sure.sum() / 100:.2f} s with a force that friction cannot explain, at "
+            f"data.contact: no contact found: {found_s:.2f} s with a force that friction cannot explain, at "
             f"least {LEAST_S:g} s are needed; does the tool of robot.tool, {1e3 * tool.radius:g} mm in radius, reach "
             "the surface?"
         )
@@ -65,17 +66,15 @@ def _starts(
             yield np.clip(u, 0.0, 1.0)
 
 
-def external_force(
-    space: ParameterSpace, x: np.ndarray, recording: Recording
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centre (T, 3) m, force on it (T, 3) N, and whether it is certain (T,), at 100 Hz.
+def external_force(torque: TorqueResidual, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return centre (T, 3) m, force on it (T, 3) N, and whether it is certain (T,), at the moments of `torque`.
 
     Least squares over the joints, below 10 Hz; friction of a resting joint counts as unknown.
     """
-    torque = TorqueResidual(space, recording)
-    motion, d = torque.motion, space.dynamics(x)
+    space, motion = torque.space, torque.motion
+    d = space.dynamics(x)
     still = np.zeros(len(motion.q), dtype=bool)
-    tip = TipMotion.of(space.robot, motion.q, motion.dq, 0.01, still, 0.0)
+    tip = TipMotion.of(space.robot, motion.q, motion.dq, torque.row_s, still, 0.0)
     jacobian = tip.jacobian(np.arange(len(motion.q)), np.zeros(3))
     sigma = np.where(np.abs(motion.dq) < MOVING, 1.0, KNOWN) * np.maximum(d.level, 1e-3 * space.robot.tau_max)
     weighted = jacobian / sigma[:, None] ** 2

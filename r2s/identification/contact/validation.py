@@ -8,8 +8,7 @@ from r2s.identification.contact.problem import ContactProblem
 
 PAUSE_S = 1.0  # s without contact between two presses; a slide may lose contact for a moment
 GUARD_S = 0.2  # s around a press, longer than a window
-ROWS_HZ = 100.0  # of the torque residual
-KNOWN_N = 1.0  # N, largest standard error of a force from torques that counts
+KNOWN = 0.05  # of the largest force, 1 N of a Panda's 20 N: standard error of a force from torques that counts
 
 
 @dataclass(frozen=True)
@@ -19,7 +18,7 @@ class Press:
     Attributes:
         t: (M,) s. force, seen: (M,) N, of the surface and of the torques.
         depth, rate: (M,) m, m/s, penetration and its rate.
-        error: (M,) N, standard error of `seen`.
+        error: (M,) N, standard error of `seen`. row_s: s, between moments.
     """
 
     t: np.ndarray
@@ -28,12 +27,13 @@ class Press:
     depth: np.ndarray
     rate: np.ndarray
     error: np.ndarray
+    row_s: float
 
     def summary(self) -> dict[str, float]:
         """Return the entry of summary.json: seconds of force, and its error, N RMS, loading and unloading apart."""
         sides = {"loading": 1.0, "unloading": -1.0}
         errors = {f"{name}_force_rmse_N": self.rmse(side) for name, side in sides.items()}
-        return {"seconds": len(self.t) / ROWS_HZ, "force_rmse_N": self.rmse(), **errors}
+        return {"seconds": len(self.t) * self.row_s, "force_rmse_N": self.rmse(), **errors}
 
     def rmse(self, side: float = 0.0) -> float:
         """Return the error, N RMS: of loading (1), unloading (-1) or all (0); nan without such moments."""
@@ -66,10 +66,11 @@ def press_errors(problem: ContactProblem, u: np.ndarray, parts: list[np.ndarray]
     weight = np.where(problem.rows, 1 / np.where(problem.rows, problem.sigma, 1.0) ** 2, 0.0)
     known = (weight * tau**2).sum(1)
     inside = np.any(parts, axis=0) if parts else np.zeros(len(force), dtype=bool)
-    some = inside & (force > 0) & (force < KNOWN_N * np.sqrt(known))
+    largest = force[inside].max(initial=0.0)
+    some = inside & (force > 0) & (force < KNOWN * largest * np.sqrt(known))
     factor = (weight * tau * error).sum(1)[some] / known[some]
     seen, spread = factor * force[some], force[some] / np.sqrt(known[some])
-    return Press(motion.t[some], force[some], seen, depth[some], rate[some], spread)
+    return Press(motion.t[some], force[some], seen, depth[some], rate[some], spread, problem.torque.row_s)
 
 
 def _depth(problem: ContactProblem, u: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from r2s.errors import UserError
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Report
 from r2s.identification.residuals.replay_residual import ReplayResidual
@@ -37,7 +38,15 @@ def choose_stiction(
     """Return {"model": index in STICTION_MODELS, "dq_min": rad/s, "breakaway": (n, 2) Nm} that replay stops best.
 
     largest: upper limit of the breakaway torques to scan for, over the identified friction; None if ramps gave them.
+    The present model stays if no trajectory is as long as a window.
     """
+    try:
+        windows = cut_windows(recording, HORIZON, limit=WINDOWS)
+        if largest is not None:
+            cut_windows(recording, window_s, limit=1)  # the scan's
+    except UserError:
+        present = float(STICTION_MODELS.index(dynamics.stiction_model))
+        return {"model": present, "dq_min": dynamics.dq_min, "breakaway": dynamics.breakaway}
     scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=report)
     trials = []
     for model in STICTION_MODELS:
@@ -48,7 +57,6 @@ def choose_stiction(
             limit = largest * np.maximum(friction, LEAST * robot.tau_max)
             trial = replace(trial, breakaway=scan(robot, trial, recording, limit))
         trials.append(trial)
-    windows = cut_windows(recording, HORIZON, limit=WINDOWS)
     error = np.stack([np.abs(replay(robot, t, windows, nthread) - windows.q).mean((0, 1)) for t in trials])
     best = int((error / error.mean(0)).sum(1).argmin())
     chosen = trials[best]

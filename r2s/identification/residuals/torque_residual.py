@@ -20,7 +20,7 @@ from r2s.identification.residuals.zero_phase import EDGE_S, SmoothMotion
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import PRESLIDING, WIDTH_DQ
 from r2s.physics.rigid_body import LinkInertia
-from r2s.physics.robot import Robot
+from r2s.physics.robot import SIM_DT, Robot
 from r2s.recordings.lateness import from_q, lateness
 from r2s.recordings.parts import give_back, pieces
 from r2s.recordings.recording import Recording
@@ -94,6 +94,11 @@ class TorqueResidual:
     def clusters(self) -> np.ndarray:
         """(R,) block of each row; errors of different blocks are independent."""
         return np.repeat(self.block, self.space.n)
+
+    @property
+    def row_s(self) -> float:
+        """s, between moments, in whole milliseconds."""
+        return SIM_DT * max(1, round(float(np.median(np.diff(self.motion.t))) / SIM_DT))
 
     def _with(self, **changes: Any) -> "TorqueResidual":
         other = copy(self)

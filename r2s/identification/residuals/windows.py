@@ -23,7 +23,8 @@ STATE_SAMPLES = 31  # ms, of the local fit that gives a window's start state
 HALF = STATE_SAMPLES // 2
 SHORTEST = 0.25  # of the window length: a shorter window costs more than it contributes
 MOVED = 0.02  # rad, range of a joint that moves
-SCATTER = 0.1  # Nm, scatter of breakaway commands between postures
+# of the largest tau_max, 0.1 Nm for a Panda's 87 Nm: scatter of breakaway commands between postures
+SCATTER = 0.1 / 87.0
 MAX_LATENCY_STEPS = 11  # ms, odd: longest latency of a command
 HISTORY = 40  # ms of commands before a window, the memory of delay and lag
 
@@ -69,8 +70,8 @@ def cut_windows(
         slowest: rad/s. A window ends where a joint gets slower, and the next starts when all are faster again. At
             rest the smallest change of a parameter shifts the release of a joint by a step, which disturbs all
             joints. Joints that never move are ignored.
-        edges: (n, 2) Nm, commands at which resting joints break away. A joint counts as slow only while its command
-            lies between them.
+        edges: (n, 2) Nm, commands at which resting joints break away, with their scatter. A joint counts as slow only
+            while its command lies between them.
 
     Raises:
         UserError: no trajectory is as long as a window, or all joints hardly ever move at once.
@@ -100,7 +101,7 @@ def cut_windows(
             continue
         slow = (np.abs(dq[s]) < slowest) & ~still
         if edges is not None:
-            between = (grid.tau[s] > edges[:, 0] - SCATTER) & (grid.tau[s] < edges[:, 1] + SCATTER)
+            between = (grid.tau[s] > edges[:, 0]) & (grid.tau[s] < edges[:, 1])
             slow &= maximum_filter1d(between, MAX_LATENCY_STEPS, axis=0, origin=(MAX_LATENCY_STEPS - 1) // 2)
         found = _between_stops(np.flatnonzero(slow.any(1)), s.stop - s.start, steps)
         starts += [s.start + start for start, _ in found]

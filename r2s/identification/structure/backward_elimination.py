@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from r2s.identification.structure.cross_validation import CrossValidation, clearly_worse
+from r2s.identification.structure.cross_validation import CrossValidation, clearly_worse, per_joint
 from r2s.identification.terms import blocks_of
 
 
@@ -33,10 +33,11 @@ def eliminate_terms(cv: CrossValidation, terms: Sequence[str], prunable: Sequenc
         return squares
 
     kept, full = list(terms), score(terms)
-    best = full / full.mean(0)  # joints count alike
+    alike = per_joint(full.mean(0))
+    best = full * alike
     for name in sorted(prunable, key=lambda term: -sum(base.size(block) for block in blocks_of(term))):
         some = [term for term in kept if term != name]
-        trial = score(some) / full.mean(0)
+        trial = score(some) * alike
         if not clearly_worse((trial - best).sum(1)):
             kept, best = some, min(best, trial, key=np.mean)
     return {"needed": [name in kept for name in terms]}

@@ -91,6 +91,14 @@ class CrossValidation:
             yield Fold(fit, test)
 
 
+def per_joint(squares: np.ndarray) -> np.ndarray:
+    """Return (n,) the factors that make joints with the mean squares (n,) count alike.
+
+    A joint without error has no held-out rows: with `slowest`, one that never slides. It counts nothing.
+    """
+    return np.divide(1.0, squares, out=np.zeros_like(squares), where=squares > 0)
+
+
 def clearly_worse(more: np.ndarray) -> bool:
     """Return whether the mean of an error increase, `more` (blocks,), exceeds its standard error.
 

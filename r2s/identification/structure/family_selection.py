@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from r2s.identification.structure.cross_validation import CrossValidation, clearly_worse
+from r2s.errors import UserError
+from r2s.identification.structure.cross_validation import CrossValidation, clearly_worse, per_joint
 from r2s.physics.dynamics import with_family
 from r2s.physics.friction import FAMILIES, Family
 
@@ -22,18 +23,25 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
     `slowest`, rad/s, families without memory are compared again on windows of faster sliding
     (modulating_functions.py), which give their "error". Families with memory need other windows.
     """
-    error, best = _compare(cv, FAMILIES, terms)  # FAMILIES are in order of their number of parameters
+    found = _compare(cv, FAMILIES, terms)  # FAMILIES are in order of their number of parameters
+    if found is None:
+        raise UserError("friction.family=auto: the recording is too short for held-out motion; name a family")
+    error, best = found
     if slowest and not FAMILIES[best].has_memory:
         plain = [k for k, family in enumerate(FAMILIES) if not family.has_memory]
-        error[plain], chosen = _compare(cv, [FAMILIES[k] for k in plain], terms, slowest, CLOSE)
-        best = plain[chosen]
+        again = _compare(cv, [FAMILIES[k] for k in plain], terms, slowest, CLOSE)
+        if again is not None:
+            error[plain], best = again[0], plain[again[1]]
     return {"error": error, "best": best}
 
 
 def _compare(
     cv: CrossValidation, families: Sequence[Family], terms: Sequence[str], slowest: float = 0.0, close: float = 1.0
-) -> tuple[np.ndarray, int]:
-    """Return the error (F,) relative to the least, and the first family that is `close` or not clearly worse."""
+) -> tuple[np.ndarray, int] | None:
+    """Return the error (F,) relative to the least, and the first family that is `close` or not clearly worse.
+
+    None if no joint has a held-out row: with `slowest`, in a recording of a few seconds.
+    """
     spaces = [cv.space(terms, with_family(cv.nominal, f.name)) for f in families]
     scores: list[list[np.ndarray]] = [[] for _ in spaces]
     for k, fold in enumerate(cv.split(spaces[0], slowest=slowest)):
@@ -42,8 +50,10 @@ def _compare(
         cost = min(float(np.concatenate(own).mean()) for own in scores)
         cv.report({"search": "family", "evaluations": 0, "cost": cost, "done": k + 1, "total": cv.folds})
     means = [np.concatenate(own) for own in scores]  # (blocks, n) of each family
-    scale = np.min([m.mean(0) for m in means], axis=0)  # joints count alike
-    squares = [(m / scale).sum(1) for m in means]
+    alike = per_joint(np.min([m.mean(0) for m in means], axis=0))
+    if not alike.any():
+        return None
+    squares = [m @ alike for m in means]
     mean = np.array([s.mean() for s in squares])
     error, least = np.sqrt(mean / mean.min()), squares[int(mean.argmin())]
     best = next(k for k, s in enumerate(squares) if error[k] <= close or not clearly_worse(s - least))

@@ -10,7 +10,7 @@ import numpy as np
 
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Problem, fit_torque, implicit_friction
-from r2s.identification.structure.cross_validation import CrossValidation, Fold
+from r2s.identification.structure.cross_validation import CrossValidation, Fold, per_joint
 from r2s.identification.terms import blocks_of, scaled_bounds
 from r2s.physics.actuation import EARLY
 from r2s.physics.robot import SIM_DT
@@ -33,11 +33,11 @@ def select_terms(
         folds.append(_LinearizedFold(cv, fold, candidates))
         cost = float(np.mean(folds[-1].squares([])))
         cv.report({"search": "terms", "evaluations": 0, "cost": cost, "done": k + 1, "total": cv.folds})
-    usual = np.sqrt(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
+    alike = per_joint(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
         """Return (blocks,) the mean square over joints, each with the same weight."""
-        return np.concatenate([f.squares(chosen) for f in folds]) @ (1.0 / usual**2)
+        return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
     chosen: list[str] = []
     best = score(chosen)
@@ -45,7 +45,7 @@ def select_terms(
         trials = [score([*chosen, name]) for name in left]
         k = int(np.argmin([t.mean() for t in trials]))
         less = best - trials[k]
-        if less.mean() < CLEARLY * less.std() / np.sqrt(len(less)):
+        if less.mean() <= CLEARLY * less.std() / np.sqrt(len(less)):  # without held-out rows both are 0
             break
         chosen.append(left[k])
         best = trials[k]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from r2s.errors import UserError
 from r2s.identification.base_parameters import base_table
 from r2s.identification.blocks import BLOCK_S
 from r2s.identification.prediction import REPLAYED_S, SCORED_EACH_S, SCORED_S
@@ -98,9 +99,13 @@ def identification_page(
     if validation.torque == "commanded":
         block_s = window_s
         seconds = max(window_s, FIGURE_WINDOW_S) if validation.duration > 2 * FIGURE_WINDOW_S else window_s
-        windows = cut_windows(spread(validation, REPLAYED_S), seconds)
-        replays = {label: replay(robot, d, windows) for label, d in both.items()}
-        pictures["position"] = position_figure(run.figure("position"), windows.q, replays)
+        try:
+            windows = cut_windows(spread(validation, REPLAYED_S), seconds)
+        except UserError:  # no trajectory is that long, such as blocks of phase of a short period
+            pass
+        else:
+            replays = {label: replay(robot, d, windows) for label, d in both.items()}
+            pictures["position"] = position_figure(run.figure("position"), windows.q, replays)
     fastest = np.maximum(np.quantile(np.abs(motion.dq), 0.995, axis=0), 0.02)
     without = replace(found.dynamics, family=SIGMOID, phi=np.zeros((robot.n, 3)))
     friction = torque.predict(found.dynamics) - torque.predict(without) - error["identified"]
