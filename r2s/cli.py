@@ -23,6 +23,7 @@ INTERRUPTED = 130
 RESUMABLE = ("identify", "train", "tune", "results")
 PATHS = ("root", "name", "calibration", "resume", "policy", "runs")
 MOST_THREADS = 4096
+MOST_SEED = 2**32 - 1  # of some generators of NumPy
 ABSENT = "not there"
 # keys that may differ where skip_completed goes on: where a run is, how it is shown, on how many cores
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
@@ -98,7 +99,7 @@ def run_job(cfg):
         cfg, overrides = replayed(cfg), list(HydraConfig.get().overrides.task)
         if cfg.stage not in STAGES:
             raise UserError(f"stage: no stage '{cfg.stage}'; allowed: {choices(STAGES)}")
-        check_number("seed", cfg.seed, "[0, inf)", whole=True)
+        check_number("seed", cfg.seed, f"[0, {MOST_SEED}]", whole=True)
         check_number("threads", cfg.threads, f"[0, {MOST_THREADS}]", whole=True)
         check_paths(cfg)
         if cfg.resume:

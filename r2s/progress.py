@@ -19,7 +19,8 @@ class Progress:
 
     def __init__(self, label: str, every_s: float = 10.0, in_cycle: bool = False):
         self._label, self._every, self._began, self._shown = label, every_s, time.perf_counter(), 0.0
-        self._part, self._share = self._began, 0.0  # begin of the part whose share grows, and its last share
+        # time and share of the first call of the part whose share grows, where a resumed run is not at 0; last share
+        self._part, self._first, self._share = self._began, -1.0, 0.0
         self._console = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
         self._bar: Bar | None = None
         if self._console.is_terminal:
@@ -58,11 +59,13 @@ class Progress:
     def _show(self, share: float, text: str) -> None:
         now = time.perf_counter()
         if share < 0.5 * self._share or share < 1.0 <= self._share:  # the next part, such as another search
-            self._part = now
+            self._first = -1.0
             if self._bar:  # a bar that was full stays finished: it would show no time any more
                 began = self._bar.tasks[0].start_time
                 self._bar.reset(self._task)
                 self._bar.tasks[0].start_time = began
+        if self._first < 0.0:
+            self._part, self._first = now, share
         self._share = share
         if now - self._shown < (0.2 if self._bar else self._every):
             return
@@ -70,7 +73,8 @@ class Progress:
         if self._bar:
             self._bar.update(self._task, completed=share, text=text, refresh=True)
         else:
-            left = f"{clock((now - self._part) * (1 - share) / share)} left" if share > 0.01 else ""
+            done = share - self._first
+            left = f"{clock((now - self._part) * (1 - share) / done)} left" if done > 0.01 else ""
             self._print(f"{self._label} {100 * min(share, 1.0):3.0f} %  {clock(now - self._began)}  {left}  {text}")
 
     def close(self, text: str = "") -> None:

@@ -10,12 +10,13 @@ import yaml
 from test_cli import one_line, r2s, succeed
 from test_comparison import write_run
 
-from r2s.reporting.comparison.adapter_comparison import compare_adapters, verdict
+from r2s.reporting.comparison.adapter_comparison import compare_adapters, score, verdict
 from r2s.reporting.comparison.adapter_comparison_page import lines, tables
 from r2s.reporting.comparison.arm_conditions import condition, in_words, order
 from r2s.reporting.comparison.statistics import paired
 from r2s.reporting.comparison.transfers import comparable, read_transfers
 from r2s.tasks.measures import Measure, MeasureTable, write_measures
+from r2s.tasks.push_measures import PUSH
 from r2s.tasks.reach import REACH, ReachTask
 from r2s.tasks.rollout import episode_measures, gap
 from r2s.tasks.task import Episodes
@@ -153,6 +154,16 @@ def test_a_stopped_path_is_no_success_and_has_no_rmse(tmp_path):
     assert value(found, "within_5mm", "rls", "nominal") == 0.5
     stops = tables(found)["stopped episodes"]["nominal"]
     assert stops.to_dict() == {"none": "0 of 2", "observer": "2 of 2", "rls": "1 of 2"}
+
+
+def test_a_stopped_push_leaves_the_distance_of_the_others():
+    """Its distance is infinite; all rows omit the episode, and their means stay finite."""
+    rows = {"row": ["none"] * 3 + ["rls"] * 3, "arm": "twin", "goal": [0, 1, 2] * 2, "arm_stopped": 0}
+    shared = pd.DataFrame(rows | {"distance_median_m": [0.01, 0.03, 0.05, 0.02, np.inf, 0.04]})
+    found = score(shared, PUSH["distance_median_m"], {"none": None, "rls": "none"}).set_index("row")
+    assert found["mean"].tolist() == pytest.approx([0.03, 0.03])
+    assert found["episodes"].tolist() == [2, 2]
+    assert np.isfinite(found.loc["rls", ["low", "high", "worse_low", "worse_high"]].astype(float)).all()
 
 
 def test_of_reaching_success_is_to_be_within_1_cm_at_the_end(tmp_path):

@@ -245,6 +245,16 @@ def test_a_saved_learner_goes_on_bit_for_bit(kind, before, tmp_path):
         assert torch.equal(torch.as_tensor(mine), torch.as_tensor(theirs))
 
 
+def test_a_restored_learner_explores_on_its_own_device():
+    """The noise of a checkpoint, which is read on the processor, goes where the learner is."""
+    algo = make(TD3)
+    algo.explore(in_si(make_batch())["observation"])
+    other = make(TD3).to("meta")
+    other.set_extra_state(algo.get_extra_state())
+    observation = in_si(make_batch())["observation"].to("meta")
+    assert other.noise(other.actor.mode(observation)).device.type == "meta"
+
+
 @pytest.mark.parametrize("kind", ALL)
 def test_two_learners_from_one_state_are_apart(kind):
     """Updates of a learner that took over a state leave the other's weights and moments as they were."""

@@ -1,5 +1,6 @@
 """A stopped training continues; a value that is not finite stops it."""
 
+import shutil
 import time
 import zipfile
 
@@ -8,7 +9,10 @@ import pandas as pd
 import pytest
 import torch
 from conftest import conf
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from test_cli import r2s, started, succeed
+from test_envs import calibration  # noqa: F401
 
 from r2s.learning.checkpoint import Checkpoint, load_tensors, save_tensors
 from r2s.learning.env import TaskEnv
@@ -16,10 +20,12 @@ from r2s.learning.evaluate import make_evaluation
 from r2s.learning.randomization import UniformRandomization
 from r2s.learning.replay import Replay
 from r2s.learning.tqc import TQC
-from r2s.learning.train import Budget, Loop, generators, set_generators, train
+from r2s.learning.train import Budget, Callbacks, Loop, generators, set_generators, train
 from r2s.physics.dynamics import Dynamics, nominal_dynamics, with_family
 from r2s.physics.friction import BRISTLE
 from r2s.physics.robot import load_robot
+from r2s.stages.build import CONF
+from r2s.stages.train import keep_calibration, make_parts
 from r2s.tasks.reach import ReachTask
 
 QUICK = [
@@ -116,6 +122,23 @@ def test_a_killed_training_resumes_to_the_same_policy(tmp_path):
     assert again.stderr.strip().endswith("is finished")
 
 
+def test_a_stopped_training_draws_from_its_own_copy_of_the_identification(calibration, tmp_path):  # noqa: F811
+    """dr=identified: with the folder of the identification gone, the arms of a resumed training are the same."""
+    words = ["dr=identified", "algo.n_envs=4", *QUICK]
+    own, drawn = tmp_path / "own", []
+    own.mkdir()
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        cfg = compose("config", words)
+    cfg.calibration = str(calibration)
+    OmegaConf.resolve(cfg)  # as in the config.yaml of a run folder
+    for resume in (None, str(own)):
+        cfg.resume = resume
+        drawn.append(make_parts(cfg).draw(np.random.default_rng(0), 5).offset)
+        keep_calibration(cfg, own)
+        shutil.rmtree(calibration, ignore_errors=True)
+    np.testing.assert_array_equal(*drawn)
+
+
 def add(replay, count, at_once):
     """Put the next `count` transitions into the buffer, each with its number, `at_once` of them in a call."""
     numbers = torch.arange(replay.seen, replay.seen + count, dtype=torch.float32)
@@ -207,6 +230,17 @@ def train_briefly(env, algo, concurrent=False):
     evaluate = make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1)
     loop = Loop(batch_size=16, learning_starts=80, concurrent=concurrent)
     train(env, algo, evaluate, loop, Budget(None, 1200))
+
+
+@pytest.mark.parametrize(("starts", "every", "evaluated"), [(0, 160, [160]), (160, 40, [164, 200, 240])])
+def test_updates_begin_with_the_first_transition_and_evaluations_keep_their_distance(panda, starts, every, evaluated):
+    """Also without random steps, and where evaluations were due before the first update."""
+    env, rows = make_env(panda), []
+    evaluate = make_evaluation(env.robot, env.task, env.draw, episodes=1, nthread=1)
+    loop = Loop(batch_size=16, learning_starts=starts, eval_env_steps=every)
+    train(env, make_algo(env), evaluate, loop, Budget(None, 240), callbacks=Callbacks(evaluated=rows.append))
+    assert [row["env_steps"] for row in rows] == [*evaluated, 240]
+    assert rows[-1]["updates"] == (240 - max(4, starts)) / 4
 
 
 def test_arms_that_step_beside_the_updates_give_the_same_run(panda):

@@ -54,6 +54,9 @@ MISTAKES = {
     "+experiment=[tune,toy] algo.tau=nan": r"algo.tau: expected a number in \(0, 1\], got nan",
     "+experiment=[tune,toy] algo.lr=1e-3": r"algo.lr: tune.space searches it; leave it out, or give tune.space=",
     "+experiment=[tune,toy] tune.space={algo:[td3,td5]}": r"tune.space: Could not find 'algo/td5'",
+    "+experiment=[tune,toy] tune.space={algo:[td3]} tune.measure=stops": r"no measure 'stops'; allowed: limited",
+    "+experiment=[tune,toy] tune.space={algo:[td3]} tune.against=GRID": r"tune.against: expected finished",
+    "+experiment=toy budget.env_steps=800": r"budget.env_steps: expected more than 800, .* algo.n_envs=8, got 800",
     "lst": r"'lst' is not KEY=VALUE; did you mean 'list'",
     "resume=nowhere": r"'nowhere' is no run folder",
     "robot.mjcf=nowhere.xml": r"nowhere.xml",
@@ -70,6 +73,7 @@ MISTAKES = {
     "evaluation.episodes=0": r"evaluation.episodes: expected a whole number in \[1, inf\), got 0",
     "task.ctrl_hz=60": r"task.ctrl_hz: 60 is not allowed; what divides 1000 is",
     "seed=-1": r"seed: expected .*, got -1",
+    "seed=9223372036854775808": r"seed: expected .*, 4294967295\], got 9223372036854775808",
     "device=tpu": r"device: expected cpu or cuda, got 'tpu'",
     "matmul=low": r"matmul: expected auto, medium, high or highest, got 'low'",
     "friction.phi1=[1,2]": r"friction.phi1: expected 7 values, for the 7 joints of panda, got 2",
@@ -176,7 +180,7 @@ def logs(recording, tmp_path_factory) -> dict[str, Path]:  # noqa: F811
         paths[name].write_text("\n".join(lines))
     for name, table in tables.items():
         np.savetxt(paths[name], table, delimiter=",", header=rows[0], comments="")
-    return {"LOG": recording} | paths
+    return {"LOG": recording, "GRID": folder} | paths
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

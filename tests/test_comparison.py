@@ -153,6 +153,14 @@ def test_settings_that_an_experiment_changed_name_a_group(tmp_path):
     assert list(group(read_trainings(sorted(tmp_path.iterdir()))[0]).members) == ["tqc, lr=0.001", "tqc, lr=0.0001"]
 
 
+def test_limits_of_contact_and_the_precision_of_products_name_a_group(tmp_path):
+    """A training reads them, so seeds with other values are of another group."""
+    words = ("safety.force_max=25", "safety.force_max=40", "matmul=highest")
+    for k, word in enumerate(words):
+        write_run(tmp_path / str(k), word)
+    assert set(group(read_trainings(sorted(tmp_path.iterdir()))[0]).members) == {f"tqc, {word}" for word in words}
+
+
 def test_runs_that_are_not_comparable_are_listed_with_a_reason(user_folder):
     """The largest set is compared; the reasons of all other folders are listed."""
     trained, others = read_trainings(sorted(user_folder.iterdir()))
@@ -189,8 +197,9 @@ def test_one_commit_and_one_machine_or_set_apart(tmp_path):
     write_run(tmp_path / "wider", "seed=7", **here | {"threads": 2})
     write_run(tmp_path / "gpu", "seed=8", **here | {"device": "cuda"})
     write_run(tmp_path / "oracle", "algo=oracle", env_steps=0, **here | {"threads": 2})
+    write_run(tmp_path / "pusher", "algo=pusher", env_steps=0, **here | {"threads": 2})
     runs, apart = comparable(read_trainings(sorted(tmp_path.iterdir()))[0])
-    assert [r.folder.name for r in runs] == ["a0", "a1", "a2", "oracle"]
+    assert [r.folder.name for r in runs] == ["a0", "a1", "a2", "oracle", "pusher"]
     assert apart == {
         "again": "seed 2 again, as a2",
         "changed": "another commit: aaaaaaaa with changes, not aaaaaaaa",

@@ -78,12 +78,15 @@ def test_same_seed_and_actions_give_the_same_bits(make):
 
 def test_set_seed_starts_over(make):
     """An environment that is given its seed again resets to the same arms, starts and goals."""
-    env = make(4)
-    seen = []
+    env = make(8, stagger=True)
+    seen, ends = [], []
     for _ in range(2):
         env.set_seed(11)
         seen.append(env.reset()["observation"])
+        ends.append(env.state()["_count"])
     assert torch.equal(*seen)
+    assert np.array_equal(*ends)
+    assert len(set(ends[0])) > 2
     assert not torch.equal(env.reset()["observation"], seen[0])
 
 

@@ -63,7 +63,8 @@ def close(one, other):
 
 
 @pytest.mark.parametrize(
-    ("name", "few"), [(REACH, []), *((f"r2s/Panda{t}-v0", ["task.pool=2"]) for t in ("Track", "Press", "Wipe"))]
+    ("name", "few"),
+    [(REACH, []), *((f"r2s/Panda{t}-v0", ["task.pool=2"]) for t in ("Track", "Press", "Wipe", "Push"))],
 )
 def test_the_checker_has_no_complaint(name, few):
     """check_env, with every warning an error."""
@@ -90,6 +91,17 @@ def test_a_seed_gives_its_trajectory():
         path[-1] = np.concatenate([path[-1], [env.reset()[0]]])
     assert np.array_equal(path[0], path[1])
     assert not np.isclose(path[0][0], path[2][0]).all()
+
+
+def test_a_camera_has_the_noise_of_the_task():
+    """The pose of a box is off by other amounts with each seed and for each arm, and alone as in a batch."""
+    seen = {}
+    for m in (0.0, 0.01):
+        robot, task, draw, _, _ = r2s.envs.parts({"task": "push"}, ["task.pool=2", f"task.pose_noise=[{m},1]"])
+        both, one = ArmVectorEnv(robot, task, draw, 2, nthread=1), ArmEnv(robot, task, draw)
+        seen[m] = both.reset(seed=3)[0]
+        close(seen[m][1], one.reset(seed=4)[0])
+    assert (np.abs(seen[0.01] - seen[0.0]).max(1) > 1e-3).all()
 
 
 @pytest.mark.parametrize("dr", ["paper", "force"])

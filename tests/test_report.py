@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -536,8 +537,19 @@ def test_progress_is_plain_lines_where_nobody_watches():
     done = subprocess.run([sys.executable, "-c", PROGRESS + "progress.close('9 s')"], capture_output=True, text=True)
     first, last = done.stderr.splitlines()
     assert first.startswith("train [tqc]  25 %  0:00")
-    assert first.endswith("left  12k env steps, 50 % < 1 cm")
+    assert first.endswith("12k env steps, 50 % < 1 cm")
     assert last == "train [tqc] done in 0:00  9 s"
+
+
+def test_the_time_left_is_that_of_the_share_since_the_begin(capsys):
+    """A resumed run begins at a share that an earlier process has done."""
+    progress = Progress("train", every_s=0.0)
+    progress(0.78)
+    time.sleep(0.2)
+    progress(0.8)  # 0.02 in 0.2 s
+    first, second = capsys.readouterr().err.splitlines()
+    assert "left" not in first
+    assert re.search(r"0:0[23] left", second)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")

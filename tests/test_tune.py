@@ -13,9 +13,10 @@ import pytest
 import yaml
 from conftest import ROOT
 from hydra import compose, initialize_config_dir
+from test_comparison import write_run
 
 from r2s.errors import UserError
-from r2s.reporting.tuning import against_table, best_so_far
+from r2s.reporting.tuning import against_table, best_so_far, read_grid
 from r2s.runs import Job, Run
 from r2s.stages.build import CONF
 from r2s.stages.tune import TrialRun, Tune, at_edges, corners, follow, parse_range, suggest
@@ -111,6 +112,31 @@ def test_a_training_that_never_begins_ends_the_search(tmp_path):
     with pytest.raises(UserError, match=r"training t_0 ended 3 times before its end; see .*logs/t.txt"):
         follow(study, one, "return_paper")
     assert one.log.read_text() == "out of memory\n" * 3
+
+
+@pytest.mark.parametrize("ignored", ["SIGINT", "SIGINT SIGTERM"])
+def test_a_training_that_ignores_ctrl_c_is_ended(ignored, tmp_path, monkeypatch):
+    """As children of a shell in the background do."""
+    monkeypatch.setattr("r2s.stages.tune.STOP_S", 0.1)
+    trial = pytest.importorskip("optuna").create_study().ask()
+    ignore = "".join(f"signal.signal(signal.{name}, signal.SIG_IGN)\n" for name in ignored.split())
+    code = f"import signal, sys, time\n{ignore}print('ready', file=sys.stderr, flush=True)\ntime.sleep(60)"
+    one = TrialRun(trial, tmp_path, [sys.executable, "-c", code], tmp_path / "logs" / "t.txt")
+    one.start()
+    while one.log.read_text() != "ready\n":
+        time.sleep(0.01)
+    one.stop()
+    assert one._process.returncode == -(signal.SIGKILL if "TERM" in ignored else signal.SIGTERM)  # type: ignore[union-attr]
+
+
+def test_a_grid_without_a_finished_training_of_the_task_is_one_line(tmp_path):
+    """Known before the search: unfinished runs, and runs without the measure."""
+    write_run(tmp_path / "a", status="running")
+    write_run(tmp_path / "b", "algo=oracle", env_steps=0)
+    write_run(tmp_path / "c")
+    assert len(read_grid(f"{tmp_path}/*", "return_paper")) == 1
+    with pytest.raises(UserError, match=r"with path_rmse_mm, .* none: a \(unfinished\); b, c \(no path_rmse_mm\)$"):
+        read_grid(f"{tmp_path}/*", "path_rmse_mm")
 
 
 def test_corners_hold_every_value_and_both_ends():

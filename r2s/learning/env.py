@@ -64,7 +64,7 @@ class TaskEnv(EnvBase):
         self.reward.terms(task)  # raises for a task with other terms
         self.weights = self.reward.weights(task, 0.0)
         self._torque = task.torque_limit(robot)
-        self._stagger = stagger
+        self._staggered = self._stagger = stagger  # as given, and whether the next reset does it
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
         self.goal = np.zeros((nsim, *self._pool.shape[1:]))
         self._dq, self._count = np.zeros((nsim, robot.n)), np.zeros(nsim, dtype=np.int64)
@@ -192,5 +192,5 @@ class TaskEnv(EnvBase):
         return draw.forces(self.rng, self.nsim)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.rng = np.random.default_rng(seed)
+        self.rng, self._stagger = np.random.default_rng(seed), self._staggered
         self.arms.seed(np.random.SeedSequence(seed).spawn(3)[2])

@@ -34,9 +34,11 @@ class SeparateArms(VectorArms):
         self.streams = self._rng.spawn(self.width)
 
     def _sense(self, at: np.ndarray | slice = ALL) -> None:
-        if self._sigma.any():
-            for i in np.arange(self.width)[at]:
+        for i in np.arange(self.width)[at]:
+            if self._sigma.any():
                 self._noise[i] = self._sigma[i] * self.streams[i].standard_normal(self.robot.n)
+            if self._pose is not None:
+                self._pose_noise[i] = self._pose_sigma * self.streams[i].standard_normal(3)
 
 
 class SeparateEnv(TaskEnv):

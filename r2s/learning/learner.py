@@ -202,7 +202,8 @@ class Learner(nn.Module, ABC):
         """Restore what `get_extra_state` returned."""
         # torch keeps the given moments by reference: without a copy two learners would write into them
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
-        self.updates, self._noise = state["updates"], state.get("noise")  # older checkpoints have none
+        noise = state.get("noise")  # older checkpoints have none
+        self.updates, self._noise = state["updates"], None if noise is None else noise.to(self.action_scale.device)
 
 
 class DeterministicLearner(Learner):

@@ -62,6 +62,9 @@ class TD3(DeterministicLearner):
         out, gradients = self._critic_gradients(batch, torch.randn_like(batch["action"]))
         due = self.updates % self.policy_delay == 0  # also in the first update, so that every logged row has a loss
         if due:
+            if self.action_scale.is_cuda and "_actor_gradients" in vars(self):
+                # compiled for a GPU each method is a captured graph, and the second overwrites outputs of the first
+                out, gradients = {k: v.clone() for k, v in out.items()}, [g.clone() for g in gradients]
             more, of_actor = self._actor_gradients(batch)
             self.last_actor_loss = more["loss_actor"].clone()  # a captured graph overwrites its outputs
             self.descend(out | more, [*critics, *actor], [*gradients, *of_actor])

@@ -156,7 +156,7 @@ def train(
         env.weights = env.reward.weights(env.task, spent, run.factor)
         algo.set_lr(loop.lr_share(spent))
         algo.set_exploration(loop.explore_end**spent)
-        learns = run.env_steps >= loop.learning_starts
+        learns = run.env_steps >= max(1, loop.learning_starts)  # an update needs a transition
         with run.step(spent):
             for _ in range(loop.updates_per_step if learns else 0):
                 losses = run.update()
@@ -165,7 +165,8 @@ def train(
         if run.updates % LOG_UPDATES < loop.updates_per_step or run.updates == loop.updates_per_step:
             callbacks.log(run.metrics(losses))
         if run.env_steps >= run.next_eval:
-            run.next_eval += loop.eval_env_steps
+            while run.next_eval <= run.env_steps:  # several are due after many random steps; one is enough
+                run.next_eval += loop.eval_env_steps
             callbacks.evaluated(run.evaluate())
             if checkpoint:
                 run.save(checkpoint)

@@ -61,6 +61,8 @@ class VectorArms:
         # of the perceived pose of a box: x m, y m, yaw rad
         self._pose = (task.table, task.pose_noise) if task.moves_box else None  # type: ignore[attr-defined]
         self._pose_noise = np.zeros((width, 3))
+        m, degrees = self._pose[1] if self._pose else (0.0, 0.0)
+        self._pose_sigma = np.array([m, m, np.radians(degrees)])
 
     def set_dynamics(self, dynamics: Dynamics, ids: np.ndarray) -> None:
         """Replace the dynamics, delay and lag of the arms `ids`."""
@@ -91,9 +93,7 @@ class VectorArms:
             sigma = self._sigma[at]
             self._noise[at] = sigma * self._rng.standard_normal(sigma.shape)
         if self._pose is not None:
-            m, degrees = self._pose[1]
-            noise = self._pose_noise[at]
-            self._pose_noise[at] = np.array([m, m, np.radians(degrees)]) * self._rng.standard_normal(noise.shape)
+            self._pose_noise[at] = self._pose_sigma * self._rng.standard_normal(self._pose_noise[at].shape)
 
     def read(self) -> State:
         """Return the present state of all arms; its arrays are views."""

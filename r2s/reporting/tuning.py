@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from r2s.reporting.comparison.trainings import read_trainings
+from r2s.errors import UserError
+from r2s.reporting.comparison.trainings import Trained, by_reason, trainings_among
 from r2s.reporting.document import Item, report_markdown
 from r2s.reporting.figures.panels import panels
 from r2s.runs import Run
@@ -41,6 +42,21 @@ def best_so_far(spent: Sequence[float], values: Sequence[float], at: np.ndarray,
     return np.array([sign * best[k - 1] if k and np.isfinite(best[k - 1]) else np.nan for k in found])
 
 
+def read_grid(against: str, measure: str) -> list[Trained]:
+    """Return the finished trainings of a glob that log a measure.
+
+    Raises:
+        UserError: there is none.
+    """
+    found, others = trainings_among(sorted(glob(against)))
+    grid = [r for r in found if r.learned and measure in r.curve]
+    if not grid:
+        others |= {r.folder.name: f"no {measure}" for r in found}
+        seen = "; ".join(by_reason(others))
+        raise UserError(f"tune.against: expected finished trainings with {measure}, {against!r} has none: {seen}")
+    return grid
+
+
 def against_table(trials: pd.DataFrame, measure: str, against: str | None, larger: bool) -> pd.DataFrame | None:
     """Return the best so far of the search and of a grid at `SHARES` of the search's compute.
 
@@ -52,7 +68,7 @@ def against_table(trials: pd.DataFrame, measure: str, against: str | None, large
     """
     if not against:
         return None
-    grid, _ = read_trainings(sorted(glob(against)))
+    grid = read_grid(against, measure)
     sign = 1.0 if larger else -1.0
     at = np.array(SHARES) * trials["wall_clock_s"].sum()
     searched = best_so_far(trials["wall_clock_s"].tolist(), trials["value"].tolist(), at, sign)

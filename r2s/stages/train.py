@@ -1,11 +1,12 @@
 """stage=train: train one policy in simulation, evaluate it, save it as policy.pt and policy.onnx."""
 
 import copy
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import check_number
+from r2s.errors import UserError, check_number
 from r2s.stages.build import (
     all_threads,
     console,
@@ -86,6 +87,7 @@ def make_parts(cfg):
     if learns:
         n_envs, loop, settings = split_algo(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
+        check_length(budget, loop, n_envs)
     robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
@@ -101,6 +103,16 @@ def make_parts(cfg):
     action_scale = torch.from_numpy(task.control(robot).action_scale)
     algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
     return Parts(robot, task, draw, episodes, algo.to(device(cfg)), env, evaluate, loop, budget)
+
+
+def check_length(budget, loop, n_envs):
+    """Raise UserError if the budget ends before the first update."""
+    before = n_envs * max(1, math.ceil(loop.learning_starts / n_envs))
+    if budget.env_steps is not None and budget.env_steps <= before:
+        raise UserError(
+            f"budget.env_steps: expected more than {before}, the env steps before the first update of "
+            f"algo.learning_starts={loop.learning_starts} and algo.n_envs={n_envs}, got {budget.env_steps}"
+        )
 
 
 class Selection:
@@ -200,6 +212,8 @@ def with_own_calibration(cfg):
         return cfg
     model = cfg.copy()
     if cfg.calibration and (Path(cfg.resume) / CALIBRATION[0]).is_file():
+        if cfg.dr.get("calibration") == cfg.calibration:  # dr=identified draws from the same one
+            model.dr.calibration = cfg.resume
         model.calibration = cfg.resume
     if cfg.dr.get("surface") and (Path(cfg.resume) / SURFACE[0]).is_file():
         model.dr.surface = cfg.resume

@@ -11,16 +11,18 @@ from dataclasses import dataclass, fields
 from functools import partial
 from glob import glob
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from r2s.errors import UserError, check_number, choices, nearest, optional_import
 from r2s.stages import train
-from r2s.stages.build import all_threads, console, make_dynamics, make_robot, make_task, open_run, unread
+from r2s.stages.build import all_threads, console, open_run, unread
 from r2s.stages.parts import called, plain
 from r2s.stages.pipeline import command_prefix, compose_step, overrides_for
 
 MOST_STARTS = 3  # of a training that the system ends, for example because memory is short
 POLL_S = 0.2
+STOP_S = 20.0  # for a training to end after Ctrl-C, and again after SIGTERM; a step or an evaluation takes less
 EDGE = 0.05  # share of a range at each end that counts as its edge
 WHY = {"calibration": "give the trained arm by friction= and inertia=", "policy": "it trains its policies itself"}
 
@@ -131,7 +133,7 @@ def training_words(cfg, overrides, settings):
 
 
 def check_trainings(cfg, overrides, space):
-    """Raise UserError if a training would refuse an override or an axis of the space."""
+    """Return the parts of one of the trainings; raise UserError if any would refuse an override or a value."""
     typed = {o.lstrip("+~").split("=")[0] for o in overrides}
     if both := sorted(typed & set(space)):
         raise UserError(f"{both[0]}: tune.space searches it; leave it out, or give tune.space={{{both[0]}: [VALUE]}}")
@@ -140,7 +142,20 @@ def check_trainings(cfg, overrides, space):
         for key in space:
             if why := unread(key, step):
                 raise UserError(f"tune.space: {why}")
-        train.make_parts(step)
+        parts = train.make_parts(step)
+    return parts
+
+
+def logged_measures(parts):
+    """Return {key: Measure} of what a training logs; of COMMON some need an arm. A short evaluation shows which."""
+    import torch
+
+    from r2s.learning.evaluate import make_evaluation
+
+    actions = parts.task.control(parts.robot).action_dim
+    still: Any = SimpleNamespace(action=lambda observation: torch.zeros(len(observation), actions))
+    row = parts.task.measures(make_evaluation(parts.robot, parts.task, parts.draw, episodes=1, nthread=1)(still))
+    return {key: measure for key, measure in parts.task.measure_table.known.items() if key in row}
 
 
 class TrialRun:
@@ -166,10 +181,19 @@ class TrialRun:
             self._process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=log)
 
     def stop(self) -> None:
-        """End the training as Ctrl-C does, so that its folder has the status stopped."""
-        if self._process is not None:
-            self._process.send_signal(signal.SIGINT)
-            self._process.wait()
+        """End the training as Ctrl-C does, so that its folder has the status stopped.
+
+        A process that a shell started in the background ignores Ctrl-C, as do its children; harder signals end those.
+        """
+        if self._process is None:
+            return
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            self._process.send_signal(number)
+            try:
+                self._process.wait(STOP_S)
+                return
+            except subprocess.TimeoutExpired:
+                continue
 
     def status(self) -> str:
         """Return started (by this tune, running), left (by another, running), or the status of the run folder."""
@@ -261,7 +285,9 @@ def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize",
     storage = f"sqlite:///{run.folder / 'study.db'}"
     study = optuna.create_study(study_name="tune", storage=storage, direction=direction, load_if_exists=True)
     # the storage keeps the drawn settings, not the state of the generator
-    study.sampler = optuna.samplers.TPESampler(seed=seed + 1000 * len(study.trials), n_startup_trials=startup)
+    study.sampler = optuna.samplers.TPESampler(
+        seed=(seed + 1000 * len(study.trials)) % 2**32, n_startup_trials=startup
+    )
     study.pruner = optuna.pruners.MedianPruner(n_startup_trials=startup, n_warmup_steps=1)
     return study
 
@@ -269,17 +295,17 @@ def open_study(run: Any, seed: int, startup: int, direction: Literal["minimize",
 def tune(cfg, overrides):
     """Search settings: ask for a trial, train, report its evaluations, prune; write trials.csv and the page."""
     optional_import("optuna", "stage=tune", "sweeps")
-    from r2s.reporting.tuning import against_table, trials_table, tuning_page
+    from r2s.reporting.tuning import against_table, read_grid, trials_table, tuning_page
     from r2s.runs import read_summary
 
     given = {k: v for k, v in plain(cfg.tune).items() if k in {f.name for f in fields(Tune)}}
     how = called(Tune, "tune", given)
-    check_trainings(cfg, overrides, how.space)
-    robot = make_robot(cfg)
-    known = make_task(cfg, robot, make_dynamics(cfg, robot)).measure_table.known
+    known = logged_measures(check_trainings(cfg, overrides, how.space))
     if how.measure not in known:
         near = nearest(str(how.measure), known)
-        raise UserError(f"tune.measure: the task has no measure '{how.measure}'; allowed: {choices(known)}{near}")
+        raise UserError(f"tune.measure: a training logs no measure '{how.measure}'; allowed: {choices(known)}{near}")
+    if how.against:
+        read_grid(how.against, how.measure)
     measure = known[how.measure]
     workers = how.workers or all_threads(cfg)
     with open_run(cfg, overrides) as run:

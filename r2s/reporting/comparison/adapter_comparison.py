@@ -107,14 +107,15 @@ def against_nominal(shared: pd.DataFrame, measure: str) -> pd.DataFrame:
 def score(shared: pd.DataFrame, measure: Measure, reference: Mapping[str, str | None], seed: int = 0) -> pd.DataFrame:
     """Return a row per row of one condition, with the columns of `AdapterComparison.scores`.
 
-    If an episode has no value in one row (a stopped episode has no RMSE and no gap), all rows omit it; rows without
-    any value do not count. A single episode has no interval.
+    If an episode has no value in one row (a stopped episode has no RMSE, no gap and an infinite distance), all rows
+    omit it; rows without any value do not count. A single episode has no interval.
 
     Args:
         shared: output of `in_common`. measure: key and direction. reference: {row: row to compare with}. seed: of the
             bootstrap.
     """
     wide = shared.pivot(index=["arm", "goal"], columns="row", values=measure.key)[list(shared["row"].unique())]
+    wide = wide.replace([np.inf, -np.inf], np.nan)  # a stopped episode has no distance, some tasks make it infinite
     stopped = shared.groupby("row", sort=False)["arm_stopped"].sum()
     power = 2 if measure.root_mean_square else 1
     kept = wide.dropna(axis=1, how="all").dropna()

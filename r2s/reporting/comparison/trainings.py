@@ -17,14 +17,14 @@ from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
 # config groups that a training reads, beside its seed; runs with equal values are seeds of one group
-READ = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward", "costs")
+READ: tuple[str, ...] = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward", "costs")
+READ += ("matmul", "safety")
 ALIKE = ("robot", "task")  # config groups that comparable runs share
 # where a run came from, which comparable runs share: code changes what is learned, a machine how much in a minute
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}
 ORIGIN |= {"threads": "other threads", "device": "another device"}
 FILES = ("config.yaml", "overrides.yaml", "evaluations.csv", "summary.json")
 MOST_BUDGETS = 2.0  # largest ratio of two comparable budgets: beyond it the longer training wins by its length
-CONTROLLERS = ("oracle", "computed_torque")  # model-based, not trained
 UNFINISHED = {"running": "unfinished"}
 
 
@@ -116,14 +116,14 @@ def _read(folder: Path) -> Trained:
     config = yaml.safe_load((folder / "config.yaml").read_text())
     algo, budget = config["algo"], config.get("budget", {})
     name = algo.get("name") or algo["_target_"].rpartition(".")[2].lower()
-    read = set(READ)
-    if config.get("calibration"):
-        read -= {"friction", "inertia"}  # the calibration replaces them
-    if name in CONTROLLERS:
-        read -= {"budget", "reward", "costs"}
-    typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
     measures = measures_of(folder)
     curve, last = _evaluations(folder, measures)
+    learned, read = last["env_steps"] > 0, set(READ)
+    if config.get("calibration"):
+        read -= {"friction", "inertia"}  # the calibration replaces them
+    if not learned:
+        read -= {"budget", "costs", "matmul", "reward"}
+    typed = {k: v for k, v in typed_in(folder).items() if k.split(".")[0] in read | {"experiment"}}
     alike = settings_in(config, ALIKE)
     origin = _origin(folder)
     return Trained(
@@ -132,7 +132,7 @@ def _read(folder: Path) -> Trained:
         name,
         settings_in(config, read),
         alike | {"evaluation.episodes": config.get("evaluation", {}).get("episodes")},
-        {"commit": origin["commit"]} if name in CONTROLLERS else origin,
+        origin if learned else {"commit": origin["commit"]},
         typed,
         typed.get("experiment") == "toy",
         None if budget.get("env_steps") else budget.get("minutes"),
