@@ -162,6 +162,16 @@ def test_a_joint_at_rest_has_no_say_in_family_and_terms(arm):
     assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
 
 
+@pytest.mark.parametrize("seconds", [2.5, 3.5])
+def test_a_log_of_seconds_lets_no_candidate_in(arm, seconds):
+    """Its held-out blocks may be too short for windows of sliding; a candidate that improves nothing stays out."""
+    robot, candidates = arm(1.0), conf("identify/default")["candidate_terms"]["commanded"]
+    truth = Dynamics.of(robot, np.array([0.02, 0.0, 0.01]) * robot.tau_max[:, None], COULOMB)
+    found = found_in(robot, driven(robot, truth, 1, seconds), family="auto", candidate_terms=candidates)
+    assert found.dynamics.family == COULOMB
+    assert not {b for term in candidates for b in blocks_of(term)} & set(found.space.blocks)
+
+
 def test_commands_between_the_rows_of_a_slow_log():
     """Held from row to row, or with a stated period interpolated at the rows that the log left out."""
     t, zero = 4e-3 * np.arange(12), np.zeros((12, 1))

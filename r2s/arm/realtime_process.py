@@ -27,7 +27,7 @@ from r2s.arm.interface import Arm, ArmState, ArmStopped, Operated, named_signals
 from r2s.arm.lifeline import Lifeline
 from r2s.arm.policy_runner import PolicyRunner, Stop, as_state
 from r2s.arm.realtime import Timing, realtime_section
-from r2s.arm.stop_request import handled_signals, parent_ended, requested, serve, watched
+from r2s.arm.stop_request import handled_signals, parent_ended, pipeline, requested, serve, watched
 from r2s.arm.warm_up import warm_up
 from r2s.errors import Stopped
 from r2s.physics.rigid_body import Kinematics
@@ -131,7 +131,8 @@ class RealtimeRunner:
         # not a daemon: that would be killed while its arm moves, and could not start an emulator
         self._process = context.Process(target=_serve, args=(remote, os.getpid(), *self._arguments), name="arm")
         self._signals = ExitStack()
-        self._signals.enter_context(handled_signals(lambda number: self._channel.signal.write(np.array([number]))))
+        signal = self._channel.signal
+        self._signals.enter_context(handled_signals(lambda number: signal.write(np.array([number])), pipeline()))
         self._channel.lifeline.hold()
         self._process.start()
         remote.close()

@@ -31,7 +31,6 @@ class _Request:
 
 
 _request = _Request()
-_parent = int(os.environ.pop(PARENT, 0))  # not for the processes that this one starts
 
 
 def requested() -> str | None:
@@ -69,10 +68,15 @@ def parent_ended(parent: int) -> Callable[[], str | None]:
     return lambda: None if os.getppid() == parent else "the process of the policy has ended"
 
 
-def _follow(over: threading.Event) -> None:
+def pipeline() -> int | None:
+    """Return the pid in PARENT, or None; the processes that this one starts have it too, but not as their parent."""
+    return int(os.environ[PARENT]) if PARENT in os.environ else None
+
+
+def _follow(parent: int, over: threading.Event) -> None:
     """Send this process SIGTERM when its parent ends before `over` is set."""
     while not over.wait(FOLLOW_S):
-        if os.getppid() != _parent:
+        if os.getppid() != parent:
             os.kill(os.getpid(), signal.SIGTERM)
             return
 
@@ -87,16 +91,18 @@ def _leave_terminal() -> None:
 
 
 @contextmanager
-def handled_signals(forward: Callable[[int], None] = lambda number: None) -> Iterator[None]:
+def handled_signals(
+    forward: Callable[[int], None] = lambda number: None, parent: int | None = None
+) -> Iterator[None]:
     """Turn SIGNALS into a request while an arm is open in this process.
 
     If no motion has taken the request after GRACE_S, the main thread gets a KeyboardInterrupt; it leaves this context
     as `Stopped` with the name of the signal. So does a request that no motion has taken when the block ends: what
-    follows may move the arm again. The end of the process in PARENT counts as SIGTERM. Outside the main thread Python
-    allows no handlers; nothing changes.
+    follows may move the arm again. Outside the main thread Python allows no handlers; nothing changes.
 
     Args:
         forward: called with the number of each signal, in the handler.
+        parent: pid of the parent process, whose end counts as SIGTERM; None: it does not matter.
 
     Raises:
         Stopped: a signal came while no motion ran.
@@ -123,8 +129,8 @@ def handled_signals(forward: Callable[[int], None] = lambda number: None) -> Ite
     before = {number: signal.signal(number, request) for number in SIGNALS}
     before[signal.SIGALRM] = signal.signal(signal.SIGALRM, insist)
     over = threading.Event()
-    if _parent:
-        threading.Thread(target=_follow, args=(over,), daemon=True, name="follow").start()
+    if parent is not None:
+        threading.Thread(target=_follow, args=(parent, over), daemon=True, name="follow").start()
     try:
         yield
     except KeyboardInterrupt:

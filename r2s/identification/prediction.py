@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from r2s.errors import UserError
 from r2s.identification.parameters import parameter_space
 from r2s.identification.residuals.torque_residual import TorqueResidual
-from r2s.identification.residuals.windows import cut_windows, replay
+from r2s.identification.residuals.windows import replay, windows_or_none
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.simulator import Simulator
@@ -43,10 +42,7 @@ def prediction_errors(
     if recording.torque != "commanded":
         return out
     recording = spread(recording, REPLAYED_S)
-    try:
-        windows = cut_windows(recording, window_s)
-    except UserError:  # such as blocks of phase of a short period
-        windows = None
+    windows = windows_or_none(recording, window_s)
     for name, dynamics in sides.items():
         if windows is not None:
             error = replay(robot, dynamics, windows, nthread) - windows.q
@@ -59,9 +55,7 @@ def open_loop_error(robot: Robot, dynamics: Dynamics, recording: Recording, nthr
     """Return {"0.1": mm, ...}: mean distance between simulated and recorded end effector after each horizon."""
     errors = {}
     for horizon in HORIZONS:
-        try:
-            windows = cut_windows(recording, horizon, limit=MAX_WINDOWS)
-        except UserError:
+        if (windows := windows_or_none(recording, horizon, MAX_WINDOWS)) is None:
             continue
         sim = Simulator(robot, dynamics, len(windows.q0), nthread)
         places = []

@@ -34,10 +34,11 @@ class SeparateArms(VectorArms):
         self.streams = self._rng.spawn(self.width)
 
     def _sense(self, at: np.ndarray | slice = ALL) -> None:
-        for i in np.arange(self.width)[at]:
-            if self._sigma.any():
+        noisy, seen = self._sigma.any(), self._pose is not None
+        for i in np.arange(self.width)[at] if noisy or seen else ():
+            if noisy:
                 self._noise[i] = self._sigma[i] * self.streams[i].standard_normal(self.robot.n)
-            if self._pose is not None:
+            if seen:
                 self._pose_noise[i] = self._pose_sigma * self.streams[i].standard_normal(3)
 
 

@@ -136,7 +136,7 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
         more: further arguments of the arm.
     """
     from r2s.arm.interface import ArmStopped
-    from r2s.arm.stop_request import handled_signals
+    from r2s.arm.stop_request import handled_signals, pipeline
     from r2s.arm.warm_up import warm_up
 
     if not is_twin(cfg):  # the clock of a twin waits
@@ -144,7 +144,7 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
     stream = {"noise": noise} if "noise" in inspect.signature(_arm_target(cfg)).parameters else {}
     with ExitStack() as stack:
         if not is_twin(cfg):
-            stack.enter_context(handled_signals())
+            stack.enter_context(handled_signals(parent=pipeline()))
         try:
             arm = part({**_arm_settings(cfg, robot, task), **stream, **more}, "arm", robot, beside=DRIVE_KEYS)
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm

@@ -8,11 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from r2s.errors import UserError
 from r2s.identification.parameters import parameter_space
 from r2s.identification.problem import Report
 from r2s.identification.residuals.replay_residual import ReplayResidual
-from r2s.identification.residuals.windows import cut_windows, replay
+from r2s.identification.residuals.windows import cut_windows, replay, windows_or_none
 from r2s.physics.dynamics import STICTION_MODELS, Dynamics
 from r2s.physics.robot import Robot
 from r2s.recordings.recording import Recording
@@ -40,11 +39,9 @@ def choose_stiction(
     largest: upper limit of the breakaway torques to scan for, over the identified friction; None if ramps gave them.
     The present model stays if no trajectory is as long as a window.
     """
-    try:
-        windows = cut_windows(recording, HORIZON, limit=WINDOWS)
-        if largest is not None:
-            cut_windows(recording, window_s, limit=1)  # the scan's
-    except UserError:
+    windows = windows_or_none(recording, HORIZON, WINDOWS)
+    scanned = largest is None or windows_or_none(recording, window_s, 1) is not None
+    if windows is None or not scanned:
         present = float(STICTION_MODELS.index(dynamics.stiction_model))
         return {"model": present, "dq_min": dynamics.dq_min, "breakaway": dynamics.breakaway}
     scan = partial(scan_breakaway, window_s=window_s, stride=stride, nthread=nthread, report=report)

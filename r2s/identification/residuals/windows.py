@@ -184,6 +184,14 @@ class StartState:
         return q, dq
 
 
+def windows_or_none(recording: Recording, seconds: float, limit: int | None = None) -> Windows | None:
+    """Return `cut_windows`, or None if no trajectory is as long as a window, such as blocks of a short period."""
+    try:
+        return cut_windows(recording, seconds, limit)
+    except UserError:
+        return None
+
+
 def replay(robot: Robot, dynamics: Dynamics, windows: Windows, nthread: int = 0) -> np.ndarray:
     """Return q (W, S, n) rad of an arm with these dynamics in each window."""
     sim = Simulator(robot, dynamics, len(windows.q0), nthread)

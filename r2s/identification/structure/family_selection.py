@@ -22,6 +22,9 @@ def compare_families(cv: CrossValidation, terms: Sequence[str], slowest: float =
     velocity, but a filter spreads stops and reversals over slow rows, and no family explains those. So with
     `slowest`, rad/s, families without memory are compared again on windows of faster sliding
     (modulating_functions.py), which give their "error". Families with memory need other windows.
+
+    Raises:
+        UserError: the recording is too short to hold out motion.
     """
     found = _compare(cv, FAMILIES, terms)  # FAMILIES are in order of their number of parameters
     if found is None:

@@ -17,8 +17,9 @@ from r2s.runs import parts_of
 from r2s.tasks.measures import MeasureTable
 
 # config groups that a training reads, beside its seed; runs with equal values are seeds of one group
-READ: tuple[str, ...] = ("algo", "budget", "calibration", "control", "dr", "friction", "inertia", "reward", "costs")
-READ += ("matmul", "safety")
+READ = (
+    *("algo", "budget", "calibration", "control", "costs", "dr", "friction", "inertia", "matmul", "reward", "safety"),
+)
 ALIKE = ("robot", "task")  # config groups that comparable runs share
 # where a run came from, which comparable runs share: code changes what is learned, a machine how much in a minute
 ORIGIN = {"commit": "another commit", "cpu": "another machine", "cores": "another machine", "gpus": "another machine"}

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from r2s.errors import UserError
 from r2s.identification.base_parameters import base_table
 from r2s.identification.blocks import BLOCK_S
 from r2s.identification.prediction import REPLAYED_S, SCORED_EACH_S, SCORED_S
 from r2s.identification.residuals.torque_residual import TorqueResidual
-from r2s.identification.residuals.windows import cut_windows, replay
+from r2s.identification.residuals.windows import replay, windows_or_none
 from r2s.identification.residuals.zero_phase import FRICTION_CUTOFF
 from r2s.identification.result import IdentificationResult
 from r2s.physics.dynamics import Dynamics
@@ -99,11 +98,8 @@ def identification_page(
     if validation.torque == "commanded":
         block_s = window_s
         seconds = max(window_s, FIGURE_WINDOW_S) if validation.duration > 2 * FIGURE_WINDOW_S else window_s
-        try:
-            windows = cut_windows(spread(validation, REPLAYED_S), seconds)
-        except UserError:  # no trajectory is that long, such as blocks of phase of a short period
-            pass
-        else:
+        windows = windows_or_none(spread(validation, REPLAYED_S), seconds)
+        if windows is not None:
             replays = {label: replay(robot, d, windows) for label, d in both.items()}
             pictures["position"] = position_figure(run.figure("position"), windows.q, replays)
     fastest = np.maximum(np.quantile(np.abs(motion.dq), 0.995, axis=0), 0.02)
