@@ -1,9 +1,10 @@
 """Compare DDPG, TD3, SAC and TQC, and TQC of TorchRL and sb3-contrib: equal wall-clock time, five seeds, one thread.
 
-`python benchmarks/algorithms.py` trains the committed defaults of each algorithm and the peers of
-benchmarks/algorithms_peers.py (those whose packages are installed), as many at a time as there are cores, and writes
-benchmarks/results/algorithms.md with its figures. It skips finished trainings, so you may interrupt it; with `page`
-it only writes. Run folders: runs/train/algo_*, of the peers runs/bench/algo_*.
+`python benchmarks/algorithms.py` trains each algorithm with its committed defaults; without demonstrations; and the
+peers of benchmarks/algorithms_peers.py (those whose packages are installed), which have none either; as many at a
+time as there are cores. It writes benchmarks/results/algorithms.md with its figures and skips finished trainings, so
+you may interrupt it; with `page` it only writes. Run folders: runs/train/shown_* (defaults), runs/train/algo_*, of
+the peers runs/bench/algo_*.
 """
 
 import json
@@ -34,6 +35,7 @@ PEERS = {"torchrl": "torchrl", "sb3": "sb3_contrib"}  # their packages
 LABELS = {"torchrl": "TorchRL's TQC", "sb3": "sb3-contrib's TQC"}
 SEEDS = range(65, 70)  # no setting was chosen on them
 MINUTES = 2
+SETS = {"algo": ("algo.demonstrations=0",), "shown": ()}  # names of runs and their settings
 MARKS = {
     "95 % < 2 cm": ("success_2cm", 0.95),
     "98 % < 1 cm": ("success_1cm", 0.98),
@@ -48,8 +50,9 @@ def train_all() -> None:
     jobs = []
     for seed in SEEDS:
         for algo in ALGORITHMS:
-            words = [f"algo={algo}", f"seed={seed}", f"budget.minutes={MINUTES}", f"name=algo_{algo}_{seed}"]
-            jobs.append(["run.py", *words, "dr=paper", "threads=1", "skip_completed=true"])
+            words = [f"algo={algo}", f"seed={seed}", f"budget.minutes={MINUTES}", "dr=paper", "threads=1"]
+            for name, own in SETS.items():
+                jobs.append(["run.py", *words, *own, f"name={name}_{algo}_{seed}", "skip_completed=true"])
         for peer in (p for p, package in PEERS.items() if find_spec(package)):
             folder = BENCH / f"algo_{peer}_{seed}"
             if not (folder / "summary.json").is_file():
@@ -132,47 +135,71 @@ def draw_profiles(path: Path, groups: dict[str, list[Trained]]) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
-    """Train, compare, write the page."""
-    if sys.argv[1:] != ["page"]:
-        train_all()
-    shutil.rmtree(ROOT / "runs/compare/algorithms", ignore_errors=True)
-    compare = [sys.executable, "run.py", "stage=compare", "runs=runs/train/algo_*", "name=algorithms"]
-    subprocess.run(compare, cwd=ROOT, check=True)
-    shutil.copy(ROOT / "runs/compare/algorithms/figures/learning.png", RESULTS / "algorithms.png")
-    folders = [str(TRAIN / f"algo_{a}_{s}") for a in ALGORITHMS for s in SEEDS]
+def read_own(name: str) -> dict[str, list[Trained]]:
+    """Return the trainings of one of SETS by algorithm."""
+    folders = [str(TRAIN / f"{name}_{a}_{s}") for a in ALGORITHMS for s in SEEDS]
     own = {g[0].algo: g for g in group(read_trainings(folders)[0]).members.values()}
-    own = {a: own[a] for a in ALGORITHMS}
-    peers = read_peers(own["tqc"])
-    groups = own | peers
-    draw_profiles(RESULTS / "algorithms_profiles.png", groups)
+    return {a: own[a] for a in ALGORITHMS}
+
+
+def tables(groups: dict[str, list[Trained]]) -> list[str]:
+    """Return the scores of the last policies, and the minutes until an evaluation met each of MARKS."""
     times = {label: {mark: reached(runs, *level) for mark, level in MARKS.items()} for label, runs in groups.items()}
     counts = {
         label: {key: f"{np.median([r.last[key] for r in runs]):,.0f}" for key in ("env_steps", "updates")}
         for label, runs in groups.items()
     }
     scores = scores_rows(measures_in(groups), summary_table(groups)).join(pd.DataFrame.from_dict(counts, "index"))
-    better, least = improvement_table(own), min(r.last["env_steps"] for runs in own.values() for r in runs)
-    origin = own["tqc"][0].origin
-    page = RESULTS / "algorithms.md"
-    _, heading, grid = page.read_text().partition("\n## The paper's grid\n")  # benchmarks/grid.py writes this section
-    parts = [
-        f"Trained on {origin['cpu']}, {origin['cores']} cores, commit {origin['commit']}, as many trainings at "
-        f"a time as cores: {len(SEEDS)} seeds, {MINUTES:g} minutes and one thread per training. dr=paper, 200 goals, "
-        "success for the last 0.5 s; last policy on the goals of reports, interquartile mean over seeds with a 95 % "
-        "bootstrap interval.",
+    return [
         markdown(scores.rename_axis("success within, %").fillna("")),
         "Minutes until an evaluation first met the level, median over seeds:",
         markdown_rows(times),
-        f"At equal env steps, {least:,.0f}, on the goals of selection; minutes are those that the steps took:",
-        at_steps(own, least),
-        "![learning curves](algorithms.png)",
-        "Selected policies, share of episodes by their distance; bands reach from the lowest to the highest seed:",
-        "![performance profiles](algorithms_profiles.png)",
-        "## Does the paper's ranking hold?",
+    ]
+
+
+def ranks(own: dict[str, list[Trained]]) -> list[str]:
+    """Return the rankings by success and by return."""
+    better = improvement_table(own)
+    return [
         "Probability of improvement with a 95 % interval:",
         f"- by success within 1 cm: {ranking(better, 'success_1cm')}",
         f"- by the return under eq. (2): {ranking(better, 'return_paper')}",
+    ]
+
+
+def main() -> None:
+    """Train, compare, write the page."""
+    if sys.argv[1:] != ["page"]:
+        train_all()
+    shutil.rmtree(ROOT / "runs/compare/algorithms", ignore_errors=True)
+    compare = [sys.executable, "run.py", "stage=compare", "runs=runs/train/shown_*", "name=algorithms"]
+    subprocess.run(compare, cwd=ROOT, check=True)
+    shutil.copy(ROOT / "runs/compare/algorithms/figures/learning.png", RESULTS / "algorithms.png")
+    own, shown = read_own("algo"), read_own("shown")
+    groups = own | read_peers(own["tqc"])
+    draw_profiles(RESULTS / "algorithms_profiles.png", groups | {f"{a}, demonstrations": r for a, r in shown.items()})
+    least = min(r.last["env_steps"] for runs in own.values() for r in runs)
+    origin, of_shown = own["tqc"][0].origin, shown["tqc"][0].origin
+    page = RESULTS / "algorithms.md"
+    _, heading, grid = page.read_text().partition("\n## The paper's grid\n")  # benchmarks/grid.py writes this section
+    parts = [
+        f"Trained on {origin['cpu']}, {origin['cores']} cores, as many trainings at a time as cores: {len(SEEDS)} "
+        f"seeds, {MINUTES:g} minutes and one thread per training. dr=paper, 200 goals, success for the last 0.5 s; "
+        "last policy on the goals of reports, interquartile mean over seeds with a 95 % bootstrap interval.",
+        "## The defaults: with demonstrations",
+        f"Commit {of_shown['commit']}.",
+        *tables(shown),
+        *ranks(shown),
+        "![learning curves](algorithms.png)",
+        "## From scratch, beside peers",
+        f"`algo.demonstrations=0`; commit {origin['commit']}.",
+        *tables(groups),
+        f"At equal env steps, {least:,.0f}, on the goals of selection; minutes are those that the steps took:",
+        at_steps(own, least),
+        "Selected policies, share of episodes by their distance; bands reach from the lowest to the highest seed:",
+        "![performance profiles](algorithms_profiles.png)",
+        "Does the paper's ranking hold?",
+        *ranks(own),
     ]
     write_page("algorithms", "Four algorithms", "python benchmarks/algorithms.py", parts)
     page.write_text(page.read_text() + heading + grid)

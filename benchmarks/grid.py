@@ -26,7 +26,8 @@ SEED, JUDGED = 70, range(75, 80)
 ENV_STEPS = 200_000
 MEASURE = "return_paper"  # of the last evaluation, selects a setting; larger is better
 SHARED = ("reward=paper", "algo.action_l2=0", "algo.explore_end=0.05", "dr=paper", "evaluation.episodes=100")
-SHARED += ("budget.minutes=null", f"budget.env_steps={ENV_STEPS}", "evaluation.env_steps=50000", f"root={RUNS_AT}")
+SHARED += ("algo.demonstrations=0", "evaluation.env_steps=50000", f"root={RUNS_AT}")
+SHARED += ("budget.minutes=null", f"budget.env_steps={ENV_STEPS}")
 
 
 def name(algo: str, lr: float, gamma: float, seed: int) -> str:

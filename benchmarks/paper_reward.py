@@ -18,6 +18,7 @@ from paper_returns import GAMMAS, PROFILES, SHARES, Motions, shaking, step_cost
 
 RUNS_AT = ROOT / "runs" / "paper_reward"
 SHARED = ("budget.minutes=null", "evaluation.env_steps=62500", "evaluation.episodes=100", "dr=paper")
+SHARED += ("algo.demonstrations=0",)
 FALLING = {  # exploration: correlated, and falling to where a joint at rest stays at rest
     "tqc": ("algo.explore_end=0.05",),
     "ddpg": ("algo.explore_std=0.2", "algo.explore_end=0.01"),

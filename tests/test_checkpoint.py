@@ -39,6 +39,7 @@ QUICK = [
     "budget.env_steps=4800",
     "evaluation.env_steps=1600",
     "algo.learning_starts=800",
+    "algo.demonstrations=800",
     "algo.replay_size=5000",
     "task.speed_noise=0.05",
 ]

@@ -253,7 +253,14 @@ def test_equal_steps_reach_what_r2ss_own_loop_reaches(monkeypatch, tmp_path):
     own = []
     for seed in range(3):
         words = [f"seed={seed}", f"budget.env_steps={LONG}", f"evaluation.env_steps={LONG}", f"root={tmp_path}"]
-        words += ["algo=sac", "budget.minutes=null", "threads=1", "compile=false", f"name={seed}"]
+        words += [
+            "algo=sac",
+            "budget.minutes=null",
+            "threads=1",
+            "compile=false",
+            "algo.demonstrations=0",
+            f"name={seed}",
+        ]
         subprocess.run([sys.executable, "run.py", *words], cwd=ROOT, check=True, capture_output=True)
         own.append(json.loads((tmp_path / "train" / str(seed) / "summary.json").read_text())["last"]["success_2cm"])
     mean = np.mean(own)

@@ -22,7 +22,13 @@ from r2s.stages.build import CONF
 from r2s.stages.tune import TrialRun, Tune, at_edges, corners, follow, parse_range, suggest
 
 TUNE = yaml.safe_load((ROOT / "conf" / "stage" / "tune.yaml").read_text())["tune"]
-TOY = ["+experiment=[tune,toy]", "budget.env_steps=4000", "evaluation.env_steps=800", "algo.learning_starts=320"]
+TOY = [
+    "+experiment=[tune,toy]",
+    "budget.env_steps=4000",
+    "evaluation.env_steps=800",
+    "algo.learning_starts=320",
+    "algo.demonstrations=320",
+]
 TOY += ["tune.trials=3", "tune.startup=1", "tune.workers=2", "evaluation.episodes=2"]
 TOY += ["tune.space={algo: [td3], algo.batch_size: [16, 32], algo.lr: 'log(1e-4, 1e-2)'}"]
 
@@ -210,7 +216,14 @@ def test_a_killed_search_continues(tmp_path):
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([sys.executable, "run.py", *words], cwd=ROOT, env=env, capture_output=True, text=True)
 
-    grid = ["+experiment=toy", "algo=td3", "algo.batch_size=16", "budget.env_steps=960", "algo.learning_starts=320"]
+    grid = [
+        "+experiment=toy",
+        "algo=td3",
+        "algo.batch_size=16",
+        "budget.env_steps=960",
+        "algo.learning_starts=320",
+        "algo.demonstrations=320",
+    ]
     assert run(*grid, "evaluation.episodes=2", f"root={tmp_path}", "name=grid_0").returncode == 0
     words = [*TOY, f"root={tmp_path}", "name=t", f"tune.against='{tmp_path}/train/grid_*'"]
     search = subprocess.Popen([sys.executable, "run.py", *words], cwd=ROOT, env=env)

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from r2s.errors import UserError, check_number
 from r2s.learning.checkpoint import Checkpoint
+from r2s.learning.demonstrations import Demonstrator
 from r2s.learning.env import TaskEnv
 from r2s.learning.learner import Learner
 from r2s.learning.networks import Policy
@@ -66,7 +67,7 @@ class Loop:
 
     Attributes:
         batch_size: transitions per update. updates_per_step: updates per step of all arms.
-        learning_starts: environment steps with uniform random actions.
+        learning_starts: environment steps before the first update, with actions of the demonstrator or random ones.
         replay_size: capacity of the replay buffer.
         lr_decay, lr_end: from this share of the budget on, the learning rate falls linearly to the share lr_end.
         explore_end: the standard deviation of exploration falls geometrically to this share at the end of the budget.
@@ -132,6 +133,7 @@ def train(
     loop: Loop,
     budget: Budget,
     *,
+    demonstrator: Demonstrator | None = None,
     checkpoint: Checkpoint | None = None,
     callbacks: Callbacks = Callbacks(),
 ) -> None:
@@ -142,6 +144,7 @@ def train(
         algo: a learner, for example r2s.learning.tqc.TQC.
         evaluate: policy -> Episodes, see r2s/learning/evaluate.py.
         loop, budget: settings.
+        demonstrator: acts in the first loop.learning_starts environment steps; None: uniform random actions.
         checkpoint: written after every evaluation; if it exists, the training continues from it.
         callbacks: for logs and progress.
 
@@ -149,7 +152,7 @@ def train(
         FloatingPointError: an action, observation, reward or loss is not finite.
     """
     keep_memory()
-    run = Training(env, algo, evaluate, loop)
+    run = Training(env, algo, evaluate, loop, demonstrator)
     if checkpoint:
         run.restore(checkpoint)
     while (spent := budget.spent(run.seconds, run.env_steps)) < 1.0:
@@ -182,9 +185,17 @@ class Training:
         factor: result of `Reward.adapt`, or of Reward.factor. evaluation: the last row of evaluations.csv.
     """
 
-    def __init__(self, env: TaskEnv, algo: Learner, evaluate: Callable[[Policy], Episodes], loop: Loop):
+    def __init__(
+        self,
+        env: TaskEnv,
+        algo: Learner,
+        evaluate: Callable[[Policy], Episodes],
+        loop: Loop,
+        demonstrator: Demonstrator | None = None,
+    ):
         self._began = time.perf_counter()
         self._env, self._algo, self._evaluate, self._loop = env, algo, evaluate, loop
+        self._demonstrator = demonstrator
         self.env_steps, self.updates, self.next_eval = 0, 0, loop.eval_env_steps
         self.factor = env.reward.factor
         self.evaluation: dict[str, Any] = {}
@@ -207,9 +218,7 @@ class Training:
     def step(self, spent: float) -> Iterator[None]:
         """Step all arms while the block runs, then store the transitions; `spent`: share of the budget."""
         env, state = self._env, self._state
-        observation = state["observation"].to(self._device)
-        random = self.env_steps < self._loop.learning_starts
-        state["action"] = env.action_spec.rand() if random else self._algo.explore(observation).cpu()
+        state["action"] = self._action(state["observation"])
         with self._dated_errors():
             pending = self._submit(env.step_and_maybe_reset, state)
         yield
@@ -220,6 +229,12 @@ class Training:
         self.factor = env.reward.adapt(self.factor, spent, terms, env.nsim)
         self._terms.append(terms)
         self.env_steps += env.nsim
+
+    def _action(self, observation: Tensor) -> Tensor:
+        """Return the actions (nsim, a) of the next step."""
+        if self.env_steps >= self._loop.learning_starts:
+            return self._algo.explore(observation.to(self._device)).cpu()
+        return self._demonstrator.action(observation) if self._demonstrator else self._env.action_spec.rand()
 
     def update(self) -> dict[str, torch.Tensor]:
         """Do one gradient update on a batch with the present reward weights; return the losses."""

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,7 @@ class Parts:
     evaluate: Any = None
     loop: Any = None
     budget: Any = None
+    demonstrator: Any = None
 
 
 def make_parts(cfg):
@@ -76,6 +77,7 @@ def make_parts(cfg):
     """
     import torch
 
+    from r2s.learning.demonstrations import make_demonstrator
     from r2s.learning.env import TaskEnv
     from r2s.learning.evaluate import SELECTION, make_evaluation
     from r2s.learning.policy import normalization
@@ -85,9 +87,8 @@ def make_parts(cfg):
     episodes, learns = cfg.evaluation.episodes, is_learner(cfg)
     check_number("evaluation.episodes", episodes, "[1, inf)", whole=True)
     if learns:
-        n_envs, loop, settings = split_algo(cfg)
+        n_envs, demonstrations, loop, settings = split_algo(cfg)
         budget = called(Budget, "budget", plain(cfg.budget))
-        check_length(budget, loop, n_envs)
     robot, model = make_robot(cfg), with_own_calibration(cfg)
     center = make_dynamics(model, robot)
     task, draw = make_task(cfg, robot, center), make_draw(model, robot, center)
@@ -102,16 +103,20 @@ def make_parts(cfg):
     evaluate = make_evaluation(robot, task, draw, episodes=episodes, nthread=cfg.threads, seed=SELECTION)
     action_scale = torch.from_numpy(task.control(robot).action_scale)
     algo = called(target(cfg.algo, "algo"), "algo", settings, normalization(robot, task), action_scale)
-    return Parts(robot, task, draw, episodes, algo.to(device(cfg)), env, evaluate, loop, budget)
+    demonstrator = make_demonstrator(robot, task, center) if demonstrations else None
+    if demonstrator:
+        loop = replace(loop, learning_starts=demonstrations)
+    check_length(budget, loop, n_envs, "demonstrations" if demonstrator else "learning_starts")
+    return Parts(robot, task, draw, episodes, algo.to(device(cfg)), env, evaluate, loop, budget, demonstrator)
 
 
-def check_length(budget, loop, n_envs):
-    """Raise UserError if the budget ends before the first update."""
+def check_length(budget, loop, n_envs, key):
+    """Raise UserError if the budget ends before the first update, for which algo.`key` is the reason."""
     before = n_envs * max(1, math.ceil(loop.learning_starts / n_envs))
     if budget.env_steps is not None and budget.env_steps <= before:
         raise UserError(
             f"budget.env_steps: expected more than {before}, the env steps before the first update of "
-            f"algo.learning_starts={loop.learning_starts} and algo.n_envs={n_envs}, got {budget.env_steps}"
+            f"algo.{key}={loop.learning_starts} and algo.n_envs={n_envs}, got {budget.env_steps}"
         )
 
 
@@ -162,7 +167,7 @@ def train(cfg, overrides):
 
         callbacks = Callbacks(lambda row: run.log("metrics", row), evaluated, show)
         given = parts.env, algo, parts.evaluate, parts.loop, parts.budget
-        run_train(*given, checkpoint=checkpoint, callbacks=callbacks)
+        run_train(*given, demonstrator=parts.demonstrator, checkpoint=checkpoint, callbacks=callbacks)
         progress.close()
         conclude(cfg, run, parts, selection)
         checkpoint.clear()
@@ -194,16 +199,18 @@ def share_threads(cfg):
 
 
 def split_algo(cfg):
-    """Return number of arms, `Loop` and the learner's settings of conf/algo."""
+    """Return number of arms, env steps of demonstrations, `Loop` and the learner's settings of conf/algo."""
     from r2s.learning.train import Loop
 
     settings = {k: v for k, v in plain(cfg.algo).items() if k not in ("_target_", "name")}
     n_envs = settings.pop("n_envs", 32)
     check_number("algo.n_envs", n_envs, "[1, inf)", whole=True)
+    demonstrations = settings.pop("demonstrations", 0)
+    check_number("algo.demonstrations", demonstrations, "[0, inf)", whole=True)
     loop = {f.name: settings.pop(f.name) for f in fields(Loop) if f.name in settings}
     loop |= {"eval_env_steps": cfg.evaluation.env_steps, "compile": cfg.compile, "matmul": cfg.matmul}
     loop |= {"concurrent": all_threads(cfg) > 1}
-    return n_envs, Loop(**loop), settings
+    return n_envs, demonstrations, Loop(**loop), settings
 
 
 def with_own_calibration(cfg):
