@@ -31,7 +31,7 @@ from common import (
 RUNS = ROOT / "runs"
 TWIN_STEPS = 500_000  # env steps: 2 to 4 minutes of a core
 GOALS = 60  # of the trainings with noise
-STEPS = ("budget.minutes=null", f"budget.env_steps={TWIN_STEPS}")
+STEPS = ("algo.demonstrations=0", "budget.minutes=null", f"budget.env_steps={TWIN_STEPS}")
 NOISES = (0.0, 0.05)  # rad/s
 STIFF = 6e4  # Nm/rad, gears of the strongest joints: four times the twin's own
 NOMINAL = ("friction=gaz2019", "inertia=nominal")
