@@ -73,12 +73,13 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
         loader = GlobalHydra.instance().config_loader()
 
         def options(group: str) -> list[str]:
-            return [o for o in loader.get_group_options(group) if o != NO_OPTION]
+            return [o for o in loader.repository.get_group_options(group) if o != NO_OPTION]  # type: ignore[attr-defined]
 
         groups = {g: options(g) for g in loader.list_groups("") if g != "hydra"}
         experiments = [w for w in words if w.lstrip("+").startswith("experiment=")]  # one may choose a launcher
         of_groups = {f"hydra/{g}": options(f"hydra/{g}") for g in loader.list_groups("hydra")}
-        _check_hydra(of_hydra, [*own, *experiments], of_groups)
+        if of_hydra:
+            _check_hydra(of_hydra, [*own, *experiments], of_groups)
         try:
             names, jobs = _jobs(words, own, groups, multirun)
             configs = [compose("config", job, return_hydra_config=True) for job in jobs]

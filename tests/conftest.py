@@ -30,6 +30,7 @@ TOGETHER = {
     "identified": ("found", "directly", "linked"),
     "own_law": ("own_law",),
     "own_family": ("own_family",),
+    **{name: (name,) for name in ("sides", "servers", "hard", "installed", "results")},
 }
 # What most tests call is compiled before the workers start, in two processes: each worker would compile it all.
 SHARED = (
