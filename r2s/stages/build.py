@@ -257,7 +257,7 @@ def training_keys():
     """Return the keys of conf/algo that only trainings use; an experiment may set them for a controller, too."""
     from r2s.learning.train import Loop
 
-    return ("n_envs", "hidden", *(f.name for f in fields(Loop)))
+    return ("n_envs", "demonstrations", "hidden", *(f.name for f in fields(Loop)))
 
 
 def make_controller(cfg, robot, task, dynamics):
