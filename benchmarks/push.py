@@ -35,9 +35,11 @@ def main() -> None:
         jobs += [[*POLICY, f"seed={seed}", f"root={RUNS}", f"name=seed_{seed}"] for seed in SEEDS]
         run_parallel(jobs)
     rows = {"`algo=pusher`": cells("reference")} | {f"policy, seed {s}": cells(f"seed_{s}") for s in SEEDS}
+    rows = {label: row for label, row in rows.items() if row}
     parts = [
+        f"{len(rows) - 1} of {len(SEEDS)} trainings have finished; the last policy of each.",
         f"`python run.py {' '.join(POLICY)}`, one core each; 200 goals, `dr=box`: each with its own box and arm.",
-        markdown_rows({label: row for label, row in rows.items() if row}),
+        markdown_rows(rows),
     ]
     write_page("push", "Pushing a box", "python benchmarks/push.py", parts)
 
