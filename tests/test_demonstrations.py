@@ -12,6 +12,7 @@ from test_press import PANDA, TRUE
 from test_push import make_task as pushing
 
 from r2s.learning.demonstrations import make_demonstrator
+from r2s.learning.model_based import Oracle
 from r2s.learning.train import Loop, Training
 from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
@@ -57,7 +58,7 @@ def test_noise_grows_from_arm_to_arm_and_keeps_actions_in_range(panda, dynamics)
     observation = env.reset()["observation"]
     torch.manual_seed(0)
     one, other = (make_demonstrator(panda, env.task, dynamics) for _ in range(2))
-    reference = make_demonstrator(panda, env.task, dynamics)._reference.action(observation)
+    reference = Oracle(panda, env.task, dynamics).action(observation)
     actions = torch.stack([one.action(observation) for _ in range(50)])
     assert torch.equal(actions[0, 0], reference[0])
     assert actions.abs().max() <= 1.0
