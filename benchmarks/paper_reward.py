@@ -18,7 +18,6 @@ from paper_returns import GAMMAS, PROFILES, SHARES, Motions, shaking, step_cost
 
 RUNS_AT = ROOT / "runs" / "paper_reward"
 SHARED = ("budget.minutes=null", "evaluation.env_steps=62500", "evaluation.episodes=100", "dr=paper")
-SHARED += ("algo.demonstrations=0",)
 FALLING = {  # exploration: correlated, and falling to where a joint at rest stays at rest
     "tqc": ("algo.explore_end=0.05",),
     "ddpg": ("algo.explore_std=0.2", "algo.explore_end=0.01"),
@@ -27,6 +26,7 @@ EARLY = (
     "reward=to_paper",
     "reward.anneal=[0.3,0.7]",
 )  # eq. (2) acts alone before noise and learning rate have fallen
+ALONE = ("reward=paper", "algo.action_l2=0")
 CORRELATED = ("algo.explore_correlation=0.9",)
 STILLS = (0.003, 0.01, 0.03, 0.06, 0.1, 0.3)  # standard deviations of an action
 PULLS = (0.0, 1.54, 3.0, 5.0, 7.0)  # S of the figure
@@ -40,12 +40,14 @@ class Way:
     env_steps: int
     words: tuple[str, ...]
     falling: bool = True
+    demonstrations: int = 0
 
     def job(self, name: str, algo: str, gamma: float, seed: int) -> list[str]:
         """Return the words of one training."""
         words = [*SHARED, *self.words, *(FALLING[algo] if self.falling else ()), f"algo={algo}", f"seed={seed}"]
         return [
             *words,
+            f"algo.demonstrations={self.demonstrations}",
             f"algo.gamma={gamma:g}",
             f"budget.env_steps={self.env_steps}",
             f"root={RUNS_AT}",
@@ -55,7 +57,8 @@ class Way:
 
 WAYS = {
     "settled": Way("+experiment=paper_reward", 500_000, ("+experiment=paper_reward",), falling=False),
-    "alone": Way("eq. (2) alone, action_l2 0", 250_000, ("reward=paper", "algo.action_l2=0", *CORRELATED)),
+    "alone": Way("eq. (2) alone, action_l2 0", 250_000, (*ALONE, *CORRELATED)),
+    "demonstrated": Way("the same with demonstrations", 250_000, (*ALONE, *CORRELATED), demonstrations=6400),
     "weighed": Way("eq. (2) alone, action_l2 0.5", 500_000, ("reward=paper", *CORRELATED)),
     "noisy": Way("curriculum that ends in eq. (2), noise stays", 500_000, EARLY, falling=False),
     "quiet": Way("curriculum that ends in eq. (2), noise falls", 500_000, EARLY),
@@ -70,6 +73,7 @@ RUNS += [  # every row's first seed first
         ("quiet", ("tqc",), (0.99, 0.97, 0.995)),
         ("noisy", ("tqc",), (0.99,)),
         ("weighed", ("tqc", "ddpg"), (0.99,)),
+        ("demonstrated", ("tqc", "ddpg"), (0.99,)),
         ("alone", ("tqc", "ddpg"), (0.99, 0.97, 0.995, 0.95)),
     )
     for gamma in gammas
@@ -173,7 +177,7 @@ def plot(stops: dict) -> None:
         middle.plot(d, cost, label=f"S = {s:g}")
         middle.plot(d[cost.argmin()], cost.min(), "ko", markersize=4)
     middle.set(xlabel="distance over d0", ylabel="cost of a step", title="Shaking, S = sum tanh|ddq|")
-    colors = dict(zip(WAYS, ("k", "C3", "C1", "C0", "C2"), strict=True))
+    colors = dict(zip(WAYS, ("k", "C3", "C4", "C1", "C0", "C2"), strict=True))
     for run in finished():
         curve = pd.read_csv(folder(run) / "evaluations.csv")
         label = WAYS[run[0]].label
