@@ -166,8 +166,10 @@ def torchrl_update(algo: TQC, batch: Mapping[str, torch.Tensor], lr: float) -> C
     loss = TQCLoss(actor, critic, num_qvalue_nets=2, target_entropy=-float(n), alpha_init=0.01)
     loss.make_value_estimator(gamma=algo.gamma)
     target = SoftUpdate(loss, eps=1.0 - algo.tau)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
-    flags = torch.zeros(b, 1, dtype=torch.bool)
+    device = batch["action"].device
+    loss = loss.to(device)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True, capturable=device.type == "cuda")
+    flags = torch.zeros(b, 1, dtype=torch.bool, device=device)
     following = {"observation": batch["next_observation"], "reward": batch["reward"][:, None]}
     following |= {"done": flags, "terminated": flags.clone()}
     seen = {"observation": batch["observation"], "action": batch["action"], "next": following}
@@ -191,10 +193,10 @@ def random_batch(robot, b: int) -> dict[str, torch.Tensor]:
     return batch | {"action": torch.rand(b, n) * 2 - 1, "reward": torch.randn(b), "terminated": torch.zeros(b)}
 
 
-def make_tqc(robot, mode: Mode, b: int, hidden: Sequence[int] = HIDDEN) -> TQC:
+def make_tqc(robot, mode: Mode, b: int, hidden: Sequence[int] = HIDDEN, device: str = "cpu") -> TQC:
     """Return a learner in this mode for batches of b."""
     mean, std = (torch.from_numpy(x).float() for x in ReachTask().observation_scale(robot))
-    algo = TQC((mean, std), torch.ones(robot.n), hidden=hidden, gamma=0.98, tau=0.005, lr=LR)
+    algo = TQC((mean, std), torch.ones(robot.n), hidden=hidden, gamma=0.98, tau=0.005, lr=LR).to(device)
     if mode.compiled:
         with matmul_precision(mode.matmul):
             if not algo.compile(b):

@@ -217,16 +217,6 @@ def test_a_checkpoint_of_a_gpu_loads_without_one(panda, tmp_path):
     assert second == algo.update(batch)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no GPU")
-def test_noise_of_a_gpu_goes_on_where_it_stopped():
-    gpu = torch.device("cuda:0")
-    torch.cuda.manual_seed(0)
-    states = generators(gpu)
-    first = torch.randn(5, device=gpu)
-    set_generators(states, gpu)
-    assert torch.equal(first, torch.randn(5, device=gpu))
-
-
 def train_briefly(env, algo, concurrent=False):
     evaluate = make_evaluation(env.robot, env.task, env.draw, episodes=2, nthread=1)
     loop = Loop(batch_size=16, learning_starts=80, concurrent=concurrent)
