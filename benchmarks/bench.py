@@ -204,10 +204,13 @@ def make_tqc(robot, mode: Mode, b: int, hidden: Sequence[int] = HIDDEN, device: 
     return algo
 
 
-def learner(robot, threads: int, mode: Mode, b: int = 256, hidden: Sequence[int] = HIDDEN) -> tuple[float, float]:
+def learner(
+    robot, threads: int, mode: Mode, b: int = 256, hidden: Sequence[int] = HIDDEN, device: str = "cpu"
+) -> tuple[float, float]:
     """Compare TQC updates with TorchRL's, both in the same mode: networks, batch, optimiser; updates/s."""
     torch.set_num_threads(threads)
-    algo, batch = make_tqc(robot, mode, b, hidden), random_batch(robot, b)
+    algo = make_tqc(robot, mode, b, hidden, device)
+    batch = {k: v.to(device) for k, v in random_batch(robot, b).items()}
     theirs = torchrl_update(algo, batch, LR)
     theirs = torch.compile(theirs) if mode.compiled else theirs
 
@@ -216,6 +219,8 @@ def learner(robot, threads: int, mode: Mode, b: int = 256, hidden: Sequence[int]
             with matmul_precision(mode.matmul):
                 for _ in range(10):
                     update()
+            if device == "cuda":
+                torch.cuda.synchronize()
 
         return run
 
@@ -318,6 +323,9 @@ def main() -> None:
             peer = "both" if not mode.compiled else "ours"
             rows[f"TQC / sb3-contrib's TQC, {peer} {mode}, updates/s, {at}"] = against_sb3(robot, threads, mode, sb3)
     sb3.close()
+    for mode in MODES if torch.cuda.is_available() else ():  # compiled, r2s captures a graph and TorchRL does not
+        what = f"TQC / TorchRL's TQCLoss, both {mode}, updates/s, {torch.cuda.get_device_name()}"
+        rows[what] = learner(robot, 1, mode, device="cuda")
     table = Table(title=f"{MACHINE}, mujoco {mujoco.__version__}, torch {torch.__version__}")
     for column in ("what", "r2s", "peer", "ratio"):
         table.add_column(column, justify="left" if column == "what" else "right")

@@ -106,6 +106,6 @@ def test_a_machine_without_a_gpu_goes_on_and_runs_the_policy(tmp_path):
     stopped = stop_training("moved", tmp_path)
     assert command(f"resume={stopped}", at=tmp_path, gpu=False).wait() == 2  # its device is missing, and it says so
     assert command(f"resume={stopped}", "device=cpu", at=tmp_path, gpu=False).wait() == 0
-    words = ("stage=transfer", f"policy={stopped}", "evaluation.episodes=2", "root=runs", "name=there")
+    words = ("stage=transfer", f"policy={stopped}", "arm=none", "evaluation.episodes=2", "root=runs", "name=there")
     assert command(*words, at=tmp_path, gpu=False).wait() == 0
     assert (tmp_path / "runs" / "transfer" / "there" / "summary.json").is_file()

@@ -177,7 +177,9 @@ def _dartpy() -> ModuleType:
     try:
         import dartpy
     except ImportError as error:
-        raise UserError(f"the DART engine needs dartpy ({error}): pip install dartpy") from None
+        missing = error.name == "dartpy"  # otherwise a shared library of its own, such as libGL on a bare machine
+        why = "which is not installed: pip install dartpy" if missing else f"which does not import: {error}"
+        raise UserError(f"the DART engine needs dartpy, {why}") from None
     return dartpy
 
 
