@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import Stopped, UserError, check_number, choices, nearest
+from r2s.errors import FAILED, Stopped, UserError, check_number, choices, nearest
 from r2s.override_checks import COMMANDS, check_overrides, extended
 from r2s.stages.build import GROUP, STAGES
 from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replayed, run_config
@@ -27,7 +27,6 @@ MOST_SEED = 2**32 - 1  # of some generators of NumPy
 ABSENT = "not there"
 # keys that may differ where skip_completed goes on: where a run is, how it is shown, on how many cores
 FREE = ("name", "root", "resume", "skip_completed", "threads", "tracker", "trust", "grid")
-FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of its jobs
 
 
 def main():

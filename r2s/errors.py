@@ -6,6 +6,8 @@ from difflib import get_close_matches
 from numbers import Integral, Real
 from types import ModuleType
 
+FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of its jobs
+
 
 class UserError(ValueError):
     """A wrong input: one line with the option or file, the expected value, the value found and the nearest match."""

@@ -529,11 +529,11 @@ from r2s.physics.dynamics import nominal_dynamics
 class Stopping(SimulatedArm):
     \"""An arm without an operator; a user stop ends its second motion.\"""
 
-    def __init__(self, robot, noise=0, motions=0, stop_s=0.15):
+    def __init__(self, robot, noise=0, motions=0, stop_s=0.15, error=None):
         self.operator, self.blocked, self._motions = (lambda reason: False), None, 0
         dynamics = nominal_dynamics(robot, phi1=[1.0] * 7, phi2=[9.0] * 7, phi3=[0.0] * 7)
         super().__init__(robot, dynamics, position_noise=0.0, velocity_noise=0.0)
-        self._motions, self._stop_s = noise + motions, stop_s
+        self._motions, self._stop_s, self._error = noise + motions, stop_s, error
 
     def move_to(self, q):
         if self.blocked is not None:
@@ -543,11 +543,13 @@ class Stopping(SimulatedArm):
 
     def command(self, tau):
         if self._motions == 2 and self.read().t >= self._stop_s:
+            if self._error:
+                raise FloatingPointError(self._error)
             self.blocked = "user stop"
             raise ArmStopped(self.blocked)
         super().command(tau)
 """
-STOPPING_YAML = "_target_: stopping.Stopping\nname: stopping\nmotions: 0\nstop_s: 0.15\n"
+STOPPING_YAML = "_target_: stopping.Stopping\nname: stopping\nmotions: 0\nstop_s: 0.15\nerror: null\n"
 
 
 @pytest.fixture
@@ -603,6 +605,15 @@ def test_an_arm_that_stops_in_its_last_episode_moves_in_no_later_job(trained, st
     done = r2s("-m", "--config-dir", "conf", *words, *TOY, "seed=0,1", at=stopping)
     assert done.returncode == 3, done.stdout + done.stderr
     assert re.search(r"^stopped: 2 of 2 goals done on arm=stopping: user stop; see ", done.stderr, flags=re.M)
+    assert len(list((stopping / "runs" / "transfer").iterdir())) == 1
+
+
+def test_an_error_while_an_arm_moves_ends_the_sweep(trained, stopping):
+    """The arm moves in no later job before the operator has seen why this one failed."""
+    words = ["stage=transfer", f"policy={trained.resolve()}", "arm=stopping", "arm.error=tau is nan"]
+    done = r2s("-m", "--config-dir", "conf", *words, *TOY, "simulator=none", "seed=0,1", at=stopping)
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert "stopped: arm=stopping: tau is nan; the sweep ends with the job that failed" in done.stderr
     assert len(list((stopping / "runs" / "transfer").iterdir())) == 1
 
 

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import Stopped, UserError, check_number, choices, nearest
+from r2s.errors import FAILED, Stopped, UserError, check_number, choices, nearest
 from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
@@ -150,7 +150,22 @@ def opened_arm(cfg, robot, noise=0, task=None, adapter=None, **more):
             arm = stack.enter_context(arm) if hasattr(arm, "__enter__") else arm
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
-        yield arm
+        with ends_sweep(cfg):
+            yield arm
+
+
+@contextmanager
+def ends_sweep(cfg):
+    """End a whole sweep, not only its job, if an error leaves the block while an arm that is no twin is open.
+
+    The next job would move the arm again before the operator knows why this one failed.
+    """
+    try:
+        yield
+    except (UserError, FloatingPointError, OSError, MemoryError) as error:
+        if FAILED not in os.environ or is_twin(cfg):
+            raise
+        raise Stopped(f"arm={cfg.arm.name}: {error}; the sweep ends with the job that failed") from error
 
 
 def is_simulated(cfg):
@@ -191,7 +206,8 @@ def opened_runner(cfg, robot, task, dynamics, noise=0, adapter=None):
         except ArmStopped as stop:
             raise UserError(f"arm={cfg.arm.name}: {stop}") from None
         try:
-            yield arms
+            with ends_sweep(cfg):
+                yield arms
         except ArmStopped as stop:  # the process of the arm has ended
             raise Stopped(f"arm={cfg.arm.name}: {stop}") from None
 
