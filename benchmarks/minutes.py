@@ -38,7 +38,7 @@ class Part:
 
 
 PARTS = {
-    "one": Part(1, range(180, 185), alone=True),
+    "one": Part(1, range(185, 190), alone=True),
     "four": Part(4, range(165, 170)),
     "twelve": Part(12, range(170, 175), ("reward=long",)),
 }
