@@ -39,7 +39,7 @@ class Part:
 
 PARTS = {
     "one": Part(1, range(185, 190), alone=True),
-    "four": Part(4, range(165, 170)),
+    "four": Part(4, range(165, 170), ("reward=long",)),
     "twelve": Part(12, range(170, 175), ("reward=long",)),
 }
 WHICH = {"last": "last", "saved": "saved, 1000 other goals"}
