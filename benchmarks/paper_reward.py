@@ -58,7 +58,9 @@ class Way:
 WAYS = {
     "settled": Way("+experiment=paper_reward", 500_000, ("+experiment=paper_reward",), falling=False),
     "alone": Way("eq. (2) alone, action_l2 0", 250_000, (*ALONE, *CORRELATED)),
-    "demonstrated": Way("the same with demonstrations", 250_000, (*ALONE, *CORRELATED), demonstrations=6400),
+    "demonstrated": Way(
+        "eq. (2) alone, action_l2 0, demonstrations", 250_000, (*ALONE, *CORRELATED), demonstrations=6400
+    ),
     "weighed": Way("eq. (2) alone, action_l2 0.5", 500_000, ("reward=paper", *CORRELATED)),
     "noisy": Way("curriculum that ends in eq. (2), noise stays", 500_000, EARLY, falling=False),
     "quiet": Way("curriculum that ends in eq. (2), noise falls", 500_000, EARLY),
@@ -187,7 +189,11 @@ def plot(stops: dict) -> None:
         right.plot(x, y, style, color=colors[run[0]], label=None if label in seen else label)
     right.axhline(20.0, color="black", linestyle=":")
     right.set(
-        xlabel="million env steps", ylabel="median distance, mm", yscale="log", title="Trainings (dashed: ddpg)"
+        xlabel="million env steps",
+        ylabel="median distance, mm",
+        yscale="log",
+        ylim=(0.9, 5e3),
+        title="Trainings (dashed: ddpg)",
     )
     for axis in (left, middle, right):
         axis.legend(fontsize=7)
