@@ -46,7 +46,7 @@ WHICH = {"last": "last", "saved": "saved, 1000 other goals"}
 SHOWN = (  # policy, measure, label, scale, targets after 1, 4 and 12 minutes
     ("last", "success_1cm", "< 1 cm, %", 100, {"one": 98.0, "four": 98.0}),
     ("last", "success_5mm", "< 5 mm, %", 100, {}),
-    ("last", "return_paper", "return", 1, {"twelve": -80.0}),
+    ("last", "return_paper", "return", 1, {"four": -75.0, "twelve": -80.0}),
     ("last", "rest", "at rest, %", 100, {"one": 98.0, "four": 98.0, "twelve": 98.0}),
     ("last", "limited", "cycles limited by the safety filter, %", 100, {"four": 5.0, "twelve": 5.0}),
     ("saved", "success_1cm", "< 1 cm, %", 100, {"four": 98.0}),

@@ -1,6 +1,6 @@
 """Why does reward=paper, eq. (2) of the paper, not reach, and what does?
 
-`python benchmarks/paper_reward.py` trains what is missing (RUNS: five hours on one core) and writes
+`python benchmarks/paper_reward.py` trains what is missing (RUNS: three hours on one core) and writes
 benchmarks/results/paper_reward.md with its figure; `page` trains nothing. Finished trainings are kept, so you may
 interrupt it; the first seed of every row comes first. Run folders: runs/paper_reward/train/*.
 """

@@ -74,7 +74,7 @@ def test_noise_goes_on_where_it_stopped():
 
 
 def command(*words, at, gpu=True):
-    """Start run.py; without `gpu` it runs as on a machine that has none."""
+    """Start run.py, which a fork with CUDA could not be; without `gpu` it runs as on a machine that has none."""
     hidden = {} if gpu else {"CUDA_VISIBLE_DEVICES": ""}
     return subprocess.Popen([sys.executable, str(RUN), *words], cwd=at, env=os.environ | hidden)
 

@@ -16,6 +16,7 @@ from r2s.physics.dynamics import nominal_dynamics
 from r2s.physics.robot import load_robot
 from r2s.recordings.recording import Recording
 from r2s.tasks.reach import ReachTask
+from r2s.tasks.rollout import REST
 
 ARM = """
 <mujoco model="threelink">
@@ -228,3 +229,13 @@ def test_a_tool_is_read_with_the_robot(tmp_path):
         load_robot(tool=str(tmp_path / "tol.json"))
     with pytest.raises(UserError, match=r"^robot\.tool: .*directory"):
         load_robot(tool=str(tmp_path))
+
+
+def test_a_wrist_that_reaching_turns_comes_to_rest():
+    """Friction at the speed that counts as rest exceeds the torque of an action of 1 in joints 5 and 7."""
+    robot = load_robot(**conf("robot/panda"))
+    dynamics = nominal_dynamics(robot, **conf("friction/paper"), inertia_scale=conf("inertia/paper")["scale"])
+    task = ReachTask(torque_fraction=tuple(conf("task/reach")["torque_fraction"]))
+    for speed in (-REST, REST):
+        holds = task.torque_limit(robot) < np.abs(dynamics.friction(np.full(robot.n, speed)))
+        assert holds[[4, 6]].all()
