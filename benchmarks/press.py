@@ -3,8 +3,9 @@
     python benchmarks/press.py [minutes=8] [rigid_0 elastic_0 ...]
 
 Identifies each twin, evaluates `algo=hybrid_force` with both models, trains policies on the identified one if minutes
-are given, and runs all on the twin with its surface, EPISODES goals each. Writes results/press.md. Finished runs are
-kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and minutes= twice more.
+are given, with the twin's seed, and runs all on the twin with its surface, EPISODES goals each. Writes
+results/press.md. Finished runs are kept in runs/press and not repeated. A twin takes about 4 minutes of one core, and
+minutes= twice more.
 """
 
 import json
@@ -45,7 +46,8 @@ def models_of(task: str, twins: list[Twin], minutes: str | None) -> dict[str, di
     for what, words in algos.items():
         names[f"{what}, identified"] = {(v, s): f"{task}_{what}_{v}_{s}" for v, s in twins}
         for (v, s), name in names[f"{what}, identified"].items():
-            jobs.append([*common, f"calibration={RUNS / 'identify' / f'{v}_{s}'}", *words, f"name={name}"])
+            own = f"calibration={RUNS / 'identify' / f'{v}_{s}'}", f"seed={s}"
+            jobs.append([*common, *own, *words, f"name={name}"])
     run_parallel(jobs)
     return names
 
@@ -83,7 +85,8 @@ def main() -> None:
     named = [w for w in words if re.fullmatch(r"(rigid|elastic)_\d+", w)] or ["rigid_0", "elastic_0"]
     twins = [(v, s) for v, _, s in (name.partition("_") for name in named)]
     identify_twins([(v, int(s), RUNS / "identify" / f"{v}_{s}") for v, s in twins], RUNS)
-    parts = [part for task in TABLES for part in section(task, models_of(task, twins, minutes))]
+    about = [f"Policies: `algo=tqc budget.minutes={minutes}` on one core, the twin's seed."] if minutes else []
+    parts = about + [part for task in TABLES for part in section(task, models_of(task, twins, minutes))]
     write_page("press", "Pressing and wiping", " ".join(["python benchmarks/press.py", *words]), parts)
 
 

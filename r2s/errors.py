@@ -1,6 +1,7 @@
 """Exceptions that end a run with one line of text: exit status 2 for a user's mistake, 3 for a stopped arm."""
 
 import importlib
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -41,8 +42,22 @@ def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         package = module.split(".")[0]
-        why = "which is not installed" if error.name in (module, package) else f"which does not import ({error})"
-        raise UserError(f"{needed_by} needs {package}, {why}: pip install 'r2s[{extra}]'") from None
+        raise UserError(f"{needed_by} needs {package}, {import_failure(error, package, f'r2s[{extra}]')}") from None
+
+
+def import_failure(error: ImportError, package: str, install: str) -> str:
+    """Return why a package does not import: it, a package it needs, or a shared library is missing.
+
+    Args:
+        error: of the import. An extension that misses a shared library, such as libGL, raises an ImportError with its
+            own name; a missing package a ModuleNotFoundError.
+        install: argument of pip that brings the packages.
+    """
+    if not isinstance(error, ModuleNotFoundError):
+        return f"which does not import ({error})"
+    absent = (error.name or "").split(".")[0] == package
+    why = "which is not installed" if absent else f"which does not import ({error})"
+    return f"{why}: pip install {install if install == package else repr(install)}"
 
 
 def check_number(name: str, value: object, interval: str, whole: bool = False) -> None:
@@ -58,7 +73,10 @@ def check_number(name: str, value: object, interval: str, whole: bool = False) -
     """
     low, high = (float(end) for end in interval[1:-1].split(","))
     if isinstance(value, Integral if whole else Real) and not isinstance(value, bool):
-        x = float(value)  # type: ignore[arg-type]
+        try:
+            x = float(value)  # type: ignore[arg-type]
+        except OverflowError:  # an integer of more than 308 digits
+            x = math.inf
         if (low < x or (x == low and interval[0] == "[")) and (x < high or (x == high and interval[-1] == "]")):
             return
     kind = "whole number" if whole else "number"

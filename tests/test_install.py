@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
@@ -104,6 +105,14 @@ def test_a_package_that_does_not_import_says_why(tmp_path, monkeypatch):
     (tmp_path / "half.py").write_text("import no_such_package")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(UserError, match=r"^arm=x needs half, which does not import \(No module named 'no_such_pack"):
+        optional_import("half", "arm=x", "panda")
+
+
+def test_an_extension_that_misses_a_library_says_which(tmp_path, monkeypatch):
+    """It is installed: the error of the dynamic linker, and no pip line."""
+    (tmp_path / f"half{EXTENSION_SUFFIXES[0]}").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UserError, match=r"^arm=x needs half, which does not import \(.*half.*\)$"):
         optional_import("half", "arm=x", "panda")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from r2s.errors import UserError
+from r2s.errors import UserError, import_failure
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
 from r2s.physics.welds import Bodies, about, make_pose, shaped
@@ -177,9 +177,7 @@ def _dartpy() -> ModuleType:
     try:
         import dartpy
     except ImportError as error:
-        missing = error.name == "dartpy"  # otherwise a shared library of its own, such as libGL on a bare machine
-        why = "which is not installed: pip install dartpy" if missing else f"which does not import: {error}"
-        raise UserError(f"the DART engine needs dartpy, {why}") from None
+        raise UserError(f"the DART engine needs dartpy, {import_failure(error, 'dartpy', 'dartpy')}") from None
     return dartpy
 
 

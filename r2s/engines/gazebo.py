@@ -131,8 +131,10 @@ def bindings() -> ModuleType:
     for name in RELEASES:
         try:
             return importlib.import_module(name)
-        except ImportError:
+        except ModuleNotFoundError:
             continue
+        except ImportError as error:
+            raise UserError(f"simulator=gazebo needs {name}, which does not import ({error})") from None
     raise UserError(
         "simulator=gazebo: gz-sim's Python bindings (gz.sim, gz.sim9 or gz.sim8) are not installed; install Gazebo "
         "from OSRF's apt repository or conda-forge, or use simulator=dart, the same physics engine"
