@@ -1,8 +1,8 @@
 """Train TD3 as CleanRL writes it, in one file, on a batch of simulated arms.
 
 `python examples/cleanrl_td3.py 200000 calibration=runs/identify/arm dr=identified`: environment steps, then options
-of the command line. Every loop over a Gymnasium vector environment looks like this one. Rates,
-discount and sizes are those of conf/algo/td3.yaml.
+of the command line. Every loop over a Gymnasium vector environment looks like this one. The buffer keeps the terms of
+the reward, so that old transitions follow the weights of the curriculum.
 """
 
 import copy
@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from r2s.learning.evaluate import make_evaluation
 
 ARMS, LEARNING_STARTS, BATCH_SIZE = 32, 3200, 256
-GAMMA, TAU, LR = 0.95, 0.02, 1e-3
+GAMMA, TAU, LR = 0.97, 0.02, 1e-3
 EXPLORATION_NOISE, POLICY_NOISE, NOISE_CLIP, POLICY_FREQUENCY = 0.5, 0.2, 0.5, 2
 
 
@@ -49,7 +49,8 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     target_actor, qf1_target, qf2_target = (copy.deepcopy(n) for n in (actor, qf1, qf2))
     q_optimizer = torch.optim.Adam([*qf1.parameters(), *qf2.parameters()], lr=LR)
     actor_optimizer = torch.optim.Adam(actor.parameters(), lr=LR)
-    replay = {k: torch.zeros(env_steps, n) for k, n in (("obs", d), ("next_obs", d), ("action", a), ("rest", 2))}
+    sizes = {"obs": d, "next_obs": d, "action": a, "terms": len(envs.unwrapped.env.weights), "terminated": 1}
+    replay = {key: torch.zeros(env_steps, size) for key, size in sizes.items()}
 
     obs, _ = envs.reset(seed=seed)
     envs.action_space.seed(seed)
@@ -61,21 +62,20 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
             with torch.no_grad():
                 mean = actor(torch.from_numpy(obs))
                 actions = (mean + EXPLORATION_NOISE * torch.randn_like(mean)).clamp(-1.0, 1.0).numpy()
-        next_obs, rewards, terminations, truncations, infos = envs.step(actions)
-        real_next_obs = next_obs.copy()
+        next_obs, _, terminations, truncations, infos = envs.step(actions)
+        real_next_obs, terms = next_obs.copy(), infos["reward_terms"]
         for i in np.flatnonzero(truncations | terminations):  # next_obs begins the next episode there
-            real_next_obs[i] = infos["final_obs"][i]
-        now = slice(global_step, global_step + ARMS)
-        rest = np.stack([rewards, terminations], 1)
-        for key, value in (("obs", obs), ("next_obs", real_next_obs), ("action", actions), ("rest", rest)):
-            replay[key][now] = torch.from_numpy(np.asarray(value, dtype=np.float32))
+            real_next_obs[i], terms[i] = infos["final_obs"][i], infos["final_info"]["reward_terms"][i]
+        for key, value in zip(replay, (obs, real_next_obs, actions, terms, terminations[:, None]), strict=True):
+            replay[key][global_step : global_step + ARMS] = torch.from_numpy(np.asarray(value, dtype=np.float32))
         obs = next_obs
         if global_step < LEARNING_STARTS:
             continue
 
         rows = torch.randint(global_step + ARMS, (BATCH_SIZE,))
         x, next_x, action = (replay[key][rows] for key in ("obs", "next_obs", "action"))
-        reward, terminated = replay["rest"][rows].split(1, dim=1)
+        weights = torch.from_numpy(envs.unwrapped.env.weights[:, None].astype(np.float32))
+        reward, terminated = replay["terms"][rows] @ weights, replay["terminated"][rows]
         with torch.no_grad():
             noise = (POLICY_NOISE * torch.randn_like(action)).clamp(-NOISE_CLIP, NOISE_CLIP)
             after = torch.cat([next_x, (target_actor(next_x) + noise).clamp(-1.0, 1.0)], 1)

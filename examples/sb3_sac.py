@@ -1,7 +1,8 @@
 """Train stable-baselines3's SAC on a batch of simulated arms.
 
 `python examples/sb3_sac.py 200000 calibration=runs/identify/arm dr=identified`: environment steps, then options of
-the command line. Rates, discount and sizes are those of conf/algo/sac.yaml. `Arms` serves any algorithm of sb3.
+the command line. Rates, discount and sizes are those of conf/algo/sac.yaml. `Arms` serves any algorithm of sb3, and
+`WeightedReplay` any that learns off-policy: stored rewards follow the curriculum's weights.
 """
 
 import sys
@@ -10,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from r2s.learning.evaluate import make_evaluation
@@ -37,9 +39,10 @@ class Arms(VecEnv):
     def step_wait(self):
         """Step all arms; sb3 expects the last observations of ended episodes in a dict per arm."""
         observation, reward, terminated, truncated, info = self.envs.step(self.actions)
-        infos = [{"distance": distance} for distance in info["distance"]]
+        infos = [{"reward_terms": terms} for terms in info["reward_terms"]]
         for i in np.flatnonzero(terminated | truncated):
             infos[i] = {"terminal_observation": info["final_obs"][i], "TimeLimit.truncated": not terminated[i]}
+            infos[i]["reward_terms"] = info["final_info"]["reward_terms"][i]
         return observation, reward.astype(np.float32), terminated | truncated, infos
 
     def close(self):
@@ -63,6 +66,32 @@ class Arms(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
+class NormReLU(torch.nn.Module):
+    """ReLU after a layer normalization without parameters: it keeps critics stable at this learning rate."""
+
+    def forward(self, x):
+        """Return the activations (B, n)."""
+        return torch.relu(torch.nn.functional.layer_norm(x, x.shape[-1:]))
+
+
+class WeightedReplay(ReplayBuffer):
+    """sb3's buffer, whose rewards are the stored terms under the present weights of the reward."""
+
+    def __init__(self, *given, arms, **named):
+        super().__init__(*given, **named)
+        self.arms, self.terms = arms, np.zeros((*self.rewards.shape, len(arms.env.weights)), np.float32)
+
+    def add(self, obs, next_obs, action, reward, done, infos):
+        """Add a step of all arms."""
+        self.terms[self.pos] = [info["reward_terms"] for info in infos]
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def sample(self, batch_size, env=None):
+        """Draw transitions."""
+        self.rewards[:] = self.terms @ self.arms.env.weights.astype(np.float32)
+        return super().sample(batch_size, env)
+
+
 class Policy:
     """sb3's policy for observations in SI units, as the evaluation of r2s calls it."""
 
@@ -82,9 +111,12 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     model = SAC(
         "MlpPolicy",
         VecMonitor(Arms(arms)),
-        **{"seed": seed, "learning_rate": 2e-3, "gamma": 0.97, "tau": 0.02, "batch_size": 256},
+        replay_buffer_class=WeightedReplay,
+        replay_buffer_kwargs={"arms": arms},
+        learning_rate=lambda left: 2e-3 * min(1.0, 0.1 + 2.25 * left),
+        **{"seed": seed, "gamma": 0.97, "tau": 0.02, "batch_size": 256},
         **{"learning_starts": RANDOM, "buffer_size": env_steps, "ent_coef": "auto_0.01", "target_entropy": -10.0},
-        policy_kwargs={"net_arch": [128, 128]},
+        policy_kwargs={"net_arch": [128, 128], "activation_fn": NormReLU},
     )
     model.learn(env_steps, callback=lambda now, _: arms.set_progress(now["self"].num_timesteps / env_steps) or True)
     evaluate = make_evaluation(arms.env.robot, arms.env.task, arms.env.draw, episodes=episodes)

@@ -174,6 +174,7 @@ def test_rewards_and_ends_are_those_of_r2ss_own_environment():
             observation, got, terminated, truncated, info = envs.step(action)
             np.testing.assert_array_equal(envs.normalized(after["observation"].numpy()), observation)
             np.testing.assert_array_equal(after["reward"][:, 0].numpy(), got.astype(np.float32))
+            np.testing.assert_array_equal(after["reward_terms"].numpy(), info["reward_terms"])
             np.testing.assert_array_equal(after["distance"][:, 0].numpy(), info["distance"].astype(np.float32))
             assert np.array_equal(after["truncated"][:, 0].numpy(), truncated)
             assert np.array_equal(after["terminated"][:, 0].numpy(), terminated)

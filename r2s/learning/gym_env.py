@@ -63,8 +63,9 @@ class ArmVectorEnv(gym.vector.VectorEnv):
     """`num_envs` simulated arms at a task, stepped together.
 
     Observations (num_envs, d) float32 are in standard deviations of the task, clipped to 10; actions (num_envs, a)
-    are clipped to [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m. Episodes are truncated
-    after `task.steps` steps.
+    are clipped to [-1, 1]. `info["distance"]` (num_envs,) is the distance from the goal, m; `info["reward_terms"]`
+    (num_envs, k) are the terms of the reward, without weights, and 0 in an arm that has just restarted. Episodes are
+    truncated after `task.steps` steps.
 
     Args:
         robot, task: the arm and its task. draw: domain randomization, called at every reset.
@@ -146,16 +147,18 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         reward, terminated, truncated = (after[key][:, 0].numpy() for key in ("reward", "terminated", "truncated"))
         reward, terminated, truncated = reward * ~waiting, terminated & ~waiting, truncated & ~waiting
         observation, info = self._presented(after)
-        over = terminated | truncated
+        over, terms = terminated | truncated, info["reward_terms"]
         if self.mode == AutoresetMode.SAME_STEP and over.any():
             final = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(over):
                 final[i] = observation[i]
-            last = {"distance": np.where(over, info["distance"], 0.0), "_distance": over}
+            last = {k: over if k[0] == "_" else (x.T * over).T for k, x in info.items()}
             observation, info = self._restarted(over)
+            info["reward_terms"] = np.where(over[:, None], 0.0, terms)
             info |= {"final_obs": final, "_final_obs": over, "final_info": last, "_final_info": over}
         elif waiting.any():
             observation, info = self._restarted(waiting)
+            info["reward_terms"] = np.where(waiting[:, None], 0.0, terms)
         if self.mode != AutoresetMode.SAME_STEP:
             self.ended = over
         return observation, reward.astype(np.float64), terminated, truncated, info
@@ -168,7 +171,8 @@ class ArmVectorEnv(gym.vector.VectorEnv):
 
     def _presented(self, present: TensorDict) -> tuple[np.ndarray, dict[str, Any]]:
         distance = present["distance"][:, 0].numpy().astype(np.float64)
-        info = {"distance": distance, "_distance": np.ones(self.num_envs, dtype=bool)}
+        info = {"distance": distance, "reward_terms": present["reward_terms"].numpy().astype(np.float64)}
+        info |= {f"_{key}": np.ones(self.num_envs, dtype=bool) for key in info}
         return self.normalized(present["observation"].numpy()), info
 
 
@@ -189,10 +193,15 @@ class ArmEnv(gym.Env):
         super().reset(seed=seed)
         self.batch.env.rngs = [self.np_random]
         observation, info = self.batch.reset()
-        return observation[0], {"distance": float(info["distance"][0])}
+        return observation[0], _single(info)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Run one control period, see `ArmVectorEnv.step`."""
         observation, reward, terminated, truncated, info = self.batch.step(np.asarray(action)[None])
         ends = bool(terminated[0]), bool(truncated[0])
-        return observation[0], float(reward[0]), *ends, {"distance": float(info["distance"][0])}
+        return observation[0], float(reward[0]), *ends, _single(info)
+
+
+def _single(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the info of the only arm."""
+    return {"distance": float(info["distance"][0]), "reward_terms": info["reward_terms"][0]}
