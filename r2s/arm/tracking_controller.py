@@ -1,6 +1,5 @@
 """PD tracking of a planned motion about the nominal model, with an adaptive friction and offset estimate."""
 
-import mujoco
 import numpy as np
 
 from r2s.arm.interface import ArmState
@@ -9,7 +8,7 @@ from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import friction_margin
 from r2s.physics.newton_euler import WORK, equations, links_of
 from r2s.physics.payload import USUAL, Payload, sphere_inertia, with_payload
-from r2s.physics.rigid_body import mass_matrix, mujoco_inverse_dynamics
+from r2s.physics.rigid_body import mass_matrix, nominal_torque
 from r2s.physics.robot import SIM_DT, Robot
 
 CUTOFF_HZ = 100.0  # low-pass of the driver during tracking, libfranka's default
@@ -43,8 +42,9 @@ class TrackingController:
 
     def __init__(self, robot: Robot, excitation: Excitation, allowed: DeviationLimits | None = None):
         self._plan, self._allowed = excitation, allowed or DeviationLimits.uniform(robot.n, MAX_DEVIATION)
-        self._feedforward, self._mass = _inverse_dynamics(robot, excitation)
         dq = excitation.dq
+        self._feedforward = nominal_torque(robot, excitation.q, dq, excitation.ddq, gravity=False)
+        self._mass = mass_matrix(robot, excitation.q[::MASS_EVERY])
         basis = np.array([np.ones_like(dq), np.tanh(dq / FRICTION_DQ), dq / robot.dq_max])
         self._regressor = basis.transpose(1, 0, 2)  # (T, 3, n)
         self._theta = np.zeros((3, robot.n))
@@ -105,10 +105,3 @@ class LoadedTrackingController(TrackingController):
             self._mass[k] = mass + np.diag(robot.armature)
         self._theta_max[0] *= LOADED_FACTOR
         self._correction = LOADED_FACTOR * self._correction
-
-
-def _inverse_dynamics(robot: Robot, e: Excitation) -> tuple[np.ndarray, np.ndarray]:
-    """Return torque without gravity (T, n) Nm and every MASS_EVERY-th mass matrix (., n, n) kg m^2."""
-    model = robot.model(gravity=False)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # excludes the soft spring of joint limits
-    return mujoco_inverse_dynamics(model, e.q, e.dq, e.ddq), mass_matrix(robot, e.q[::MASS_EVERY])

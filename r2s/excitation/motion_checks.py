@@ -13,7 +13,7 @@ from r2s.errors import UserError
 from r2s.physics.collision import TABLE_M, collision_pairs, link_name
 from r2s.physics.fence import FENCE_M
 from r2s.physics.obstacle import Box
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import SIM_DT, Robot
 
 TOOL_M = 0.1  # m, default minimum height of the end effector, because the MJCF contains no tool
@@ -153,20 +153,13 @@ def torque_share(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -
     applies before gravity compensation, of others after it.
     """
     gravity = gravity_torque(robot, q)
-    dynamics = _inverse(robot, q, dq, ddq) - gravity
+    dynamics = nominal_torque(robot, q, dq, ddq) - gravity
     return (np.abs(gravity) + np.abs(dynamics) + friction_margin(robot)) / robot.tau_max
 
 
 def gravity_torque(robot: Robot, q: np.ndarray) -> np.ndarray:
     """Return the torque (T, n) Nm that holds the nominal arm at rest at q (T, n) rad."""
-    return _inverse(robot, q, np.zeros_like(q), np.zeros_like(q))
-
-
-def _inverse(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-    """Return the nominal model's torque (T, n) Nm, gravity included."""
-    model = robot.model(gravity=True)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)  # without the springs of joint limits
-    return mujoco_inverse_dynamics(model, q, dq, ddq)
+    return nominal_torque(robot, q, np.zeros_like(q), np.zeros_like(q))
 
 
 def friction_margin(robot: Robot) -> np.ndarray:

@@ -5,12 +5,11 @@ from copy import copy
 from itertools import combinations
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from r2s.physics.friction import WIDTH_DQ
-from r2s.physics.rigid_body import LinkInertia, mujoco_inverse_dynamics, regressor
+from r2s.physics.rigid_body import LinkInertia, nominal_torque, regressor
 from r2s.physics.robot import Robot
 
 MASS, MASS_LEFT = 3.0, 0.1  # a link's factor that is named, and the share of the misfit that it leaves, at most
@@ -46,13 +45,9 @@ class Unexplained:
         out.need = need
         return out
 
-    def inverse_dynamics(self, gravity: bool, down: np.ndarray | None = None) -> np.ndarray:
-        """Return (T, n) Nm of the nominal arm without friction; down: (3,) m/s^2 instead of the robot's gravity."""
-        model = self.robot.model(gravity=gravity)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-        if down is not None:
-            model.opt.gravity[:] = down
-        return mujoco_inverse_dynamics(model, self.m.q, self.m.dq, self.m.ddq)
+    def inverse_dynamics(self, gravity: bool | np.ndarray) -> np.ndarray:
+        """Return the `nominal_torque` (T, n) Nm of the recorded motion."""
+        return nominal_torque(self.robot, self.m.q, self.m.dq, self.m.ddq, gravity)
 
     def fit(self, parts: np.ndarray) -> np.ndarray:
         """Return the factors (K,) of torques (K, T, n) Nm that all joints share, besides their own friction."""
@@ -167,7 +162,7 @@ def mounting(left: Unexplained) -> list[tuple[float, str]]:
     """Return the correction by another direction of gravity, fitted to the torque: an arm on a wall or a ceiling."""
     robot, size = left.robot, float(np.linalg.norm(left.robot.gravity))
     inertial = left.inverse_dynamics(False)
-    parts = np.array([left.inverse_dynamics(True, g) - inertial for g in np.eye(3)])
+    parts = np.array([left.inverse_dynamics(g) - inertial for g in np.eye(3)])
     fitted = left.with_need(inertial).fit(parts)
     if size == 0 or not np.any(fitted):
         return []

@@ -114,13 +114,23 @@ def rigid_body(
 
     `rest` is the torque of the file's armature and welded bodies. For the arguments see `regressor`.
     """
-    model = robot.model(gravity=gravity is not None)
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-    if gravity is not None:
-        model.opt.gravity = gravity
-    total = mujoco_inverse_dynamics(model, q, dq, ddq)
+    total = nominal_torque(robot, q, dq, ddq, False if gravity is None else gravity)
     y = regressor(robot, q, dq, ddq, gravity)
     return total - np.einsum("tjkc,kc->tj", y, LinkInertia(robot.mass, robot.com, robot.inertia).standard()), y
+
+
+def nominal_torque(
+    robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool | np.ndarray = True
+) -> np.ndarray:
+    """Return the torque (T, n) Nm of the nominal links and rotors, without the soft springs of joint limits.
+
+    q, dq, ddq: (T, n) rad, rad/s, rad/s^2. gravity: the robot's, none (False), or (3,) m/s^2.
+    """
+    model = robot.model(gravity=bool(np.any(gravity)))
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    if isinstance(gravity, np.ndarray):
+        model.opt.gravity = gravity
+    return mujoco_inverse_dynamics(model, q, dq, ddq)
 
 
 def mujoco_inverse_dynamics(model: mujoco.MjModel, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from r2s.arm.clients import fr3_limits
 from r2s.errors import UserError
 from r2s.physics.payload import LoadTorque, Payload, ee_pose
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
 # Both kinematics are exact and read the same q: what is left is single precision (1e-7 m) and rounded robot files
@@ -123,10 +123,8 @@ class Connection:
 
 def gravity_torque(robot: Robot, q: np.ndarray, load: np.ndarray) -> np.ndarray:
     """Return the gravity torque (n,) Nm of the nominal links and load (4,) (`mass_and_moment`) at q (n,) rad."""
-    model, rest = robot.model(gravity=True), np.zeros((1, robot.n))
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    links = mujoco_inverse_dynamics(model, q[None], rest, rest)[0]
-    return links + LoadTorque(robot)(q, load)
+    rest = np.zeros((1, robot.n))
+    return nominal_torque(robot, q[None], rest, rest)[0] + LoadTorque(robot)(q, load)
 
 
 def _load_of(robot: Robot, s: Any) -> np.ndarray:

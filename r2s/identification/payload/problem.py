@@ -3,7 +3,6 @@
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
-import mujoco
 import numpy as np
 
 from r2s.identification.arm_uncertainty import Arm, arm_directions, sensor_factor, sliding_sign
@@ -12,7 +11,7 @@ from r2s.identification.parameters import ParameterSpace
 from r2s.identification.residuals.torque_residual import TorqueResidual
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.payload import LoadTorque, Payload, dynamics_with_payload, mass_and_moment
-from r2s.physics.rigid_body import LinkInertia, mujoco_inverse_dynamics
+from r2s.physics.rigid_body import LinkInertia, nominal_torque
 from r2s.recordings.recording import Recording
 
 # changes since the calibration, standard deviations: friction warms by as much in minutes (WARMED in adaptation); an
@@ -92,9 +91,7 @@ class LoadedTorque:
         m, robot, load = self.torque.motion, arm.robot, LoadTorque(arm.robot)
         still = np.zeros_like(m.q)
         self._load = load
-        model = robot.model(gravity=True)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-        self._weight = mujoco_inverse_dynamics(model, m.q, still, still)
+        self._weight = nominal_torque(robot, m.q, still, still)
         held = mass_and_moment(robot, declared)
         self._declared = m.rows(np.array([load(q, held) for q in m.q])) if held.any() else np.zeros(m.tau.shape)
         self._sign = m.filtered(sliding_sign(self.torque))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.rigid_body import mujoco_inverse_dynamics
+from r2s.physics.rigid_body import nominal_torque
 from r2s.physics.robot import Robot
 
 
@@ -36,8 +36,7 @@ class PlannedMotion:
     ) -> "PlannedMotion":
         """Return B motions, q, dq and ddq (B, T, n) at times t (T,), with the torque of the nominal arm."""
         q, dq, ddq = (x.reshape(-1, robot.n) for x in motions)
-        model = robot.model(gravity=torque != "commanded")
-        tau = mujoco_inverse_dynamics(model, q, dq, ddq) + nominal.friction(dq, np.sign(dq))
+        tau = nominal_torque(robot, q, dq, ddq, torque != "commanded") + nominal.friction(dq, np.sign(dq))
         change = np.gradient(tau.reshape(motions[0].shape), t, axis=1).reshape(tau.shape)
         return PlannedMotion(np.tile(t, len(motions[0])), q, dq, ddq, tau, change, torque)
 
