@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of, nearest
 
 PORT = 9090
 CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # groups that a command reads
@@ -81,9 +81,7 @@ def list_runs(typed: Namespace) -> None:
     from r2s.stages.build import STAGES, console
 
     if typed.stage not in (None, *STAGES):
-        raise UserError(
-            f"--stage: no stage '{typed.stage}'; allowed: {choices(STAGES)}{nearest(typed.stage, STAGES)}"
-        )
+        raise UserError(f"--stage: no stage '{typed.stage}'; {instead_of(typed.stage, STAGES)}")
     table = run_rows(typed.root, stage=typed.stage, failed=typed.failed)
     if table.empty:
         kind = " that failed or was killed" * typed.failed

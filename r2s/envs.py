@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from r2s.cli import MOST_THREADS
-from r2s.errors import UserError, check_number, choices, nearest, optional_import
+from r2s.errors import UserError, check_number, instead_of, optional_import
 from r2s.override_checks import check_overrides
 from r2s.stages.build import CONF, make_draw, make_dynamics, make_robot, make_task
 from r2s.stages.parts import part
@@ -62,18 +62,14 @@ def parts(settings: dict[str, Any], overrides: Sequence[str]) -> tuple[Any, Any,
     """
     for name in settings:
         if name not in SETTINGS:  # no UserError: sb3 tries again without render_mode after a TypeError
-            raise TypeError(
-                f"unexpected keyword argument '{name}'; allowed: {choices(SETTINGS)}{nearest(name, SETTINGS)}"
-            )
+            raise TypeError(f"unexpected keyword argument '{name}'; {instead_of(name, SETTINGS)}")
     words = [_word(k, v) for k, v in settings.items() if v is not None]
     if isinstance(overrides, str):
         raise UserError(f"overrides: expected a list of KEY=VALUE, got {overrides!r}")
     for word in overrides:
         key = word.lstrip("+~").split("=", 1)[0].split(".")[0]
         if key not in READ:
-            raise UserError(
-                f"overrides: an environment does not read '{word}'; allowed: {choices(READ)}{nearest(key, READ)}"
-            )
+            raise UserError(f"overrides: an environment does not read '{word}'; {instead_of(key, READ)}")
     cfg = _composed([*words, *overrides])
     check_number("threads", cfg.threads, f"[0, {MOST_THREADS}]", whole=True)
     robot = make_robot(cfg)

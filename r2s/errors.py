@@ -2,7 +2,7 @@
 
 import importlib
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
 from types import ModuleType
@@ -18,15 +18,20 @@ class Stopped(Exception):  # noqa: N818 (a stopped arm is not a bug)
     """The arm stopped and the operator did not resume: the run keeps its results and ends as stopped."""
 
 
-def nearest(name: str, allowed: Iterable[str]) -> str:
+def nearest(name: object, allowed: Iterable[str]) -> str:
     """Return "; did you mean 'x'?" for the closest of the allowed names, or "" if none is close."""
-    match = get_close_matches(name, [str(a) for a in allowed], n=1, cutoff=0.5)
+    match = get_close_matches(str(name), [str(a) for a in allowed], n=1, cutoff=0.5)
     return f"; did you mean '{match[0]}'?" if match else ""
 
 
 def choices(allowed: Iterable[str]) -> str:
     """Return the allowed names as "a, b, c"."""
     return ", ".join(str(a) for a in allowed)
+
+
+def instead_of(name: object, allowed: Collection[str]) -> str:
+    """Return "allowed: a, b, c; did you mean 'a'?" for a name that is none of them."""
+    return f"allowed: {choices(allowed)}{nearest(name, allowed)}"
 
 
 def optional_import(module: str, needed_by: str, extra: str) -> ModuleType:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of, nearest
 from r2s.stages.build import CONF, STAGES, unread
 from r2s.stages.run_config import PROGRAM
 
@@ -252,9 +252,7 @@ def _mistake(word: str, error: Exception, groups: dict[str, list[str]], known: S
         return UserError(line)
     for option in [v.strip() for v in value.strip("[]").split(",")] if value.startswith("[") else [value]:
         if bare in groups and option not in groups[bare]:
-            return UserError(
-                f"{bare}: no option '{option}'; allowed: {choices(groups[bare])}{nearest(option, groups[bare])}"
-            )
+            return UserError(f"{bare}: no option '{option}'; {instead_of(option, groups[bare])}")
     special = PLAIN.sub("", value)
     if special and value[0] not in "[{\"'" and not _parses(word):
         return UserError(f"{bare}: a value with {special[0]} needs quotes: {quoted(word)}")

@@ -14,7 +14,7 @@ import numpy as np
 from r2s.control.computed_torque import BANDWIDTH_LATENCY, LATENCY
 from r2s.control.controller import ControlledTask, Controller
 from r2s.control.impedance_cpp import CARTESIAN, JOINT
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, instead_of
 from r2s.physics import impedance as law
 from r2s.physics.description import chain
 from r2s.physics.dynamics import Dynamics
@@ -234,7 +234,7 @@ def cartesian_impedance(
 def _check(action: str, softest: float, displacement: float) -> None:
     """Raise UserError for settings that both impedances share."""
     if action not in ACTIONS:
-        raise UserError(f"action: '{action}'; allowed: {choices(ACTIONS)}{nearest(str(action), ACTIONS)}")
+        raise UserError(f"action: '{action}'; {instead_of(action, ACTIONS)}")
     check_number("softest", softest, "(0, 1]")
     check_number("displacement", displacement, "(0, inf)")
 

@@ -131,9 +131,7 @@ def gazebo_classic(robot: Robot, physics: str = "ode") -> Callable[[Dynamics], G
         UserError: an unknown physics engine, or Gazebo or the plugin is missing.
     """
     if physics not in PHYSICS:
-        raise UserError(
-            f"simulator.physics: expected {choices(PHYSICS)}, got '{physics}'{nearest(str(physics), PHYSICS)}"
-        )
+        raise UserError(f"simulator.physics: expected {choices(PHYSICS)}, got '{physics}'{nearest(physics, PHYSICS)}")
     gzserver()
     return lambda d: GazeboClassicEngine(robot, d, physics)
 

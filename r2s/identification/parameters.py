@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of
 from r2s.identification.link_inertia import LINK, PAYLOAD, add_point_mass, inertia_scale, links, log_cholesky
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.friction import known_families
@@ -196,7 +196,7 @@ def check_parameters(where: str, names: Iterable[str]) -> None:
     known = units()
     for name in names:
         if name not in known:
-            raise UserError(f"{where}: unknown parameter '{name}'; allowed: {choices(known)}{nearest(name, known)}")
+            raise UserError(f"{where}: unknown parameter '{name}'; {instead_of(name, known)}")
 
 
 def check_bounds(where: str, bounds: Mapping[str, Sequence[ArrayLike]]) -> None:

@@ -74,7 +74,7 @@ class PlannedWidths:
             elif name in names:
                 places.append(names.index(name))
             else:
-                near = nearest(str(name), [*blocks, *names])
+                near = nearest(name, [*blocks, *names])
                 raise UserError(f"parameters: '{name}' is not estimated; allowed: {', '.join(blocks)}{near}")
         return np.unique(places) if places else np.arange(len(names))
 

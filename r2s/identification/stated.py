@@ -30,7 +30,7 @@ def check_stated(stated: Stated, n: int | None = None) -> None:
             raise UserError(f"{where}: expected {choices(f'{where}.{key}=' for key in KEYS)}, got {entry!r}")
         for key, value in entry.items():
             if key not in KEYS:
-                raise UserError(f"{where}: expected {choices(KEYS)}, got '{key}'{nearest(str(key), KEYS)}")
+                raise UserError(f"{where}: expected {choices(KEYS)}, got '{key}'{nearest(key, KEYS)}")
             _check(f"{where}.{key}", value, 1 if name in WHOLE_ARM else n, key == "width" or name in logarithmic())
         if n is not None:
             mean, width, fixed = (np.isfinite(_values(entry, key, 1 if name in WHOLE_ARM else n)) for key in KEYS)

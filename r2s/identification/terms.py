@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of
 from r2s.identification.link_inertia import LINK, PAYLOAD
 from r2s.identification.parameters import ParameterSpace, check_parameters, logarithmic, parameter_space, sizes
 from r2s.identification.stated import Stated, fixed_in
@@ -41,7 +41,7 @@ def check_terms(where: str, terms: Sequence[str]) -> None:
     known = (*optional_friction(), *TERMS)
     for name in terms:
         if name not in known:
-            raise UserError(f"{where}: unknown term '{name}'; allowed: {choices(known)}{nearest(str(name), known)}")
+            raise UserError(f"{where}: unknown term '{name}'; {instead_of(name, known)}")
 
 
 def check_prior(prior: Mapping[str, ArrayLike | None]) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, instead_of
 from r2s.physics.friction import COULOMB, SIGMOID, Family
 from r2s.physics.friction import family as friction_family
 from r2s.physics.robot import Robot, per_joint
@@ -71,10 +71,8 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         if self.stiction_model not in STICTION_MODELS:
-            raise UserError(
-                f"friction.stiction_model: '{self.stiction_model}'; allowed: {choices(STICTION_MODELS)}"
-                f"{nearest(str(self.stiction_model), STICTION_MODELS)}"
-            )
+            given = self.stiction_model
+            raise UserError(f"friction.stiction_model: '{given}'; {instead_of(given, STICTION_MODELS)}")
 
     @staticmethod
     def of(robot: Robot, phi: np.ndarray, family: Family = SIGMOID, dq_min: float = 0.01) -> "Dynamics":

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, instead_of
 
 PREFIX = "obstacle "  # of the geoms' names in a model
 KEYS = ("center", "size", "yaw")
@@ -42,7 +42,7 @@ def boxes(where: str, given: Sequence[Mapping[str, Any]]) -> list[Box]:
             raise UserError(f"{name}: expected {{center: [x, y, z], size: [x, y, z]}}, got {one!r}")
         for key in one:
             if key not in KEYS:
-                raise UserError(f"{name}: unknown key '{key}'; allowed: {choices(KEYS)}{nearest(str(key), KEYS)}")
+                raise UserError(f"{name}: unknown key '{key}'; {instead_of(key, KEYS)}")
         for key in ("center", "size"):
             _check_numbers(f"{name}.{key}", one.get(key), 3)
         _check_numbers(f"{name}.yaw", [one.get("yaw", 0.0)], 1)

@@ -69,8 +69,7 @@ def payload_of(value: Any, most: tuple[float, float], name: str = "arm.payload")
     allowed = ("mass", "centre", "inertia", "on_s", "off_s")
     for key in value:
         if key not in allowed:
-            near = nearest(str(key), allowed)
-            raise UserError(f"{name}: expected the keys {choices(allowed)}, got '{key}'{near}")
+            raise UserError(f"{name}: expected the keys {choices(allowed)}, got '{key}'{nearest(key, allowed)}")
     if "mass" not in value:
         raise UserError(f"{name}: expected a number of kg or {{mass: ..., centre: [...], ...}}, got no mass")
     check_number(f"{name}.mass", value["mass"], f"[0, {most[0]:g}]")

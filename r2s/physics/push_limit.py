@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, instead_of
 from r2s.physics.linear_algebra import factor, solve, unpack
 from r2s.physics.payload import ee_pose
 from r2s.physics.rigid_body import InverseInertia
@@ -128,7 +128,7 @@ def push_limit(
             and the task asks.
     """
     if stop is not None and stop not in STOPS:
-        raise UserError(f"task.stop: {stop!r}; allowed: {choices(STOPS)}{nearest(str(stop), STOPS)}")
+        raise UserError(f"task.stop: {stop!r}; {instead_of(stop, STOPS)}")
     if force_max is None and speed_near is None:
         return None
     if force_max is None:

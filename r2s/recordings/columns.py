@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of, nearest
 from r2s.recordings.csv_table import bare_name
 from r2s.recordings.robot_logs import Table, choose_joints
 
@@ -32,10 +32,7 @@ def specs_of(columns: Mapping[str, Spec]) -> dict[str, Spec]:
     """Return the user's names of each field, None if there are none."""
     for key in columns:
         if key not in DEFAULT_COLUMNS:
-            raise UserError(
-                f"unknown key '{key}' in data.columns; allowed: {choices(DEFAULT_COLUMNS)}"
-                f"{nearest(str(key), DEFAULT_COLUMNS)}"
-            )
+            raise UserError(f"unknown key '{key}' in data.columns; {instead_of(key, DEFAULT_COLUMNS)}")
     return {x: _bare(columns.get(x)) for x in DEFAULT_COLUMNS}
 
 

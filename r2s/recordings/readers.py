@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, nearest, optional_import
+from r2s.errors import UserError, choices, instead_of, nearest, optional_import
 from r2s.files import DAMAGED
 from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed, specs_of
 from r2s.recordings.csv_table import read_csv, without_units
@@ -254,9 +254,7 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
         )
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES and not path.is_dir():
-        raise UserError(
-            f"{path}: unknown suffix '{path.suffix}'; allowed: {choices(SUFFIXES)}{nearest(suffix, SUFFIXES)}"
-        )
+        raise UserError(f"{path}: unknown suffix '{path.suffix}'; {instead_of(suffix, SUFFIXES)}")
     try:
         if is_bag(path):
             return bag_table(path, **bag)

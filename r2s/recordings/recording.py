@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, instead_of
 from r2s.files import atomic_write
 from r2s.recordings.gaps import longest_step
 from r2s.recordings.periodicity import TOLERANCE, find_period, overlap, tracks_of
@@ -369,9 +369,7 @@ def declared_torque(torque: str | None) -> str:
     )
     if torque in (None, "", "???"):
         raise UserError(f"torque is not declared; {meaning}")
-    raise UserError(
-        f"unknown torque '{torque}'; allowed: {choices(TORQUES)}{nearest(str(torque), TORQUES)}; {meaning}"
-    )
+    raise UserError(f"unknown torque '{torque}'; {instead_of(torque, TORQUES)}; {meaning}")
 
 
 def _floats(field: str, value) -> np.ndarray:

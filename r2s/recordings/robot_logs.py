@@ -154,7 +154,7 @@ def choose_joints(
     if joints is not None:
         for name in joints:
             if name not in logged:
-                raise UserError(f"no joint '{name}'; joints: {names}{nearest(str(name), logged)} (set data.joints)")
+                raise UserError(f"no joint '{name}'; joints: {names}{nearest(name, logged)} (set data.joints)")
         distinct = len(set(joints))
         if not distinct or distinct < len(joints) or (n is not None and distinct != n):
             expected = n or max(len(joints), 1)

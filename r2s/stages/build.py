@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import FAILED, Stopped, UserError, check_number, choices, nearest
+from r2s.errors import FAILED, Stopped, UserError, check_number, choices, instead_of
 from r2s.stages.parts import called, check_types, part, plain, target
 from r2s.stages.run_config import CONF, modules
 
@@ -264,8 +264,7 @@ def make_truth(cfg, robot):
     if "/" in str(cfg.data.truth) or not all(path.is_file() for path in both):
         known = sorted({p.stem for p in both[0].parent.glob("*")} & {p.stem for p in both[1].parent.glob("*")})
         raise UserError(
-            f"data.truth: no '{cfg.data.truth}' in friction and inertia; allowed: "
-            f"{choices(known)}{nearest(str(cfg.data.truth), known)}"
+            f"data.truth: no '{cfg.data.truth}' in friction and inertia; {instead_of(cfg.data.truth, known)}"
         )
     return dynamics_of(robot, *(plain(OmegaConf.load(path)) for path in both))
 

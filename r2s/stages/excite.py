@@ -48,7 +48,7 @@ class Excite:
 
         check_number("seconds", self.seconds, f"[{LEAST_S:g}, {LONGEST_S:g}]")
         if self.torque not in TORQUES:
-            near = nearest(str(self.torque), TORQUES)
+            near = nearest(self.torque, TORQUES)
             raise UserError(f"torque: expected {choices(TORQUES)}, got {self.torque!r}{near}")
         check_number("effort", self.effort, "[0, inf)", whole=True)
         check_number("noise", self.noise, "(0, 1]")

@@ -53,7 +53,7 @@ def called(make: Callable[..., Any], group: str, settings: Mapping[str, Any], *g
     known, name = arguments(make), getattr(make, "__name__", make)
     for key in settings:
         if key not in known and "**" not in known:
-            raise UserError(f"{group}: {name} has no argument '{key}'{nearest(str(key), known)}")
+            raise UserError(f"{group}: {name} has no argument '{key}'{nearest(key, known)}")
     try:
         inspect.signature(make).bind(*given, **settings)
     except TypeError as error:

@@ -35,8 +35,7 @@ def commands_of(settings):
     """
     page, pages, data = (settings[k] for k in ("page", "pages", "data"))
     if page not in pages:
-        near = nearest(str(page), pages)
-        raise UserError(f"results.page: expected one of {choices(pages)}, got {page!r}{near}")
+        raise UserError(f"results.page: expected one of {choices(pages)}, got {page!r}{nearest(page, pages)}")
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
         raise UserError("stage=results: needs git and a checkout of r2s; an installed package has no benchmarks")
     lines = pages[page]

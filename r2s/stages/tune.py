@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
-from r2s.errors import UserError, check_number, choices, nearest, optional_import
+from r2s.errors import UserError, check_number, instead_of, optional_import
 from r2s.stages import train
 from r2s.stages.build import all_threads, console, open_run, unread
 from r2s.stages.parts import called, plain
@@ -302,8 +302,7 @@ def tune(cfg, overrides):
     how = called(Tune, "tune", given)
     known = logged_measures(check_trainings(cfg, overrides, how.space))
     if how.measure not in known:
-        near = nearest(str(how.measure), known)
-        raise UserError(f"tune.measure: a training logs no measure '{how.measure}'; allowed: {choices(known)}{near}")
+        raise UserError(f"tune.measure: a training logs no measure '{how.measure}'; {instead_of(how.measure, known)}")
     if how.against:
         read_grid(how.against, how.measure)
     measure = known[how.measure]

@@ -11,7 +11,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, instead_of
 from r2s.files import atomic_write
 
 FILE = "measures.json"
@@ -118,10 +118,7 @@ class MeasureTable:
             object.__setattr__(self, name, keys)
             for key in keys:
                 if key not in self.known:
-                    raise UserError(
-                        f"measure_table.{name}: no measure '{key}'; allowed: {choices(self.known)}"
-                        f"{nearest(key, self.known)}"
-                    )
+                    raise UserError(f"measure_table.{name}: no measure '{key}'; {instead_of(key, self.known)}")
 
     @property
     def known(self) -> dict[str, Measure]:

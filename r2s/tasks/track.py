@@ -11,7 +11,7 @@ from scipy.signal import savgol_filter
 from r2s.compiled import njit
 from r2s.control.computed_torque import computed_torque
 from r2s.control.controller import Controller
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, instead_of
 from r2s.excitation.motion_checks import Space
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
@@ -111,7 +111,7 @@ class TrackTask(BaseTask):
                 raise UserError(f"task.{name}: {pair} is not allowed; two numbers above 0 are, the lesser first")
         for kind in self.kinds or ("",):
             if kind not in KINDS:
-                raise UserError(f"task.kinds: '{kind}'; allowed: {choices(KINDS)}{nearest(str(kind), KINDS)}")
+                raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         replace(self._region)  # raises if it is invalid
 
     @property

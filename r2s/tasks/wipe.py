@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from r2s.control.impedance import fastest_spring
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, instead_of
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.impedance import SLIDES
 from r2s.physics.inverse_dynamics import InverseDynamics
@@ -63,7 +63,7 @@ class WipeTask(SurfaceTask):
         self._check_range("size", "m", equal=True)
         for kind in self.kinds or ("",):
             if kind not in KINDS:
-                raise UserError(f"task.kinds: '{kind}'; allowed: {choices(KINDS)}{nearest(str(kind), KINDS)}")
+                raise UserError(f"task.kinds: '{kind}'; {instead_of(kind, KINDS)}")
         check_number(
             "task.size", self.size[1], f"(0, {self.spread / np.sqrt(2):.3g}]"
         )  # its middle is that of a square

@@ -13,7 +13,7 @@ import numpy as np
 from r2s.arm.clients import fci, fr3_limits
 from r2s.arm.emulator.robot_model import BoxModel
 from r2s.arm.interface import Arm, ArmStopped, Reflexes
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, instead_of
 from r2s.physics.robot import SIM_DT
 
 FAULT_KINDS = ("late", "drop", "discontinuity", "joint_limit", "estop", "press", "hold")
@@ -55,8 +55,7 @@ class Fault:
 
     def __post_init__(self):
         if self.kind not in FAULT_KINDS:
-            near = nearest(self.kind, FAULT_KINDS)
-            raise UserError(f"fault: '{self.kind}'; allowed: {choices(FAULT_KINDS)}{near}")
+            raise UserError(f"fault: '{self.kind}'; {instead_of(self.kind, FAULT_KINDS)}")
         if self.cycle < 0 or self.motion < 0 or self.cycles < 1:
             raise UserError(
                 f"fault '{self.kind}': expected cycle and motion from 0 and cycles from 1, got cycle={self.cycle}, "
@@ -109,7 +108,7 @@ class Control:
         self._right = self.state.copy()  # the settings with which the arm's own gravity compensation works
         for name, value in (desk or {}).items():
             if name not in DESK:
-                raise UserError(f"emulator: desk setting '{name}'; allowed: {choices(DESK)}{nearest(name, DESK)}")
+                raise UserError(f"emulator: desk setting '{name}'; {instead_of(name, DESK)}")
             self.state[name] = value
         self.state["F_T_NE"] = self.state["F_T_EE"]
         self._place(arm.robot.q_home)

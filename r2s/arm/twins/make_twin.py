@@ -5,7 +5,7 @@ from typing import Any
 from r2s.arm.twins.elastic_twin import ElasticTwin
 from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.arm.twins.twin_base import TwinBase
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, instead_of
 from r2s.physics.robot import Robot
 
 VARIANTS: dict[str, type[TwinBase]] = {"rigid": RigidTwin, "elastic": ElasticTwin}
@@ -34,8 +34,7 @@ def make_twin(
         UserError: an unknown variant, or an argument out of its range.
     """
     if not isinstance(variant, str) or variant not in VARIANTS:
-        near = nearest(str(variant), VARIANTS)
-        raise UserError(f"arm.variant: {variant!r}; allowed: {choices(VARIANTS)}{near}")
+        raise UserError(f"arm.variant: {variant!r}; {instead_of(variant, VARIANTS)}")
     return VARIANTS[variant](
         robot,
         seed,

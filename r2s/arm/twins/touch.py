@@ -171,7 +171,7 @@ def _place(surface: Any) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"arm.surface: expected false, true, box or {{point: [3], normal: [3]}}, got {surface!r}")
     for key in (values := dict(surface)):
         if key not in ("point", "normal"):
-            raise UserError(f"arm.surface: unknown key '{key}'{nearest(str(key), ('point', 'normal'))}")
+            raise UserError(f"arm.surface: unknown key '{key}'{nearest(key, ('point', 'normal'))}")
     try:
         point, normal = (np.array(values[key], dtype=float).reshape(3) for key in ("point", "normal"))
         length = float(np.linalg.norm(normal))
