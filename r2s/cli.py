@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import FAILED, Stopped, UserError, check_number, choices, nearest
+from r2s.errors import FAILED, Stopped, UserError, check_number, choices, nearest_file
 from r2s.override_checks import COMMANDS, check_overrides, extended
 from r2s.stages.build import GROUP, STAGES
 from r2s.stages.run_config import CONF, PROGRAM, TRUST, loaded, modules, replayed, run_config
@@ -126,8 +126,7 @@ def resumed(cfg, overrides):
 
     folder = Path(cfg.resume)
     if not (folder / "config.yaml").is_file():
-        names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
-        raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest(folder.name, names)}")
+        raise UserError(f"resume: '{cfg.resume}' is no run folder{nearest_file(folder)}")
     if extra := [o for o in overrides if not o.startswith(("resume=", "trust=", "device="))]:
         raise UserError(f"resume: a run continues with its own config; leave out {' '.join(extra)}")
     before = run_config(folder, cfg.trust)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from r2s.errors import UserError, choices, instead_of, nearest
+from r2s.errors import UserError, choices, instead_of, nearest, nearest_file
 
 PORT = 9090
 CONVERTED = ("robot", "data", "calibration", "friction", "inertia")  # groups that a command reads
@@ -243,8 +243,7 @@ def viewable(folder: Path) -> Path:
         return folder
     if (folder / "meta.json").is_file():
         raise UserError(f"look: {folder} has no recording.rrd; the run did not reach its end")
-    names = [p.name for p in folder.parent.glob("*")] if folder.parent.is_dir() else []
-    raise UserError(f"look: '{folder}' is no run folder{nearest(folder.name, names)}")
+    raise UserError(f"look: '{folder}' is no run folder{nearest_file(folder)}")
 
 
 def robot_of(folders: Sequence[Path], trust: str | None = None):

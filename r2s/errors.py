@@ -5,6 +5,7 @@ import math
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
+from pathlib import Path
 from types import ModuleType
 
 FAILED = "R2S_FAILED"  # environment variable in a sweep: file of the errors of its jobs
@@ -22,6 +23,11 @@ def nearest(name: object, allowed: Iterable[str]) -> str:
     """Return "; did you mean 'x'?" for the closest of the allowed names, or "" if none is close."""
     match = get_close_matches(str(name), [str(a) for a in allowed], n=1, cutoff=0.5)
     return f"; did you mean '{match[0]}'?" if match else ""
+
+
+def nearest_file(path: Path, pattern: str = "*") -> str:
+    """Return the `nearest` of the names beside a path that match a pattern."""
+    return nearest(path.name, (p.name for p in path.parent.glob(pattern)))
 
 
 def choices(allowed: Iterable[str]) -> str:

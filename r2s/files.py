@@ -11,6 +11,8 @@ from pathlib import Path
 from tokenize import TokenError
 from typing import Any
 
+from r2s.errors import UserError, nearest_file
+
 # Exceptions that NumPy, pandas, h5py and zipfile raise for a truncated, altered or foreign array file.
 DAMAGED = (
     KeyError, TypeError, ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
@@ -38,6 +40,18 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def run_file(folder: str | Path, name: str, option: str) -> Path:
+    """Return the file `name` of a run folder, or `folder` itself if that is a file; `option` names it, for errors.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    path = Path(folder) / name if Path(folder).is_dir() else Path(folder)
+    if not path.is_file():
+        raise UserError(f"{option}: no {name} at {folder}{nearest_file(Path(folder))}")
+    return path
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

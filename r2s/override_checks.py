@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, choices, instead_of, nearest
+from r2s.errors import UserError, choices, instead_of, nearest, nearest_file
 from r2s.stages.build import CONF, STAGES, unread
 from r2s.stages.run_config import PROGRAM
 
@@ -64,8 +64,7 @@ def check_overrides(words: Sequence[str], config_dir: str | None, multirun: bool
     from omegaconf.errors import OmegaConfBaseException
 
     if config_dir and not Path(config_dir).is_dir():
-        siblings = [p.name for p in Path(config_dir).absolute().parent.glob("*/")]
-        raise UserError(f"--config-dir: no folder '{config_dir}'{nearest(Path(config_dir).name, siblings)}")
+        raise UserError(f"--config-dir: no folder '{config_dir}'{nearest_file(Path(config_dir).absolute(), '*/')}")
     own = [f"{SEARCHPATH}=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     of_hydra = [w for w in words if w.lstrip("+~").startswith(("hydra.", "hydra/"))]
     words = [w for w in words if w not in of_hydra]

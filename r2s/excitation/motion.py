@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, nearest, nearest_file
 from r2s.excitation.motion_checks import TABLE_M, TOOL_M, check_motion
 from r2s.files import atomic_write
 from r2s.physics.robot import Robot
@@ -41,8 +41,7 @@ def load(path: str | os.PathLike, robot: Robot, *, table: float = TABLE_M, z_min
     """
     path = Path(path)
     if not path.is_file():
-        others = [p.name for p in path.parent.glob("*.csv")] if path.parent.is_dir() else []
-        raise UserError(f"data.excitation: no such file: {path}{nearest(path.name, others)}")
+        raise UserError(f"data.excitation: no such file: {path}{nearest_file(path, '*.csv')}")
     try:
         with open(path, encoding="utf-8") as file:
             header = [name.strip() for name in file.readline().split(",")]

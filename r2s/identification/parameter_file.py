@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from r2s.errors import UserError, check_number, nearest
-from r2s.files import DAMAGED, atomic_write
+from r2s.errors import UserError, check_number
+from r2s.files import DAMAGED, atomic_write, run_file
 from r2s.identification.parameters import (
     TIMING,
     WHOLE_ARM,
@@ -85,13 +85,9 @@ def load_parameters(
     Raises:
         UserError: no such run or file, parameters of another robot, a foreign friction family, or a damaged file.
     """
-    path = Path(folder)
-    path = path / "parameters.yaml" if path.is_dir() else path
-    if Path(folder).is_dir() and not path.is_file():
+    if Path(folder).is_dir() and not (Path(folder) / "parameters.yaml").is_file():
         raise UserError(f"{option}: {folder} has no parameters.yaml; is it a finished identification?")
-    if not path.is_file():
-        siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
-        raise UserError(f"{option}: no parameters.yaml at {folder}{nearest(Path(folder).name, siblings)}")
+    path = run_file(folder, "parameters.yaml", option)
     try:
         document = yaml.safe_load(path.read_text())
         named, joints = document["robot"], document["joints"]

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from r2s.errors import UserError, check_number, choices, nearest
+from r2s.files import run_file
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import Robot
 from r2s.physics.welds import Bodies, rotation
@@ -104,10 +105,7 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], default: np.ndarray)
 
 def _of_file(name: str, path: Path) -> Any:
     """Return the mapping of a payload.yaml, or of the one in a run folder."""
-    file = path / "payload.yaml" if path.is_dir() else path
-    if not file.is_file():
-        siblings = [p.name for p in path.parent.glob("*")] if path.parent.is_dir() else []
-        raise UserError(f"{name}: no payload.yaml at {path}{nearest(path.name, siblings)}")
+    file = run_file(path, "payload.yaml", name)
     try:
         return yaml.safe_load(file.read_text())["payload"]
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:

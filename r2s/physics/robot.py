@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, check_number, choices, nearest
+from r2s.errors import UserError, check_number, choices, nearest, nearest_file
 from r2s.files import located
 from r2s.physics.obstacle import Box
 from r2s.physics.robot_checks import check_arm, check_limits, check_masses, gravity_of, torque_limits
@@ -226,8 +226,7 @@ def load_robot(
 def _read(path: Path, lock: Mapping[str, float] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel, np.ndarray]:
     """Return the file's spec, its checked model, and velocity limits, infinite where it has none."""
     if not path.is_file():
-        others = [p.name for p in path.parent.glob("*.*")]
-        raise UserError(f"robot.mjcf: no such file: {path}{nearest(path.name, others)}")
+        raise UserError(f"robot.mjcf: no such file: {path}{nearest_file(path, '*.*')}")
     spec, fastest = read_spec(path, lock)
     try:
         model = spec.compile()

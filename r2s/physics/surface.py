@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.errors import UserError, nearest
+from r2s.errors import UserError, nearest, nearest_file
 from r2s.files import located
 
 TINY = np.finfo(float).tiny
@@ -132,8 +132,7 @@ def load_tool(path: str | Path) -> Tool:
     try:
         values = json.loads(file.read_text())
     except FileNotFoundError:
-        others = [p.name for p in file.parent.glob("*.json")]
-        raise UserError(f"robot.tool: no such file: {file}{nearest(file.name, others)}") from None
+        raise UserError(f"robot.tool: no such file: {file}{nearest_file(file, '*.json')}") from None
     except OSError as error:
         raise UserError(f"robot.tool: {file}: {error.strerror}") from None
     except ValueError as error:

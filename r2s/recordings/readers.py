@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from r2s.errors import UserError, choices, instead_of, nearest, optional_import
+from r2s.errors import UserError, choices, instead_of, nearest_file, optional_import
 from r2s.files import DAMAGED
 from r2s.recordings.columns import DEFAULT_COLUMNS, Spec, by_names, find_columns, listed, specs_of
 from r2s.recordings.csv_table import read_csv, without_units
@@ -247,7 +247,7 @@ def load_table(path: Path, bag: Mapping[str, Any] = NO_BAG) -> Table:
     if not path.exists():
         if not path.parent.is_dir():
             raise UserError(f"no file {path}: no folder {path.parent}")
-        raise UserError(f"no file {path}{nearest(path.name, (p.name for p in path.parent.iterdir()))}")
+        raise UserError(f"no file {path}{nearest_file(path)}")
     if path.is_dir() and not is_bag(path) and not is_dataset(path):
         raise UserError(
             f"{path}: expected a file ({choices(SUFFIXES)}), a ROS 2 bag or a LeRobotDataset, got another folder"

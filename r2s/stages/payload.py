@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError
-from r2s.files import located
+from r2s.files import located, run_file
 from r2s.stages.build import console
 from r2s.stages.data import check_cutoff, read_file
 
@@ -58,13 +58,10 @@ def torque_of_calibration(cfg, given):
     Raises:
         UserError: data.torque= is another one.
     """
-    from r2s.stages.adapter_factory import PARAMETERS, TORQUE, run_folder
+    from r2s.stages.adapter_factory import PARAMETERS, TORQUE
     from r2s.stages.run_config import loaded
 
-    path = Path(cfg.calibration)
-    path = path if path.is_file() else run_folder(path) / PARAMETERS
-    if not path.is_file():
-        raise UserError(f"calibration: no parameters.yaml at {cfg.calibration}")
+    path = run_file(cfg.calibration, PARAMETERS, "calibration")
     torque = (loaded(path).get("source") or {}).get("torque", TORQUE)
     if given not in (None, torque):
         raise UserError(

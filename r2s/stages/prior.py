@@ -1,10 +1,10 @@
 """The prior of stage=identify: identify.prior.PARAMETER.mean=, and an earlier run, identify.from=RUN."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from r2s.errors import UserError
+from r2s.files import run_file
 from r2s.stages.build import modules
 from r2s.stages.parts import called, plain
 from r2s.stages.run_config import loaded
@@ -53,7 +53,7 @@ def earlier_run(cfg, robot):
     if cfg.calibration:
         raise UserError(f"{option}: {run} is the arm to start from; leave calibration={cfg.calibration} out")
     space, x = load_parameters(run, robot, modules(cfg.get("trust")), option)
-    path = Path(run) if Path(run).is_file() else Path(run) / "parameters.yaml"
+    path = run_file(run, "parameters.yaml", option)
     torque = (loaded(path).get("source") or {}).get("torque", "commanded")
     return Earlier(run, torque, space, x, load_posterior(run, space, option), cfg.identify.drift, True)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import UserError, choices, nearest
+from r2s.errors import UserError, choices, nearest, nearest_file
 from r2s.files import located
 from r2s.stages.data import check_other_motion, file_data, read_file
 from r2s.stages.parts import plain
@@ -67,9 +67,7 @@ def _matching(where: str, path: str) -> Iterator[str]:
         yield path
         return
     if not (found := sorted(glob.glob(os.path.expanduser(path)))):
-        folder = Path(path).parent
-        there = [p.name for p in folder.glob("*")] if folder.is_dir() else []
-        raise UserError(f"{where}: no file matches '{path}'{nearest(Path(path).name, there)}")
+        raise UserError(f"{where}: no file matches '{path}'{nearest_file(Path(path))}")
     yield from found
 
 

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from r2s.errors import Stopped, UserError, check_number, nearest
+from r2s.errors import Stopped, UserError, check_number, nearest_file
 from r2s.progress import Progress
 from r2s.stages.adapter_factory import make_adapter
 from r2s.stages.build import (
@@ -52,9 +52,7 @@ def trained_config(cfg, option="policy"):
         raise UserError(f"{option} must be given: {option}=RUN_FOLDER, of a finished stage=train")
     source = Path(cfg.policy)
     if not all((source / name).is_file() for name in ("summary.json", "config.yaml")):
-        names = [p.name for p in source.parent.glob("*")] if source.parent.is_dir() else []
-        near = nearest(source.name, names)
-        raise UserError(f"{option}: '{cfg.policy}' is no finished run folder of stage=train{near}")
+        raise UserError(f"{option}: '{cfg.policy}' is no finished run folder of stage=train{nearest_file(source)}")
     trained = run_config(source, getattr(cfg, "trust", None))
     if trained.stage != "train":
         raise UserError(f"{option}: expected a run of stage=train, got stage={trained.stage} ({source})")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from r2s.errors import UserError, nearest
-from r2s.files import DAMAGED, atomic_write
+from r2s.errors import UserError
+from r2s.files import DAMAGED, atomic_write, run_file
 from r2s.identification.contact.estimate import ContactEstimate
 from r2s.identification.contact.exchange import inverse_mass, mujoco_contact, sdf_surface
 from r2s.identification.contact.surface_space import LOAD
@@ -88,11 +88,7 @@ def load_contact(folder: str | Path, where: str = "contact") -> IdentifiedSurfac
     Raises:
         UserError: no such file, or a damaged one.
     """
-    path = Path(folder)
-    path = path / "contact.yaml" if path.is_dir() else path
-    if not path.is_file():
-        siblings = [p.name for p in Path(folder).parent.glob("*")] if Path(folder).parent.is_dir() else []
-        raise UserError(f"{where}: no contact.yaml at {folder}{nearest(Path(folder).name, siblings)}")
+    path = run_file(folder, "contact.yaml", where)
     try:
         document = yaml.safe_load(path.read_text())
         with np.load(path.with_name("contact_posterior.npz"), allow_pickle=False) as file:
