@@ -10,20 +10,18 @@ from r2s.errors import check_number
 from r2s.learning.randomization import UniformRandomization, check_pair
 from r2s.physics.box import TableFrame, check_size, standing_box, table_frame
 from r2s.physics.dynamics import Dynamics
-from r2s.physics.robot import Robot
 
 RANGES = "mass", "table", "friction", "damping", "bristle"
 
 
-@dataclass(frozen=True)
-class BoxRandomization:
+@dataclass(frozen=True, kw_only=True)
+class BoxRandomization(UniformRandomization):
     """Arms as of `UniformRandomization`, each with a box of its own.
 
     mass ~ log U(mass); stiffness ~ log U(stiffness); table, friction, damping, bristle ~ U
     x, y ~ U(-spread, spread) and yaw ~ U(-yaw, yaw) about the nominal place
 
     Attributes:
-        robot, center, phi_relative, inertia_relative, payload: see `UniformRandomization`.
         size: (3,) m, edges. mass: kg, table, friction (with the tip), stiffness: N/m, damping: s/m, bristle: m, all
             [least, most], see `Surface`.
         spread: m. yaw: degrees. point: (3,) m, normal: (3,), of the table; None: of `table_frame`.
@@ -32,10 +30,6 @@ class BoxRandomization:
         UserError: a range that is none, a box that would tilt, or no tool.
     """
 
-    robot: Robot
-    center: Dynamics
-    phi_relative: float
-    inertia_relative: float
     size: Sequence[float]
     mass: Sequence[float]
     table: Sequence[float]
@@ -47,18 +41,14 @@ class BoxRandomization:
     yaw: float
     point: Sequence[float] | None = None
     normal: Sequence[float] | None = None
-    payload: Sequence[float] | None = None
-
-    @cached_property
-    def _arms(self) -> UniformRandomization:
-        return UniformRandomization(self.robot, self.center, self.phi_relative, self.inertia_relative, self.payload)
 
     @cached_property
     def _frame(self) -> TableFrame:
         return table_frame(self.robot, self.point, self.normal)
 
     def __post_init__(self):
-        _ = self._arms, self._frame  # raise for wrong settings
+        super().__post_init__()
+        _ = self._frame  # raise for wrong settings
         for name in ("stiffness", *RANGES):
             check_pair(name, getattr(self, name), "(0, inf)" if name in ("mass", "stiffness") else "[0, inf)")
         check_size("dr.size", self.size, self.table[1])
@@ -75,4 +65,4 @@ class BoxRandomization:
         law |= {name: np.exp(drawn(*np.log(getattr(self, name)))) for name in ("mass", "stiffness")}
         most = np.array([self.spread, self.spread, np.radians(self.yaw)])
         box = standing_box(self._frame, rng.uniform(-most, most, (m, 3)), self.size, **law)
-        return replace(self._arms(rng, m), surface=box)
+        return replace(super().__call__(rng, m), surface=box)

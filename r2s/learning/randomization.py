@@ -148,15 +148,14 @@ def check_pair(name: str, pair: Any, allowed: str) -> None:
         raise UserError(f"dr.{name}: expected [least, most], got {list(pair)}")
 
 
-@dataclass(frozen=True)
-class ContactRandomization:
+@dataclass(frozen=True, kw_only=True)
+class ContactRandomization(UniformRandomization):
     """Arms as of `UniformRandomization`, each with a plane of its own around a nominal one.
 
     stiffness ~ log U(stiffness); exponent ~ U({least, most}); damping, friction ~ U; bristle ~ U(bristle)
     point ~ point + U(-place, place) normal; normal tilted by U(0, tilt) about a random axis
 
     Attributes:
-        robot, center, phi_relative, inertia_relative, payload: see `UniformRandomization`.
         point: (3,) m, normal: (3,), of the nominal plane; None: of a table below the tip at home.
         stiffness: N/m, exponent, damping: s/m, friction, bristle: m, all [least, most], see `Surface`.
         place: m. tilt: degrees.
@@ -166,10 +165,6 @@ class ContactRandomization:
         UserError: a range that is none, or outside what a surface may have; no tool.
     """
 
-    robot: Robot
-    center: Dynamics
-    phi_relative: float
-    inertia_relative: float
     stiffness: Sequence[float]
     exponent: Sequence[float]
     damping: Sequence[float]
@@ -179,7 +174,6 @@ class ContactRandomization:
     tilt: float
     point: Sequence[float] | None = None
     normal: Sequence[float] | None = None
-    payload: Sequence[float] | None = None
     surface: str | None = None
 
     @cached_property
@@ -191,15 +185,12 @@ class ContactRandomization:
         return Surface(**{k: np.array([getattr(s, k) for s in draws]) for k in DRAWN})
 
     @cached_property
-    def _arms(self) -> UniformRandomization:
-        return UniformRandomization(self.robot, self.center, self.phi_relative, self.inertia_relative, self.payload)
-
-    @cached_property
     def _plane(self) -> tuple[np.ndarray, np.ndarray]:
         return nominal_plane(self.robot, self.point, self.normal)
 
     def __post_init__(self):
-        _ = self._arms, self._plane, self._identified  # raise for wrong settings
+        super().__post_init__()
+        _ = self._plane, self._identified  # raise for wrong settings
         for name in ("stiffness", "exponent", "damping", "friction", "bristle"):
             low = {"stiffness": "(0, inf)", "exponent": "[1, 2]"}.get(name, "[0, inf)")
             check_pair(name, getattr(self, name), low)
@@ -211,7 +202,7 @@ class ContactRandomization:
         if (known := self._identified) is not None:
             row = rng.integers(len(known.stiffness), size=m)  # type: ignore[arg-type]
             drawn = Surface(**{k: getattr(known, k)[row] for k in DRAWN})
-            return replace(self._arms(rng, m), surface=drawn)
+            return replace(super().__call__(rng, m), surface=drawn)
         (point, n), (least, most) = self._plane, np.log(self.stiffness)
         about, tilt = rng.uniform(0, 2 * np.pi, (m, 1)), np.radians(rng.uniform(0, self.tilt, (m, 1)))
         surface = Surface(
@@ -223,7 +214,7 @@ class ContactRandomization:
             friction=rng.uniform(self.friction[0], self.friction[1], m),
             bristle=rng.uniform(self.bristle[0], self.bristle[1], m),
         )
-        return replace(self._arms(rng, m), surface=surface)
+        return replace(super().__call__(rng, m), surface=surface)
 
 
 def posterior_randomization(
