@@ -82,16 +82,13 @@ def test_every_pair_of_shapes(one, other, tmp_path):
     assert compare(load_robot(str(path), q_home=[0, 0, 0]), 200) > 0
 
 
-def test_the_table_and_more_distance(tmp_path):
-    """A link below the table touches it; with `margin` smaller distances count too."""
+def test_the_table():
+    """A link below the table touches it; a table that touches the arm at home is refused."""
     robot = load_robot(**conf("robot/panda"))
-    touches, near = CollisionCheck(robot), CollisionCheck(robot, margin=0.03)
+    touches = CollisionCheck(robot)
     down = np.array([0.0, 1.7, 0, -1.9, 0, 2.2, 0.8])
     k = int(touches.first_contact(down[None])[0])
     assert "and the table" in touches.names[k]
-    q = np.random.default_rng(1).uniform(robot.q_min, robot.q_max, (500, 7))
-    assert np.all(near(q) >= touches(q))
-    assert near(q).sum() > touches(q).sum()
     assert not CollisionCheck(robot, table=-np.inf)(down[None])[0]
     with pytest.raises(UserError, match=r"panda: link 'link\d' and the table at 0.6 m touch at robot.q_home"):
         CollisionCheck(robot, table=0.6)

@@ -26,7 +26,6 @@ class DartEngine:
         masses, coms, inertias: (n,) kg, (n, 3) m in link axes, (n, 3, 3) kg m^2 about the centre of mass in link
             axes; each replaces the MJCF's values of the n moving links.
         armature: (n,) kg m^2 of the joints, replaces the MJCF's.
-        dt: time step, s.
         stop_margin: rad, distance of the hard stops outside the position limits.
 
     The engine does not enforce velocity limits: MuJoCo has none either, and enforcing them would hide that a policy
@@ -42,11 +41,10 @@ class DartEngine:
         coms: np.ndarray | None = None,
         inertias: np.ndarray | None = None,
         armature: np.ndarray | None = None,
-        dt: float = SIM_DT,
         stop_margin: float = 0.0,
     ):
         dart = _dartpy()
-        model = robot.model(gravity=gravity, dt=dt)
+        model = robot.model(gravity=gravity)
         n = robot.n
         bodies = model.jnt_bodyid
         links = Bodies(model)
@@ -55,7 +53,7 @@ class DartEngine:
         # DART has no armature A. Damping A/h plus the torque (A/h) v is exactly equivalent: the implicit step solves
         # (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.
         self._armature = np.array(robot.armature if armature is None else armature, dtype=float)
-        self._damping = self._armature / dt
+        self._damping = self._armature / SIM_DT
         self._counter = self._damping if self._armature.any() else None
         self._low, self._high = -robot.tau_max, robot.tau_max
         self._skeleton = dart.dynamics.Skeleton(robot.name)
@@ -73,7 +71,7 @@ class DartEngine:
         self._tip, self._links, self._last = parent, links, int(bodies[-1])
         self._ee = pose[:3, :3] @ model.site_pos[site] + pose[:3, 3]
         self._world = dart.simulation.World()
-        self._world.setTimeStep(dt)
+        self._world.setTimeStep(SIM_DT)
         self._world.setGravity(model.opt.gravity)
         self._world.addSkeleton(self._skeleton)
         _as_gazebo(dart, self._world)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 CLIP = 10.0  # largest normalised observation, in standard deviations
+LOG_STD = -5.0, 2.0  # bounds of the scale's logarithm
 
 
 class Normalizer(nn.Module):
@@ -33,21 +34,18 @@ class Actor(nn.Module):
     algorithms have one format, and compared networks have one size.
     """
 
-    def __init__(
-        self, obs_dim: int, act_dim: int, hidden: tuple[int, ...], log_std: tuple[float, float] = (-5.0, 2.0)
-    ):
+    def __init__(self, obs_dim: int, act_dim: int, hidden: tuple[int, ...]):
         super().__init__()
         sizes = [obs_dim, *hidden]
         layers: list[nn.Module] = []
         for i, o in pairwise(sizes):
             layers += [nn.Linear(i, o), nn.ReLU()]
         self.body = nn.Sequential(*layers, nn.Linear(sizes[-1], 2 * act_dim))
-        self.log_std = log_std
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return loc and scale of the Gaussian whose tanh is the action."""
         loc, log_std = self.body(observation).chunk(2, -1)
-        return loc, log_std.clamp(*self.log_std).exp()
+        return loc, log_std.clamp(*LOG_STD).exp()
 
     def mode(self, observation: Tensor) -> Tensor:
         """Return the deterministic action (B, a), tanh of loc."""

@@ -86,14 +86,13 @@ def link_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 class Scene(NamedTuple):
-    """Bodies (G, WIDTH), hull vertices (V, 3), body rows in `above` (A,) and `pairs` (P, 2); table and margin, m."""
+    """Bodies (G, WIDTH), hull vertices (V, 3), body rows in `above` (A,) and `pairs` (P, 2); table, m."""
 
     bodies: np.ndarray
     vertices: np.ndarray
     above: np.ndarray
     pairs: np.ndarray
     table: float
-    margin: float
 
 
 class CollisionCheck:
@@ -107,7 +106,6 @@ class CollisionCheck:
         robot: its file's geoms.
         table: m, height of the table in the base frame; -inf: no table. None: TABLE_M, or no table if the arm is
             below that at q_home, as a hanging arm is.
-        margin: m, a smaller distance counts as a collision.
         may_touch: pairs of body names, or of a body name and "table", that are not checked.
 
     Raises:
@@ -119,7 +117,6 @@ class CollisionCheck:
         robot: Robot,
         *,
         table: float | None = TABLE_M,
-        margin: float = 0.0,
         may_touch: Collection[tuple[str, str]] = (),
     ):
         model = robot.model(gravity=False)
@@ -132,7 +129,7 @@ class CollisionCheck:
         row = {g: k for k, g in enumerate(geoms)}
         above = np.array([row[g] for g in found.above], dtype=int)
         pairs = np.array([(row[a], row[b]) for a, b in found.pairs], dtype=int).reshape(-1, 2)
-        self.scene = Scene(bodies, vertices, above, pairs, float(table), float(margin))
+        self.scene = Scene(bodies, vertices, above, pairs, float(table))
         self.names = [f"{link_name(model, g)} and the table" for g in found.above]
         self.names += [f"{link_name(model, a)} and {link_name(model, b)}" for a, b in found.pairs]
         at_home = int(self.first_contact(robot.q_home[None])[0])
@@ -163,7 +160,7 @@ class CollisionCheck:
 def empty_scene() -> Scene:
     """Return a scene without pairs."""
     none = np.zeros((0, 2), dtype=int)
-    return Scene(np.zeros((0, WIDTH)), np.zeros((0, 3)), np.zeros(0, dtype=int), none, -np.inf, 0.0)
+    return Scene(np.zeros((0, WIDTH)), np.zeros((0, 3)), np.zeros(0, dtype=int), none, -np.inf)
 
 
 def _bodies(
@@ -235,7 +232,7 @@ def body_poses(links, bodies, q, frames, poses):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pair_distance(scene, k, enough, poses, work):
     """Return the distance of pair k, m, or a lower bound above `enough` m; work: (10, 3), any content."""
-    bodies, vertices, above, pairs, table = scene[:5]
+    bodies, vertices, above, pairs, table = scene
     if k < len(above):
         body, pose = bodies[above[k]], poses[above[k]]
         bound = pose[2] - body[BOUND] - table
@@ -259,7 +256,7 @@ def _first_contacts(q, links, scene, out):
         body_poses(links, bodies, q[arm], frames, poses)
         out[arm] = -1
         for k in range(len(scene.above) + len(scene.pairs)):
-            if pair_distance(scene, k, scene.margin, poses, work) <= scene.margin:
+            if pair_distance(scene, k, 0.0, poses, work) <= 0.0:
                 out[arm] = k
                 break
 

@@ -54,7 +54,7 @@ def _new_run(t: np.ndarray, two: Sequence[slice]) -> bool:
     return bool(pause <= 0 or pause > PAUSE_S)
 
 
-def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[float | None, np.ndarray]:
+def find_period(tracks: Sequence[Track]) -> tuple[float | None, np.ndarray]:
     """Return the period of the motion, s, and the shift (K,) s that aligns the clock of each of K tracks.
 
     With these shifts, the same motion has the same phase in all tracks. The period is None without a repetition. If
@@ -62,10 +62,10 @@ def find_period(tracks: Sequence[Track], tolerance: float = TOLERANCE) -> tuple[
     """
     shift, found, period = np.zeros(len(tracks)), False, None
     for k, b in enumerate(tracks):
-        if period is None and (lag := _own_lag(b, tolerance)):
+        if period is None and (lag := _own_lag(b)):
             period = lag * STEP
         for i, a in enumerate(tracks[: min(k, MAX_COMPARED)]):
-            if (other := _lag(a, b, tolerance)) is not None:
+            if (other := _lag(a, b)) is not None:
                 shift[k] = shift[i] + a.start + other * STEP - b.start
                 found = True
                 break
@@ -137,32 +137,32 @@ def _distances(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return np.maximum(square, 0.0), variance, count
 
 
-def _errors(a: np.ndarray, b: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def _errors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the RMS distance per joint (L,) rad and the number of common rows (L,) at every lag.
 
     The distance is inf where the common part is shorter than OVERLAP_S or moves less than MIN_MOTION.
     """
     square, variance, count = _distances(a, b)
-    counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * tolerance) ** 2)
+    counts = (count >= OVERLAP_S / STEP) & (variance.max(1) > (MIN_MOTION * TOLERANCE) ** 2)
     return np.where(counts, np.sqrt(square.mean(1)), np.inf), count
 
 
-def _own_lag(track: Track, tolerance: float) -> int | None:
+def _own_lag(track: Track) -> int | None:
     """Return the first lag, in rows, after which a track repeats itself."""
     q, least = track.q, round(OVERLAP_S / STEP)
-    error = _errors(q, q, tolerance)[0][len(q) - 1 :]  # from lag 0
+    error = _errors(q, q)[0][len(q) - 1 :]  # from lag 0
     error[:least] = np.inf
-    for run in _runs(error < tolerance):
+    for run in _runs(error < TOLERANCE):
         best = run.start + int(error[run].argmin())
         if best > least:  # a match at the smallest lag is slow motion, not a repetition
             return best
     return None
 
 
-def _lag(a: Track, b: Track, tolerance: float) -> int | None:
+def _lag(a: Track, b: Track) -> int | None:
     """Return the lag, in rows, at which b repeats a; of several, the one with the most common rows."""
-    error, count = _errors(a.q, b.q, tolerance)
-    runs = _runs(error < tolerance)
+    error, count = _errors(a.q, b.q)
+    runs = _runs(error < TOLERANCE)
     if not runs:
         return None
     longest = max(runs, key=lambda run: count[run].max())

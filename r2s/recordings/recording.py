@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 from r2s.errors import UserError, choices, instead_of
 from r2s.files import atomic_write
 from r2s.recordings.gaps import longest_step
-from r2s.recordings.periodicity import TOLERANCE, find_period, overlap, tracks_of
+from r2s.recordings.periodicity import find_period, overlap, tracks_of
 
 TORQUES = ("measured", "commanded", "motor")
 MIN_ROWS = 10
@@ -244,27 +244,27 @@ class Recording:
         """Return the `derivative` of dq (T, n) rad/s^2; `resample` and `smooth` raw data first."""
         return self.derivative(self.dq)
 
-    def find_period(self, tolerance: float = TOLERANCE) -> float | None:
+    def find_period(self) -> float | None:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
-        It repeats if, at some lag, at least 0.5 s recur within `tolerance` rad RMS per joint while the arm moves by
-        ten times that. If the clock restarts, the repetitions may be trajectories: see `in_phase`.
+        It repeats if, at some lag, at least 0.5 s recur within 0.01 rad RMS per joint while the arm moves by ten
+        times that. If the clock restarts, the repetitions may be trajectories: see `in_phase`.
         """
-        return self._period_and_clock(tolerance)[0]
+        return self._period_and_clock()[0]
 
-    def in_phase(self, tolerance: float = TOLERANCE) -> "Recording":
+    def in_phase(self) -> "Recording":
         """Return the recording with its `find_period`, and clocks shifted so that equal motion has equal phase.
 
         A recording without a repetition is returned unchanged.
         """
-        period, t = self._period_and_clock(tolerance)
+        period, t = self._period_and_clock()
         return self if period is None else replace(self, t=t, period=period)
 
-    def _period_and_clock(self, tolerance: float) -> tuple[float | None, np.ndarray]:
+    def _period_and_clock(self) -> tuple[float | None, np.ndarray]:
         best, clock = None, self.t
         runs, each = (tracks_of(self.t, self.q, self.stretches, each) for each in (False, True))
         for tracks in (runs, each) if len(each) > len(runs) else (runs,):
-            period, shift = find_period(tracks, tolerance)
+            period, shift = find_period(tracks)
             if period is None:
                 continue
             # a period of the log's clock may not hold for trajectories that were started by hand
