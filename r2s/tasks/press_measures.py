@@ -76,9 +76,13 @@ def _measured(force: np.ndarray, asked: np.ndarray, step: int, ctrl_hz: int) -> 
     error, change = force - asked, asked[-1] - asked[0]
     rmse = [float(np.sqrt((error[part] ** 2).mean())) for part in (slice(step - window, step), slice(-window, None))]
     over = max(0.0, float((np.sign(change) * error[step:]).max()))
+    return *rmse, over, over / abs(change), *impact_of(force, ctrl_hz)
+
+
+def impact_of(force: np.ndarray, ctrl_hz: int) -> tuple[float, float]:
+    """Return the peak of force (T,) N within IMPACT_S of the first touch, and the share of steps in contact since."""
     touched = np.flatnonzero(force > TOUCH_N)
     if not len(touched):
-        return *rmse, over, over / abs(change), 0.0, 0.0
+        return 0.0, 0.0
     since = force[touched[0] :]
-    impact = float(since[: 1 + round(IMPACT_S * ctrl_hz)].max())
-    return *rmse, over, over / abs(change), impact, float((since > TOUCH_N).mean())
+    return float(since[: 1 + round(IMPACT_S * ctrl_hz)].max()), float((since > TOUCH_N).mean())

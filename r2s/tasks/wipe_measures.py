@@ -3,7 +3,7 @@
 import numpy as np
 
 from r2s.tasks.measures import Measure, MeasureTable
-from r2s.tasks.press_measures import IMPACT_S, TOUCH_N
+from r2s.tasks.press_measures import TOUCH_N, impact_of
 from r2s.tasks.task import Episodes
 
 GOOD_N, GOOD_M = 2.0, 0.003  # N, m: a step counts as wiped within both
@@ -52,7 +52,7 @@ def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, flo
     light, close = (error <= GOOD_N) & runs, (away <= GOOD_M) & runs
     none = bool(ended.all())
     squares = [np.nan, np.nan] if none else [np.mean(x[~ended] ** 2) for x in (error, away)]
-    impacts = [_impact(f, round(IMPACT_S * ctrl_hz)) for f in episodes.force[~ended, :, 0]]  # type: ignore[index]
+    impacts = [impact_of(f, ctrl_hz)[0] for f in episodes.force[~ended, :, 0]]  # type: ignore[index]
     wiped = (light & close).mean(1)
     return {
         "success": float((wiped >= SUCCESS).mean()),
@@ -69,9 +69,3 @@ def wipe_measures(episodes: Episodes, begin: int, ctrl_hz: int) -> dict[str, flo
         "limited": float(episodes.limited.mean()),
         "collision": float((episodes.collision != "").mean()),
     }
-
-
-def _impact(force: np.ndarray, window: int) -> float:
-    """Return the largest force, N, within `window` steps of the first touch (T,) N; 0 without a touch."""
-    touched = np.flatnonzero(force > TOUCH_N)
-    return float(force[touched[0] : touched[0] + 1 + window].max()) if len(touched) else 0.0
