@@ -275,12 +275,12 @@ def test_what_does_not_move_is_listed_and_the_rest_survives():
         by_hand(t, 0.25),  # labelled the wrong way
         by_hand(t, 0.21),
         by_hand(t, 0.02, wait=0.04),  # gone before the command rises
-        by_hand(np.arange(0, 0.4, 0.02), 0.1, far=0.06),  # too few rows
+        by_hand(np.arange(0, 0.4, 0.025), 0.1, far=0.06),  # too few rows
     ]
     whole = {f: np.concatenate([getattr(p, f) for p in parts]) for f in ("t", "q", "dq", "tau")}
     labels = np.repeat(np.arange(6), [len(p.t) for p in parts])
     motion = Recording(**whole, torque="commanded", trajectory=labels)
-    found = estimate_breakaway(Ramps(motion, 1, [1, 1, -1, 1, 1, 1], [0, 1, 2, 3, 4, 5]), moved=3e-3)
+    found = estimate_breakaway(Ramps(motion, 1, [1, 1, -1, 1, 1, 1], [0, 1, 2, 3, 4, 5]))
     assert np.flatnonzero(np.isnan(found.value)).tolist() == [1, 2, 4, 5]
     np.testing.assert_allclose(found.value[[0, 3]], [0.4, 0.42], atol=4e-3)
     assert found.count[1].tolist() == [0, 2]
@@ -486,7 +486,6 @@ def test_bad_input_is_named_in_one_line(panda, truth):
     ramps = Ramps(motion, 1, 1)
     assert "breakaway: delay: " in message(estimate_breakaway, ramps, delay=-0.1)
     assert "breakaway: lag: " in message(estimate_breakaway, ramps, lag=np.nan)
-    assert "breakaway: moved: " in message(estimate_breakaway, ramps, moved=1e-5)
     arm, home = simulated(panda, truth), panda.q_home
     assert "pose 2 at 2.85 rad, allowed -2.7473 to 2.7473" in message(ramp, arm, [home, [2.85, *home[1:]]])
     assert "expected 7 joints, got shape (1, 3)" in message(ramp, arm, [home[:3]])

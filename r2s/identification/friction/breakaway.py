@@ -28,7 +28,7 @@ from r2s.compiled import njit
 from r2s.errors import check_number
 from r2s.recordings.ramps import Ramps
 
-MOVED = 5e-3  # rad; real joints and the twin creep by 1 to 3 mrad before release
+MOVED = 5e-3  # rad, after which rows are not used; real joints and the twin creep by 1 to 3 mrad before release
 MIN_ROWS = 10  # up to there
 ENCODER = 2e-5  # rad, scale of position residuals: encoder noise of a Panda
 RELEASE_S = 2e-3  # s, accuracy of the moment of release
@@ -106,35 +106,33 @@ class Slide:
 
 
 def estimate_breakaway(
-    ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, moved: float = MOVED, slide: Slide | None = None
+    ramps: Ramps, *, delay: float = 0.0, lag: float = 0.0, slide: Slide | None = None
 ) -> Breakaway:
     """Estimate the command at which each ramped joint broke away, from t, q and tau alone.
 
-    A ramp that does not reach `moved` in its own direction, or whose joint moved before the command rose, gives NaN.
+    A ramp that does not reach MOVED in its own direction, or whose joint moved before the command rose, gives NaN.
 
     Args:
         ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms
             for an encoder of 2e-5 rad, largest for the largest inertia.
         delay, lag: s, of the command, beyond its hold; each shifts the result.
-        moved: rad from the first position, well beyond creep; rows after that are not used.
         slide: sliding motion by an identified model.
 
     Raises:
-        UserError: delay, lag or distance out of range.
+        UserError: delay or lag out of range.
     """
     check_number("breakaway: delay", delay, "[0, 0.1)")
     check_number("breakaway: lag", lag, "[0, 0.1)")
-    check_number("breakaway: moved", moved, f"[{10 * ENCODER:g}, 0.1)")
     r = ramps.recording
     count, hold = len(r.stretches), r.command_period or 1.0 / r.rate_hz
     delay += 0.5 * hold  # of a command that is held until the next one
     value, misfit = (np.full(count, np.nan) for _ in range(2))
     held, blur = np.zeros(count), np.zeros(count)
     for k, (t, x, u) in enumerate(_in_direction(ramps)):
-        end = int(np.argmax(np.abs(x) >= moved)) + 1
-        if np.abs(x).max() < moved:
+        end = int(np.argmax(np.abs(x) >= MOVED)) + 1
+        if np.abs(x).max() < MOVED:
             held[k] = max(_delayed(t, u, delay, lag).max(), 0.0)
-        if x[end - 1] < moved or end < MIN_ROWS:
+        if x[end - 1] < MOVED or end < MIN_ROWS:
             continue
         seen = t[:end], x[:end], _delayed(t, u, delay, lag)[:end]
         if slide is not None and not np.isnan(slide.kappa[k]):
