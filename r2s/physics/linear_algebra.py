@@ -28,49 +28,21 @@ def unpack(packed, scale, diagonal, out):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def factor(matrix, root):
-    """Write the root of the lower triangle of `matrix` (n, n), which may be `root` itself."""
+def factor(matrix, root, active=None):
+    """Write the root of the lower triangle of `matrix` (n, n), which may be `root` itself.
+
+    active: (n,); the root is that of the rows and columns where it is not 0. None: of all.
+    """
     for i in range(len(root)):
-        d = matrix[i, i]
-        for k in range(i):
-            r = matrix[i, k]
-            for c in range(k):
-                r -= root[i, c] * root[k, c]
-            r *= root[k, k]
-            root[i, k] = r
-            d -= r * r
-        root[i, i] = 1.0 / np.sqrt(d)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def solve(root, x):
-    """Replace x (n,) by the solution of A y = x."""
-    n = len(x)
-    for i in range(n):
-        s = x[i]
-        for c in range(i):
-            s -= root[i, c] * x[c]
-        x[i] = s * root[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for c in range(i + 1, n):
-            s -= root[c, i] * x[c]
-        x[i] = s * root[i, i]
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def factor_active(matrix, active, root):
-    """Write the root of the rows and columns i of `matrix` with active[i] != 0; `matrix` may be `root` itself."""
-    for i in range(len(active)):
-        if active[i] == 0.0:
+        if active is not None and active[i] == 0.0:
             continue
         d = matrix[i, i]
         for k in range(i):
-            if active[k] == 0.0:
+            if active is not None and active[k] == 0.0:
                 continue
             r = matrix[i, k]
             for c in range(k):
-                if active[c] != 0.0:
+                if active is None or active[c] != 0.0:
                     r -= root[i, c] * root[k, c]
             r *= root[k, k]
             root[i, k] = r
@@ -79,22 +51,22 @@ def factor_active(matrix, active, root):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def solve_active(root, active, x):
-    """Replace x (n,) by the solution for the active rows and columns, and by 0 elsewhere."""
+def solve(root, x, active=None):
+    """Replace x (n,) by the solution of A y = x; by 0 where `active` (n,), that of `factor`, is 0."""
     n = len(x)
     for i in range(n):
         s = 0.0
-        if active[i] != 0.0:
+        if active is None or active[i] != 0.0:
             s = x[i]
             for c in range(i):
-                if active[c] != 0.0:
+                if active is None or active[c] != 0.0:
                     s -= root[i, c] * x[c]
             s *= root[i, i]
         x[i] = s
     for i in range(n - 1, -1, -1):
-        if active[i] != 0.0:
+        if active is None or active[i] != 0.0:
             s = x[i]
             for c in range(i + 1, n):
-                if active[c] != 0.0:
+                if active is None or active[c] != 0.0:
                     s -= root[c, i] * x[c]
             x[i] = s * root[i, i]

@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.physics.linear_algebra import factor, factor_active, solve, solve_active, unpack
+from r2s.physics.linear_algebra import factor, solve, unpack
 from r2s.physics.rigid_body import InverseInertia
 from r2s.physics.robot import Robot
 
@@ -261,8 +261,8 @@ def _stop_torque(ddq, low, high, work, root):
         for i in range(n):
             if side[i] != 0.0:
                 stop[i] = (high[i] if side[i] > 0.0 else low[i]) - ddq[i]
-        factor_active(mobility, side, root)
-        solve_active(root, side, stop)
+        factor(mobility, root, side)
+        solve(root, stop, side)
         done = True
         for j in range(n - 1, -1, -1):
             reached = ddq[j]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from r2s.compiled import njit
-from r2s.physics.linear_algebra import factor, factor_active, packed_element, solve, solve_active, unpack
+from r2s.physics.linear_algebra import factor, packed_element, solve, unpack
 
 TINY = 1e-9  # rad/s, round-off of the velocity of a sticking joint
 HELD, FREE = 0.0, 2.0  # `side` of a sticking joint and of a joint without stiction; -1, 1: direction of sliding
@@ -78,8 +78,8 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
             for j in range(n):
                 acceleration[j] = forces.drive[j] - friction[j]
             unpack(mass, h, damping, root)
-            factor_active(root, side, root)
-            solve_active(root, side, acceleration)
+            factor(root, root, side)
+            solve(root, acceleration, side)
             j, direction = _farthest_beyond(mass, acceleration, forces, side)
             if j < 0 or events > 4 * n:  # a joint with so many stops within a step sticks until its end
                 break
@@ -94,7 +94,7 @@ def coming_velocity(mass, damping, h, forces, dq_min, work, coming):
                 for k in range(n):
                     if side[k] == HELD:
                         impulse[j] += packed_element(mass, j, k) * coming[k]
-            solve_active(root, side, impulse)
+            solve(root, impulse, side)
             for j in range(n):
                 coming[j] = 0.0 if side[j] == HELD else coming[j] + impulse[j]
         for j in range(n):
