@@ -14,7 +14,7 @@ import numpy as np
 from r2s.errors import UserError, import_failure
 from r2s.physics.dynamics import Dynamics
 from r2s.physics.robot import SIM_DT, Robot
-from r2s.physics.welds import Bodies, about, make_pose, shaped
+from r2s.physics.welds import Bodies, about, make_pose
 
 
 class DartEngine:
@@ -48,7 +48,12 @@ class DartEngine:
         n = robot.n
         bodies = model.jnt_bodyid
         links = Bodies(model)
-        links.override(bodies, shaped("masses", masses, (n,)), shaped("coms", coms, (n, 3)), inertias, n)
+        given = {"masses": (masses, links.mass), "coms": (coms, links.com), "inertias": (inertias, links.inertia)}
+        for name, (value, own) in given.items():
+            if value is not None:
+                if np.shape(value) != own[bodies].shape:
+                    raise UserError(f"{name}: expected shape {own[bodies].shape}, got {np.shape(value)}")
+                own[bodies] = value
         self.robot = robot
         # DART has no armature A. Damping A/h plus the torque (A/h) v is exactly equivalent: the implicit step solves
         # (M + h D) a = tau + (A/h) v - D v, which with D = A/h is (M + A) a = tau.

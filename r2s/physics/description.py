@@ -58,7 +58,7 @@ def chain(robot: Robot, dynamics: Dynamics, *, friction: bool = True) -> tuple[l
     """
     model = robot.model(gravity=True)
     bodies, moving = Bodies(model), model.jnt_bodyid
-    bodies.override(moving, dynamics.mass, dynamics.com, dynamics.inertia, robot.n)
+    bodies.mass[moving], bodies.com[moving], bodies.inertia[moving] = dynamics.mass, dynamics.com, dynamics.inertia
     coulomb, viscous = coulomb_viscous(robot, dynamics) if friction else np.zeros((2, robot.n))
     out, before = [], np.eye(4)
     for i, body in enumerate(moving):

@@ -3,8 +3,6 @@
 import mujoco
 import numpy as np
 
-from r2s.errors import UserError
-
 Inertia = tuple[float, np.ndarray, np.ndarray]  # mass, kg; centre (3,), m; tensor (3, 3) about it, kg m^2
 
 
@@ -30,22 +28,6 @@ class Bodies:
         poses = zip(model.body_pos, model.body_quat, strict=True)
         self.local = [make_pose(position, rotation(quat)) for position, quat in poses]
 
-    def override(
-        self,
-        bodies: np.ndarray,
-        masses: np.ndarray | None,
-        coms: np.ndarray | None,
-        inertias: np.ndarray | None,
-        n: int,
-    ) -> None:
-        """Replace mass (n,), centre (n, 3) and tensor (n, 3, 3) of these bodies, unless None."""
-        if masses is not None:
-            self.mass[bodies] = masses
-        if coms is not None:
-            self.com[bodies] = coms
-        if (inertias := shaped("inertias", inertias, (n, 3, 3))) is not None:
-            self.inertia[bodies] = inertias
-
     def moving_parent(self, body: int) -> tuple[int, np.ndarray]:
         """Return the nearest body with a joint at or above `body` (0: the world), and the pose of `body` in it."""
         pose = np.eye(4)
@@ -63,13 +45,6 @@ class Bodies:
                 r = pose[:3, :3]
                 parts.append((self.mass[other], r @ self.com[other] + pose[:3, 3], r @ self.inertia[other] @ r.T))
         return combined(parts)
-
-
-def shaped(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return value; raise UserError unless it is None or has this shape."""
-    if value is not None and np.shape(value) != shape:
-        raise UserError(f"{name}: expected shape {shape}, got {np.shape(value)}")
-    return value
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:
