@@ -174,7 +174,7 @@ class RobotSide(NamedTuple):
 
 def _serve(pipe, settings: RobotSide, folder: Path) -> None:
     os.setsid()
-    version = CLIENTS[settings.client][1]
+    version = CLIENTS[settings.client].arm_type.version
     arm = settings.make_arm()
     arm.move_to(arm.robot.q_home)
     arm.command(np.zeros(7))  # compiles; a client would time out during it
@@ -363,7 +363,7 @@ def run_motion(folder: Path, robot: Robot, client: str, address: str, motion: Mo
 
 def _open(robot: Robot, client: str, address: str, operator: Refuses, motion: Motion) -> Franka:
     thresholds = {"collision_torque": motion.collision.torque, "collision_force": motion.collision.force}
-    arm = CLIENTS[client][0](robot, address, operator=operator, declared_payload=motion.declared, **thresholds)
+    arm = CLIENTS[client](robot, address, operator=operator, declared_payload=motion.declared, **thresholds)
     arm.realtime = motion.realtime  # without a real-time kernel, which the client's own option requires
     return arm
 

@@ -37,7 +37,6 @@ REASONS = {
     "r2s.control.impedance.cartesian_impedance": YAML,
     "r2s.control.impedance.joint_impedance": YAML,
     "r2s.arm.clients.emulated.emulated_arm": YAML,
-    "r2s.arm.clients.fr3.FR3.__init__": YAML,
     "r2s.arm.clients.panda.Panda.__init__": YAML,
     "r2s.arm.twins.make_twin.make_twin": YAML,
     "r2s.arm.twins.twin_base.TwinBase.__init__": YAML,

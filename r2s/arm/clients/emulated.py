@@ -15,7 +15,7 @@ from r2s.arm.twins.rigid_twin import RigidTwin
 from r2s.errors import UserError, check_number, choices
 from r2s.physics.robot import Robot
 
-CLIENTS: dict[str, tuple[type[Panda] | type[FR3], int]] = {"panda": (Panda, 5), "fr3": (FR3, 10)}  # with FCI version
+CLIENTS: dict[str, type[Panda]] = {"panda": Panda, "fr3": FR3}
 
 
 def emulated_arm(
@@ -44,7 +44,7 @@ def emulated_arm(
     """
     if client not in CLIENTS:
         raise UserError(f"arm.client: {client!r}; allowed: {choices(CLIENTS)}")
-    make, version = CLIENTS[client]
+    make = CLIENTS[client]
     CollisionThresholds(collision_torque, collision_force)  # checked before the emulator starts
     check_number("speed_share", speed_share, "(0, 1]")
     settings: dict[str, Any] = {"collision_torque": collision_torque, "collision_force": collision_force}
@@ -52,7 +52,7 @@ def emulated_arm(
     arm = partial(make, robot, operator=find_operator(operator), **settings)
     own: dict[str, Any] = {"payload": payload, "declared_payload": declared_payload, "surface": surface}
     twin = partial(RigidTwin, robot, seed, noise=noise, **own)
-    return _opened(arm, Emulator(twin, version=version, realtime=realtime), realtime)
+    return _opened(arm, Emulator(twin, version=make.arm_type.version, realtime=realtime), realtime)
 
 
 @contextmanager

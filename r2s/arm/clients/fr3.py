@@ -3,19 +3,15 @@
 pylibfranka has neither rate limiter nor low-pass in this loop: the arm receives each command unchanged.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from r2s.arm.clients import connection_check, fr3_limits
-from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
-from r2s.arm.clients.connection_check import Connection
-from r2s.arm.clients.consent import Operator, find_operator
-from r2s.arm.clients.franka import Franka
 from r2s.arm.clients.libfranka import Client
-from r2s.physics.payload import payload_of
+from r2s.arm.clients.panda import Panda
 from r2s.physics.robot import Robot
 
 STOP_DISTANCE = 0.02  # rad, of a joint that brakes from 0.2 rad/s, the speed that an FR3 allows there
@@ -45,39 +41,12 @@ def as_driven(robot: Robot) -> Robot:
     return within_fr3(robot) if inside.all() else robot
 
 
-class FR3(Franka):
-    """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
-
-    Raises:
-        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm behind it
-            is not the one of the model.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        address: str,
-        *,
-        operator: Operator | str | None = None,
-        realtime: bool = False,
-        collision_torque: Sequence[float] = CAUTIOUS.torque,
-        collision_force: Sequence[float] = CAUTIOUS.force,
-        declared_payload: Any = None,
-        moves: bool = True,
-        speed_share: float = 1.0,
-    ):
-        thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
-        expected = Connection(connection_check.FR3, declared, moves)
-        client = _FR3Client(address, realtime)
-        super().__init__(within_fr3(robot), client, operator, thresholds, expected, realtime, speed_share)
-
-
 class _FR3Client(Client):
+    name, package = "fr3", "pylibfranka"
     version = 10  # libfranka connects to no other, and pylibfranka does not pass the number on
 
     def __init__(self, address: str, realtime: bool):
-        super().__init__("fr3", "pylibfranka", address, realtime)
+        super().__init__(address, realtime)
         self._control: Any = None
         self._last = [0.0] * 7
 
@@ -120,3 +89,14 @@ class _FR3Client(Client):
         except Exception:
             self._control = None
             raise
+
+
+class FR3(Panda):
+    """A Franka Research 3; arguments as in `Panda`, limits restricted by `within_fr3`.
+
+    Raises:
+        UserError: pylibfranka is missing, no server of its FCI version answers at the address, or the arm behind it
+            is not the one of the model.
+    """
+
+    arm_type, client_type, within = connection_check.FR3, _FR3Client, staticmethod(within_fr3)

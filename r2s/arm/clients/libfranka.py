@@ -23,21 +23,23 @@ class Client:
     Every method raises ArmStopped with libfranka's message.
 
     Attributes:
+        name: option of the group `arm`, and the extra that installs the package. package: its module.
         version: of the arm's FCI.
 
     Args:
-        name: option of the group `arm`, and the extra that installs the package. package: its module.
         address: host name or IP. realtime: require a real-time kernel and priority.
     """
 
+    name: str
+    package: str
     version: int
 
-    def __init__(self, name: str, package: str, address: str, realtime: bool):
-        self._package = optional_import(package, f"arm={name}", name)
+    def __init__(self, address: str, realtime: bool):
+        self._package = optional_import(self.package, f"arm={self.name}", self.name)
         config = self._package.RealtimeConfig
         config = config.kEnforce if realtime else config.kIgnore
         with kept_scheduler():
-            self._robot = connect(lambda: self._package.Robot(address, config), name, address)
+            self._robot = connect(lambda: self._package.Robot(address, config), self.name, address)
 
     def start(self) -> Any:
         """Start a torque motion; return the RobotState that waits for the first command."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from r2s.arm.clients.collision_thresholds import CAUTIOUS, CollisionThresholds
-from r2s.arm.clients.connection_check import PANDA, Connection
+from r2s.arm.clients.connection_check import PANDA, ArmType, Connection
 from r2s.arm.clients.consent import Operator, find_operator
 from r2s.arm.clients.franka import Franka
 from r2s.arm.clients.libfranka import Client, one_line
@@ -25,47 +25,12 @@ NO_FILTER_HZ = 1000.0  # libfranka's kMaxCutoffFrequency: switches the low-pass 
 OWNER_CHECK_S = 0.1  # period of the check that the commanding thread is alive
 
 
-class Panda(Franka):
-    """A Franka Emika Panda.
-
-    Args:
-        robot: limits and nominal model.
-        address: host name or IP of the arm or of an emulator.
-        operator: see `Franka`; 'terminal' asks a person at the terminal.
-        realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
-        collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
-        declared_payload: what the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
-            `payload_of`; the connection is refused if the arm has another mass. moves: see `Connection`.
-
-    Raises:
-        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm behind it is
-            not the one of the model.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        address: str,
-        *,
-        operator: Operator | str | None = None,
-        realtime: bool = False,
-        collision_torque: Sequence[float] = CAUTIOUS.torque,
-        collision_force: Sequence[float] = CAUTIOUS.force,
-        declared_payload: Any = None,
-        moves: bool = True,
-        speed_share: float = 1.0,
-    ):
-        thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
-        declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
-        expected = Connection(PANDA, declared, moves)
-        client = _PandaClient(address, realtime)
-        super().__init__(PANDA.within(robot), client, operator, thresholds, expected, realtime, speed_share)
-
-
 class _PandaClient(Client):
+    name, package = "panda", "panda_py.libfranka"
+
     def __init__(self, address: str, realtime: bool):
         self._motion: _Motion | None = None
-        super().__init__("panda", "panda_py.libfranka", address, realtime)
+        super().__init__(address, realtime)
         self.version = self._robot.server_version()
 
     def __del__(self):
@@ -151,3 +116,47 @@ class _Motion:
             except Empty:
                 if not self._owner.is_alive():
                     raise RuntimeError("the thread that commanded the arm has ended") from None
+
+
+class Panda(Franka):
+    """A Franka Emika Panda.
+
+    Attributes:
+        arm_type, client_type, within: what an `FR3` has instead; `within` restricts a robot's limits to the arm's.
+
+    Args:
+        robot: limits and nominal model.
+        address: host name or IP of the arm or of an emulator.
+        operator: see `Franka`; 'terminal' asks a person at the terminal.
+        realtime: require a real-time kernel and priority; necessary on hardware, not with the emulator.
+        collision_torque, collision_force: see `CollisionThresholds`. speed_share: see `Franka`.
+        declared_payload: what the arm's gravity compensation assumes (Desk's end effector plus setLoad), see
+            `payload_of`; the connection is refused if the arm has another mass. moves: see `Connection`.
+
+    Raises:
+        UserError: panda-python is missing, no server of FCI version 5 answers at the address, or the arm behind it is
+            not the one of the model.
+    """
+
+    arm_type: ArmType = PANDA
+    client_type: type[Client] = _PandaClient
+    within = staticmethod(PANDA.within)
+
+    def __init__(
+        self,
+        robot: Robot,
+        address: str,
+        *,
+        operator: Operator | str | None = None,
+        realtime: bool = False,
+        collision_torque: Sequence[float] = CAUTIOUS.torque,
+        collision_force: Sequence[float] = CAUTIOUS.force,
+        declared_payload: Any = None,
+        moves: bool = True,
+        speed_share: float = 1.0,
+    ):
+        thresholds, operator = CollisionThresholds(collision_torque, collision_force), find_operator(operator)
+        declared = payload_of(declared_payload, robot.payload_max, "arm.declared_payload")
+        expected = Connection(self.arm_type, declared, moves)
+        client = self.client_type(address, realtime)
+        super().__init__(self.within(robot), client, operator, thresholds, expected, realtime, speed_share)
