@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from r2s.errors import UserError
-from r2s.excitation.information import COARSE_HZ, motion_information
+from r2s.excitation.information import COARSE_HZ, information
 from r2s.excitation.motion import Excitation
 from r2s.excitation.motion_checks import (
     GEOMETRY_HZ,
@@ -94,7 +94,7 @@ def fourier(
         raise UserError(f"excitation.effort: expected a number of 0 or more, got {effort}")
     space = Space(robot, table=table, z_min=z_min)
     center = checked_center(robot, space, q_center)
-    candidates = Candidates(robot, center, duration, partial(motion_information, robot, gravity=gravity), space)
+    candidates = Candidates(robot, center, duration, partial(information, robot, gravity=gravity), space)
     motion = candidates.found(np.random.default_rng(seed), effort)
     check_motion(robot, motion, space=space)
     return motion

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from r2s.excitation.motion_checks import Motion, gravity_torque
+from r2s.excitation.motion_checks import gravity_torque
 from r2s.physics.rigid_body import LinkInertia, regressor, tensor_elements
-from r2s.physics.robot import SIM_DT, Robot
+from r2s.physics.robot import Robot
 
 COARSE_HZ = 10  # samples for information and safety
 # Standard deviations of noise and priors, rough values of torque-controlled arms.
@@ -18,8 +18,10 @@ SLOPE = 0.05  # share of dq_max, width of the sign change of friction
 RESTING = 1e-3  # share of dq_max; a slower joint may stick, and its torque carries no information
 
 
-def information(robot: Robot, motion: Motion, *, gravity: bool = False) -> float:
-    """Return the information in nats of a recording of this motion: half the log det of posterior over prior.
+def information(
+    robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
+) -> np.ndarray:
+    """Return (B,) nats of B motions (B, T, n) at the times t (T,): half the log det of posterior over prior.
 
     The unknowns have independent normal priors. Per joint: offset, Coulomb friction as a tanh, its width and shift,
     viscous friction, and angle-dependent drag. Per link: mass and centre of mass (their errors appear in gravity even
@@ -27,15 +29,6 @@ def information(robot: Robot, motion: Motion, *, gravity: bool = False) -> float
     one delay. With `gravity` (link-side torque): the whole tensors. The noise is 0.2 % of tau_max at 10 samples per
     second. Rows with a joint at rest do not count, because friction is undetermined there.
     """
-    every = round(1 / (COARSE_HZ * SIM_DT))
-    q, dq, ddq = (x[None, ::every] for x in (motion.q, motion.dq, motion.ddq))
-    return float(motion_information(robot, motion.t[::every], q, dq, ddq, gravity)[0])
-
-
-def motion_information(
-    robot: Robot, t: np.ndarray, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, gravity: bool
-) -> np.ndarray:
-    """Return the information (B,) of B motions (B, T, n) at the times t (T,)."""
     n, shape = robot.n, (len(q), len(t), robot.n)
     flat = q.reshape(-1, n), dq.reshape(-1, n), ddq.reshape(-1, n)
     y = regressor(robot, *flat, gravity=robot.gravity).reshape(*shape, n, 10)
