@@ -76,9 +76,17 @@ class Emulator:
 
 
 def _child(pipe, settings: tuple) -> None:
+    make_arm, version, realtime, faults, max_missed, desk = settings
     os.setsid()  # as a control box, it receives no signal of the terminal
     try:
-        server = _server(*settings)
+        socket = open_port()
+        arm = make_arm()
+        arm.move_to(arm.robot.q_home)
+        arm.command(np.zeros(arm.robot.n))  # compiles; a client would time out during it
+        arm.stop()
+        arm = make_arm()
+        control = Control(arm, version, faults, max_missed, desk)
+        server = Server(socket, control, urdf(arm.robot), version, realtime=realtime)
     except UserError as error:
         pipe.send(error)
         return
@@ -87,21 +95,3 @@ def _child(pipe, settings: tuple) -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     server.serve(parent.sentinel)  # type: ignore[arg-type]  # on POSIX a file descriptor
-
-
-def _server(
-    make_arm: Callable[[], Arm],
-    version: int,
-    realtime: bool,
-    faults: Sequence[Fault],
-    max_missed: int,
-    desk: Mapping[str, Any] | None,
-) -> Server:
-    socket = open_port()
-    trial = make_arm()
-    trial.move_to(trial.robot.q_home)
-    trial.command(np.zeros(trial.robot.n))  # compiles; a client would time out during it
-    trial.stop()
-    arm = make_arm()
-    control = Control(arm, version, faults, max_missed, desk)
-    return Server(socket, control, urdf(arm.robot), version, realtime=realtime)
