@@ -66,11 +66,12 @@ class TimedProblem(Problem):
 
     log: Log = field(default_factory=Log)
 
-    def _with_prior(self, data, u):
-        rows = super()._with_prior(data, u)
+    def residual(self, u):
+        """Return the residual, as `Problem` does."""
+        rows = super().residual(u)
         cost = (rows**2).sum(1)
-        if cost.min() < self.log.best.get(data, np.inf):
-            self.log.best[data] = cost.min()
+        if cost.min() < self.log.best.get(self.data, np.inf):
+            self.log.best[self.data] = cost.min()
             self.log.trail.append((time.perf_counter() - self.log.began, u[cost.argmin()].copy()))
         return rows
 

@@ -113,7 +113,7 @@ def test_a_fit_needs_less_memory_than_a_jacobian(arm, wrong):  # noqa: F811
     residual = TorqueResidual(space, recording)
     problem = Problem.of(residual, residual, {})
     tracemalloc.start()
-    normal_equations(problem.torque_linearize(problem.start))
+    normal_equations(problem.linearize(problem.start))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 8 * len(residual.clusters) * len(problem.start)

@@ -35,7 +35,7 @@ def states(start):
 
 def same(a: State, b: State) -> bool:
     """Return whether two states have the same parameters, solution, weights and prior."""
-    arrays = [(s.u, s.problem.sigma, s.problem.torque_residual(s.u[None])) for s in (a, b)]
+    arrays = [(s.u, s.problem.sigma, s.problem.on_torque.residual(s.u[None])) for s in (a, b)]
     return a.terms == b.terms and all(map(np.array_equal, *arrays))
 
 

@@ -67,7 +67,7 @@ def expected_widths(robot: Robot, nominal: Dynamics, recording: Recording, setti
     problem = torque_problem(robot, nominal, used, settings)
     space = problem.space
     u = LeastSquares(STEPS, FTOL, level="torque")(problem, problem.start, lambda row: None)
-    problem = problem.torque_reweighted(u)
+    problem = problem.reweighted(u, fitted=True)
     sure = posterior(problem, u, settings.seed)
     found = conclude(problem, space, sure._asdict(), history=pd.DataFrame(), families={}).found
     share = np.minimum(sure.steps.std(0) / problem.prior_width, 1.0)

@@ -370,8 +370,8 @@ def worse_on_torque(problem: Problem, u: np.ndarray, v: np.ndarray) -> bool:
     Two estimates of the same parameters differ by their errors, which raises the sum of squares by about P. The sum
     itself has the relative error ALIKE, because the number of independent rows is uncertain.
     """
-    fitted = (problem.torque_residual(u[None])[0] ** 2).sum()
-    rise = (problem.torque_residual(v[None])[0] ** 2).sum() - fitted
+    fitted = problem.on_torque.cost(u)
+    rise = problem.on_torque.cost(v) - fitted
     return bool(rise > max(len(u), ALIKE * fitted))
 
 

@@ -82,6 +82,11 @@ class Problem:
         return self.data is not self.torque_data
 
     @property
+    def on_torque(self) -> "Problem":
+        """The problem with the torque residual as data."""
+        return replace(self, data=self.torque_data)
+
+    @property
     def prior_width(self) -> np.ndarray:
         """(P,) on the unit cube, the standard deviation that the data's is compared with: the prior's.
 
@@ -126,23 +131,15 @@ class Problem:
 
     def residual(self, u: np.ndarray) -> np.ndarray:
         """Return (C, R + B) for u (C, P): data, prior and extra rows, in standard deviations."""
-        return self._with_prior(self.data, u)
+        return np.concatenate([self.data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield `residual` and its Jacobian (., P) at u (P,) in parts of rows: data, then prior and extra rows."""
-        if not self.uses_replays:
-            yield from self.torque_linearize(u)
-        else:
+        if self.uses_replays:
             yield _differences(self.residual, u)
-
-    def torque_residual(self, u: np.ndarray) -> np.ndarray:
-        """Return `residual` with the torque residual as data."""
-        return self._with_prior(self.torque_data, u)
-
-    def torque_linearize(self, u: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield `torque_residual` and its Jacobian at u (P,) like `linearize`."""
-        yield from self.torque_data.linearize(u)
-        yield _differences(self._prior, u)
+        else:
+            yield from self.torque_data.linearize(u)
+            yield self.prior_rows(u)
 
     def prior_rows(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the prior and extra rows (B,) and their Jacobian (B, P) at u (P,)."""
@@ -152,9 +149,6 @@ class Problem:
         """Return (P, P), half the Hessian at u (P,) of the prior and extra rows."""
         j = self.prior_rows(u)[1]
         return j.T @ j
-
-    def _with_prior(self, data: ReplayResidual | TorqueResidual, u: np.ndarray) -> np.ndarray:
-        return np.concatenate([data(self.space.from_unit(u)), self._prior(u)], axis=1)
 
     def _prior(self, u: np.ndarray) -> np.ndarray:
         prior, x = (u - self.start) * self.weight, self.space.from_unit(u)
@@ -193,12 +187,12 @@ def fits_torque(search: Search) -> bool:
 
 
 def fit_torque(problem: Problem) -> tuple[np.ndarray, Problem]:
-    """Return u (P,) by least squares on torque, reweighted between rounds, and the problem with the last weights."""
+    """Return u (P,) of a problem on torque, reweighted between rounds, and the problem with the last weights."""
     u, rounds = problem.start, MOTOR_ROUNDS if problem.torque_data.at_motor else ROUNDS
     for k in range(rounds):
-        u = minimize(problem.torque_residual, problem.torque_linearize, u, FIT_STEPS, FIT_FTOL)
+        u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
         if k < rounds - 1:
-            problem = problem.torque_reweighted(u)
+            problem = problem.reweighted(u, fitted=True)
     return u, problem
 
 
@@ -209,11 +203,12 @@ def implicit_friction(problem: Problem, u: np.ndarray, significant: float = SIGN
     effect must have about the expected size and be `significant` standard deviations. A missing rotor has a similar
     effect, a hundred times larger.
     """
-    r = problem.torque_residual(u[None])[0]
+    problem = problem.on_torque
+    r = problem.residual(u[None])[0]
     ahead = problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT))
-    moved = ahead.torque_residual(u[None])[0] - r
+    moved = ahead.residual(u[None])[0] - r
     row, products, hessian = 0, 0.0, 0.0
-    for own, j in problem.torque_linearize(u):
+    for own, j in problem.linearize(u):
         both = np.stack([own, moved[row : row + len(own)]], 1)
         row, products, hessian = row + len(own), products + j.T @ both, hessian + j.T @ j
     gradient, slope = np.asarray(products).T

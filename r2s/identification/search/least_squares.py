@@ -30,7 +30,8 @@ class LeastSquares:
         limits = (self.max_evaluations, self.ftol, self.minutes, report)
         if self.level != "torque":
             return minimize(problem.residual, problem.linearize, start, *limits)
+        problem = problem.on_torque
         for _ in range(ROUNDS):  # iteratively reweighted
-            start = minimize(problem.torque_residual, problem.torque_linearize, start, *limits, "torque")
-            problem = problem.torque_reweighted(start)
+            start = minimize(problem.residual, problem.linearize, start, *limits, "torque")
+            problem = problem.reweighted(start, fitted=True)
         return start

@@ -63,7 +63,7 @@ class _LinearizedFold:
             # a simulator's implicit friction would pass for a rotor that adds to the inertia
             test = test.with_lead(EARLY * SIM_DT)
             u, problem = fit_torque(problem.with_torque_data(problem.torque_data.with_lead(EARLY * SIM_DT)))
-        problem = problem.torque_reweighted(u)
+        problem = problem.reweighted(u, fitted=True)
         fit = problem.torque_data
         names = [block for name in candidates for block in blocks_of(name)]
         found = space.dynamics(space.from_unit(u))
@@ -74,7 +74,7 @@ class _LinearizedFold:
         at_test = test.on(space).weighted_like(fit), test.on(more).weighted_like(fit)
         self._own = len(u)
         self._where = {name: [more.where(block) for block in blocks_of(name)] for name in candidates}
-        r, own = (np.concatenate(x) for x in zip(*problem.torque_linearize(u), strict=True))
+        r, own = (np.concatenate(x) for x in zip(*problem.linearize(u), strict=True))
         rows = len(fit.clusters)
         more_rows = np.concatenate([fit_more.jacobian(wide.start), np.zeros((len(r) - rows, len(wide.start)))])
         j = np.concatenate([own, more_rows], 1)

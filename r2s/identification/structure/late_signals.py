@@ -52,8 +52,8 @@ def torque_is_late(cv: CrossValidation, terms: Sequence[str]) -> bool:
     recording = cv.recording if cv.recording.period else cv.recording.in_phase()  # repetitions are one block
     data = TorqueResidual(space, recording, cutoff_hz=cv.cutoff_hz, rate_hz=RATE_HZ)
     u, problem = fit_torque(Problem.of(data, data, cv.prior))
-    problem = problem.torque_reweighted(u)
-    u = minimize(problem.torque_residual, problem.torque_linearize, u, FIT_STEPS, FIT_FTOL)
+    problem = problem.reweighted(u, fitted=True)
+    u = minimize(problem.residual, problem.linearize, u, FIT_STEPS, FIT_FTOL)
     (at,) = space.where(DELAY)
     late = np.abs(u - problem.start)[at]
     return bool(late > max(SURE * posterior(problem, u, seed=0).steps.std(0)[at], LATE_S / space.width[at]))
