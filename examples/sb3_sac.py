@@ -1,8 +1,8 @@
 """Train stable-baselines3's SAC on a batch of simulated arms.
 
 `python examples/sb3_sac.py 200000 calibration=runs/identify/arm dr=identified`: environment steps, then options of
-the command line. Rates, discount and sizes are those of conf/algo/sac.yaml. `Arms` serves any algorithm of sb3, and
-`WeightedReplay` any that learns off-policy: stored rewards follow the curriculum's weights.
+the command line. Settings are those of conf/algo/sac.yaml. `Arms` serves any algorithm of sb3, and `WeightedReplay`
+any that learns off-policy: stored rewards follow the curriculum's weights.
 """
 
 import sys
@@ -13,6 +13,7 @@ import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from r2s.learning.evaluate import make_evaluation
 
@@ -74,6 +75,26 @@ class NormReLU(torch.nn.Module):
         return torch.relu(torch.nn.functional.layer_norm(x, x.shape[-1:]))
 
 
+class QuietActor(Actor):
+    """sb3's actor; its loss has half the mean squared action beside its own terms, conf/algo's `action_l2`."""
+
+    def action_log_prob(self, obs):
+        """Return actions (B, a), whose gradients include the penalty's, and their log-density (B,)."""
+        action, log_prob = super().action_log_prob(obs)
+        if action.requires_grad:
+            action.register_hook(lambda gradient: gradient + action.detach() / action.numel())
+        return action, log_prob
+
+
+class QuietPolicy(SACPolicy):
+    """sb3's networks with a `QuietActor`, which has no normalization."""
+
+    def make_actor(self, features_extractor=None):
+        """Return the actor."""
+        settings = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return QuietActor(**settings | {"activation_fn": torch.nn.ReLU}).to(self.device)
+
+
 class WeightedReplay(ReplayBuffer):
     """sb3's buffer, whose rewards are the stored terms under the present weights of the reward."""
 
@@ -109,7 +130,7 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     name, mode = "r2s.envs:r2s/PandaReach-v0", "SameStep"
     arms = gym.make_vec(name, num_envs=32, autoreset_mode=mode, overrides=overrides).unwrapped
     model = SAC(
-        "MlpPolicy",
+        QuietPolicy,
         VecMonitor(Arms(arms)),
         replay_buffer_class=WeightedReplay,
         replay_buffer_kwargs={"arms": arms},

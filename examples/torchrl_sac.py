@@ -40,7 +40,7 @@ def train(env_steps: int, *overrides: str, seed: int = 0, episodes: int = 200) -
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(env_steps), batch_size=BATCH)
     collector = Collector(env, actor, frames_per_batch=ARMS, total_frames=env_steps, init_random_frames=RANDOM)
     for k, steps in enumerate(collector):
-        arms.weights = arms.reward.weights(arms.task, k * ARMS / env_steps)
+        arms.set_progress(k * ARMS / env_steps)
         buffer.extend(steps.reshape(-1))
         if len(buffer) < RANDOM:
             continue

@@ -180,6 +180,19 @@ def test_rewards_and_ends_are_those_of_r2ss_own_environment():
             assert np.array_equal(after["terminated"][:, 0].numpy(), terminated)
 
 
+def test_the_weights_adapt_as_in_r2ss_own_loop():
+    """Torques that the safety filter changes raise its penalty, by the terms that `info` gives."""
+    envs = batch(4)
+    envs.reset(seed=0)
+    reward, task, factor = envs.env.reward, envs.env.task, envs.env.reward.factor
+    for k, action in enumerate(np.sign(actions(STEPS, 4)) * np.float32(1.0)):
+        envs.set_progress(0.5 + 0.01 * k)
+        np.testing.assert_allclose(envs.env.weights, reward.weights(task, 0.5 + 0.01 * k, factor), rtol=1e-5)
+        *_, info = envs.step(action)
+        factor = reward.adapt(factor, 0.5 + 0.01 * (k + 1), info["reward_terms"].mean(0), 4)
+    assert factor > 1.0
+
+
 @pytest.mark.parametrize(
     ("call", "line"),
     [

@@ -63,6 +63,7 @@ class TaskEnv(EnvBase):
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises for a task with other terms
         self.weights = self.reward.weights(task, 0.0)
+        self._factor, self._seen, self._seen_steps = self.reward.factor, 0.0 * self.weights, 0  # of `set_progress`
         self._torque = task.torque_limit(robot)
         self._staggered = self._stagger = stagger  # as given, and whether the next reset does it
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
@@ -80,6 +81,17 @@ class TaskEnv(EnvBase):
         self.reward_spec = Unbounded((nsim, 1), dtype=torch.float32)
         flag = Binary(1, (nsim, 1), dtype=torch.bool)
         self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape)
+
+    def set_progress(self, progress: float) -> None:
+        """Set the weights of the reward to those at this share, 0 to 1, of a training, for loops of other libraries.
+
+        Its factor adapts to the steps since the last call, as in `r2s.learning.train.train`.
+        """
+        if self._seen_steps:
+            mean = self._seen / self._seen_steps
+            self._factor = self.reward.adapt(self._factor, progress, mean, self._seen_steps)
+            self._seen, self._seen_steps = 0.0 * mean, 0
+        self.weights = self.reward.weights(self.task, progress, self._factor)
 
     def place(self, q: np.ndarray, goal: np.ndarray, ids: np.ndarray | None = None) -> State:
         """Start episodes of the arms `ids` (all by default) at rest at q (m, n) with goals (m, ...)."""
@@ -183,6 +195,7 @@ class TaskEnv(EnvBase):
         observation = self._observe(state)
         check_finite("observation", observation, self._count)
         check_finite("reward", terms, self._count)
+        self._seen, self._seen_steps = self._seen + terms.sum(0), self._seen_steps + self.nsim
         after = self._tensors(observation, terms, distance, self._count >= self.task.steps)
         after["reward"] = torch.from_numpy((terms @ self.weights)[:, None].astype(np.float32))
         return after

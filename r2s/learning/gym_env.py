@@ -104,8 +104,8 @@ class ArmVectorEnv(gym.vector.VectorEnv):
         self.observation_space, self.action_space = (gym.vector.utils.batch_space(s, num_envs) for s in spaces)
 
     def set_progress(self, progress: float) -> None:
-        """Set the weights of the reward to those at this share, 0 to 1, of a training."""
-        self.env.weights = self.env.reward.weights(self.env.task, progress)
+        """Set the weights of the reward to those at this share, 0 to 1, of a training; see `TaskEnv.set_progress`."""
+        self.env.set_progress(progress)
 
     def normalized(self, observation: np.ndarray) -> np.ndarray:
         """Return observations (m, d) of r2s as this environment gives them."""
