@@ -48,7 +48,7 @@ MISTAKES = {
     "dr=identified": r"give calibration=RUN_FOLDER",
     "task=track robot.torque_fraction=null": r"robot.torque_fraction: expected a number in \[1e-6, 1\], got None",
     "robot.torque_fraction=[0.3,nan]": r"robot.torque_fraction: expected a number in \[1e-6, 1\], got nan",
-    "robot.torque_fraction=[0.1,0.2]": r"robot.torque_fraction: expected one number or 7, .* got 2 numbers",
+    "robot.torque_fraction=[0.1,0.2]": r"expected 7 values, .* got 2; its default is robot.torque_fraction",
     "stage=pipeline pipeline.train_minutes=0": r"pipeline.train_minutes: expected a number in \(0, inf\), got 0",
     "stage=pipeline +experiment=toy algo.tau=nan": r"algo.tau: expected a number in \(0, 1\], got nan",
     "+experiment=paper_grid": r"this is a grid of jobs, and only -m runs it: .* -m \+experiment=paper_grid",

@@ -43,24 +43,15 @@ def make_robot(cfg):
     """Return the arm of conf/robot."""
     from r2s.physics.robot import OF_TASKS
 
+    for key in OF_TASKS:
+        if key.endswith("fraction") and isinstance(cfg.robot, Mapping) and key in cfg.robot:
+            share = plain(cfg.robot)[key]
+            for value in share if isinstance(share, list) and share else [share]:
+                check_number(f"robot.{key}", value, "[1e-6, 1]")
     settings, task = plain(cfg.robot), plain(cfg.get("task"))
     if isinstance(settings, dict) and settings.get("tool") is None and isinstance(task, Mapping):
         settings = {**settings, "tool": task.get("tool")}
-    robot = part(settings, "robot", beside=OF_TASKS)
-    for key in OF_TASKS:
-        if key.endswith("fraction") and isinstance(settings, Mapping) and key in settings:
-            check_shares(f"robot.{key}", settings[key], robot)
-    return robot
-
-
-def check_shares(name, share, robot):
-    """Raise UserError unless `share` is a share of tau_max for all joints or one for each joint."""
-    if isinstance(share, list) and len(share) != robot.n:
-        raise UserError(
-            f"{name}: expected one number or {robot.n}, for the joints of {robot.name}, got {len(share)} numbers"
-        )
-    for value in share if isinstance(share, list) else [share]:
-        check_number(name, value, "[1e-6, 1]")
+    return part(settings, "robot", beside=OF_TASKS)
 
 
 def make_dynamics(cfg, robot):

@@ -109,7 +109,7 @@ class ReachTask(BaseTask):
         if share.ndim and share.shape != (robot.n,):
             raise UserError(
                 f"task.torque_fraction: expected {robot.n} values, for the {robot.n} joints of {robot.name}, "
-                f"got {share.size}"
+                f"got {share.size}; its default is robot.torque_fraction, of tracking robot.tracking_fraction"
             )
         return share * robot.tau_max
 
