@@ -62,6 +62,16 @@ def test_a_multiplier_settles_where_the_cost_is_at_its_limit(light, end):
     assert reward.adapt(np.array([1.0, MOST]), 0.0, np.array([0.0, 9.0]), PATIENCE)[1] == MOST
 
 
+def test_rare_large_costs_count_by_their_mean():
+    """One step in 50 costs 100 times the limit, the others nothing: as a constant cost of twice the limit."""
+    reward = ConstrainedReward(Reward(), PANDA, {"excess_force": 0.5})
+    rare = constant = np.array([1.0, 5.0])
+    for step in range(500):
+        rare = reward.adapt(rare, 0.0, np.array([0.0, 50.0 * (step % 50 == 0)]), PATIENCE // 1000)
+        constant = reward.adapt(constant, 0.0, np.array([0.0, 1.0]), PATIENCE // 1000)
+    np.testing.assert_allclose(rare, constant, rtol=1e-9)
+
+
 @pytest.mark.parametrize("kind", [DDPG, TD3, SAC, TQC])
 def test_a_constrained_policy_keeps_its_limit(kind):
     """A point x' = x + a/2 that wants to be at 1, and may be at 0.5 on average.

@@ -98,6 +98,6 @@ class ConstrainedReward(Reward):
     def adapt(self, factor: Any, progress: float, seen: np.ndarray, env_steps: int) -> np.ndarray:
         """Return the reward's factor and the multipliers after `env_steps` steps with mean terms `seen` (k,)."""
         own = len(seen) - len(self._names)
-        beyond = (seen[own:] / self._limits - 1.0).clip(-1.0, 1.0)  # one bad step does not wind a multiplier up
+        beyond = seen[own:] / self._limits - 1.0  # not clipped: rare large costs would count less than their mean
         multipliers = (factor[1:] + beyond * env_steps / PATIENCE).clip(0.0, MOST)
         return np.array([self._reward.adapt(factor[0], progress, seen[:own], env_steps), *multipliers])
