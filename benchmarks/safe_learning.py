@@ -14,7 +14,7 @@ import pandas as pd
 from common import RESULTS, ROOT, markdown_rows, run_parallel, write_page
 
 RUNS = ROOT / "runs" / "safe_learning"
-COSTS = {"excess_force": (0.05, "N"), "impact_speed": (3e-4, "m/s")}
+COSTS = {"excess_force": (0.08, "N"), "impact_speed": (4e-4, "m/s")}
 LIMITED = "safety.force_max=40", "safety.speed_near=0.03"
 KEPT = tuple(f"costs.{name}={limit:g}" for name, (limit, _) in COSTS.items())
 MEASURED = tuple(f"costs.{name}=1e6" for name in COSTS)  # limits that nothing reaches
