@@ -69,9 +69,12 @@ def section(task: str, names: dict[str, dict[Twin, str]]) -> list[str]:
         for (label, v, s), name in on_twin.items()
     }
     simulated = {f"{label}: {v} {s}": rows_of(task, RUNS / "train" / name, "best") for label, v, s, name in runs}
+    rows = [json.loads((RUNS / "train" / name / "summary.json").read_text())["last"] for *_, name in runs]
+    steps = [row["env_steps"] for row in rows if row["env_steps"]]  # the reference has none
     return [
         f"## {FORCES[task]}",
-        f"{EPISODES} goals on each twin. No force is fed back.",
+        f"{EPISODES} goals on each twin. No force is fed back."
+        + (f" Policies had {min(steps):,} to {max(steps):,} env steps." if steps else ""),
         markdown_rows(transferred, "on the twin"),
         f"In MuJoCo, {SIMULATED} goals with `dr=contact`: each with a surface of its own, friction within 10 %.",
         markdown_rows(simulated, "in simulation"),

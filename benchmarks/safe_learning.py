@@ -43,7 +43,7 @@ def row_of(name: str) -> dict[str, str]:
         mean, multiplier = end[f"term_{cost}"].mean(), -end[f"weight_{cost}"] * limit
         cells[f"{cost}, {unit}, at most {limit:g}"] = f"{mean:.3g}"
         cells[f"multiplier of {cost}"] = f"{multiplier.mean():.2f} ± {multiplier.std():.2f}"
-    cells["filter active in training, %"] = f"{-100 * end.term_filter_penalty.mean():.1f}"
+    cells["filter active in training, %"] = f"{0.0 - 100 * end.term_filter_penalty.mean():.1f}"
     best = json.loads((RUNS / "train" / name / "summary.json").read_text())["best"]
     shown = (("return_press", "return", 1, ".0f"), ("success", "success, %", 100, ".0f"))
     shown += (("force_rmse_N", "force RMSE, N", 1, ".2f"), ("overshoot_N", "overshoot, N", 1, ".2f"))
@@ -80,13 +80,13 @@ def main() -> None:
     text = (
         f"Means over the last quarter of each training of {ENV_STEPS:,} env steps, exploration included. The "
         "last columns are of the saved policy on the goals of all reports. Costs are means over all steps. Limit of "
-        f"force: {' '.join(LIMITED)}."
+        f"force: `{' '.join(LIMITED)}`."
     )
     write_page(
         "safe_learning",
         "Costs and a limit of force",
         " ".join(["python", *sys.argv]),
-        [text, table, "![](safe_learning.png)"],
+        [text, table, "![costs and multipliers over env steps](safe_learning.png)"],
     )
 
 

@@ -63,7 +63,8 @@ class TaskEnv(EnvBase):
         self.reward, self.control = reward or Reward(), task.control(robot)
         self.reward.terms(task)  # raises for a task with other terms
         self.weights = self.reward.weights(task, 0.0)
-        self._factor, self._seen, self._seen_steps = self.reward.factor, 0.0 * self.weights, 0  # of `set_progress`
+        self._factor = self.reward.factor  # of `set_progress`, as are the sum of the terms and its steps
+        self._seen, self._seen_steps = np.zeros_like(self.weights), 0
         self._torque = task.torque_limit(robot)
         self._staggered = self._stagger = stagger  # as given, and whether the next reset does it
         self._pool = task.goals(robot, np.random.default_rng(of_goals), task.pool)
@@ -90,7 +91,7 @@ class TaskEnv(EnvBase):
         if self._seen_steps:
             mean = self._seen / self._seen_steps
             self._factor = self.reward.adapt(self._factor, progress, mean, self._seen_steps)
-            self._seen, self._seen_steps = 0.0 * mean, 0
+            self._seen, self._seen_steps = np.zeros_like(mean), 0
         self.weights = self.reward.weights(self.task, progress, self._factor)
 
     def place(self, q: np.ndarray, goal: np.ndarray, ids: np.ndarray | None = None) -> State:
