@@ -21,6 +21,7 @@ from r2s.export.bundle import law_source
 from r2s.export.contract import check_exportable
 from r2s.physics import impedance as law
 from r2s.physics.dynamics import Dynamics, nominal_dynamics
+from r2s.physics.friction import BRISTLE, presliding
 from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.newton_euler import WORK, equations, links_of
 from r2s.physics.robot import load_robot
@@ -197,12 +198,58 @@ def test_joints_rest_where_the_command_says():
 
 @pytest.mark.parametrize("speed", [0.32, -0.08, 0.02])
 def test_friction_of_the_reference_is_fed_forward(speed):
-    """At the speeds of its table the torque is the model's friction; measured speed does not enter."""
+    """At the speeds of its table the torque is the model's friction, or the breakaway torque of a joint at rest."""
     model = replace(nominal_dynamics(PANDA, **conf("friction/paper")), offset=np.zeros(N))
-    control = joint_impedance(PANDA, TrackTask(pool=2), model)
     q, dq = PANDA.q_home, np.full(N, speed)
-    tau = control.torque(q[None], dq[None], np.concatenate([np.zeros(N), q, dq])[None])[0]
-    np.testing.assert_allclose(tau, model.friction(dq), atol=1e-9)
+    command = np.concatenate([np.zeros(N), q, dq])
+    edges, friction = model.breakaway[:, int(speed > 0)], model.friction(dq)
+    farther = np.where(np.abs(edges) > np.abs(friction), edges, friction)
+    for rest, wanted in ((True, farther), (False, friction)):
+        control = joint_impedance(PANDA, TrackTask(pool=2), model)
+        memory, tau = np.zeros(control.memory_size), np.empty(N)
+        for k in range(60):  # the low-pass of the speed settles; a joint that moves is at q and dq in the last cycle
+            there = q if rest else q + (k - 59) * DT * dq
+            control.law(there, dq, command, control.parameters, memory, tau)
+        np.testing.assert_allclose(tau, wanted, rtol=1e-4)
+
+
+def bristle_model(**changes):
+    """Return dynamics whose friction has bristles, with nothing else that the feedforward knows."""
+    rows = np.tile([1.0, 0.1, 0.3, 0.2, 0.1, 6e-4, 0.0, 0.0], (N, 1)) * np.linspace(0.5, 1.5, N)[:, None]
+    rows[:, 5] = np.linspace(4e-4, 1e-3, N)
+    return replace(Dynamics.of(PANDA, rows, BRISTLE), **changes)
+
+
+def ahead(control, angles):
+    """Return the torque (m, n) Nm along angles (m, n) rad of a joint impedance that holds each of them at rest."""
+    memory, out = np.zeros(control.memory_size), np.empty(angles.shape)
+    for k, q in enumerate(angles):
+        control.law(q, np.zeros(N), q - PANDA.q_home, control.parameters, memory, out[k])
+    return out
+
+
+def test_bristles_are_fed_forward_as_they_deflect():
+    """Forth by 2 mrad and back by a part of the presliding distance: their friction is the family's, to a step."""
+    model = bristle_model()
+    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
+    path = np.concatenate([np.linspace(0, 2e-3, 400), np.linspace(2e-3, 1.7e-3, 400), np.full(100, 1.7e-3)])
+    got = ahead(control, PANDA.q_home + path[:, None])[-1]
+    moves = np.gradient(path, DT)[:, None] * np.ones(N)
+    z = presliding(moves, DT, model.phi[:, 5])[-1]
+    level = np.abs(model.friction(law.FIRST_DQ * np.sign(z), np.sign(z)))
+    # a step of the law: STEP of the distance behind, and as much of the deflection that is left to go
+    assert (np.abs(got - level * z) <= 2.0 * law.STEP * level * (1.0 + np.abs(z))).all()
+    assert (np.abs(z) < 0.9).all()
+
+
+def test_noise_of_the_encoders_does_not_move_the_bristles():
+    """While joints rest for ten seconds under a Panda's noise, they deflect at most by a step that a motion began."""
+    control = joint_impedance(PANDA, REACH, bristle_model(), action="target", displacement=3.0)
+    rest = 2e-5 * np.round((2e-3 + 1.5e-5 * np.random.default_rng(0).normal(size=(10_000, N))) / 2e-5)
+    moves = np.linspace(0, 2e-3, 400)[:, None] * np.ones(N)
+    tau = ahead(control, PANDA.q_home + np.concatenate([moves, rest]))
+    left = np.exp(-2e-3 / 1e-3)  # of the deflection after 2 mrad, at most
+    np.testing.assert_allclose(tau[-1], tau[500], rtol=law.STEP * left)
 
 
 def hostile_stiffness(control, rng, cycles):
@@ -398,6 +445,7 @@ CONTROLS = {
     "sliding": lambda model: cartesian_impedance(PANDA, WipeTask(), model, hybrid=True, integral_rate=8.0),
     "joint": lambda model: joint_impedance(PANDA, REACH, model, action="both"),
     "joint path": lambda model: joint_impedance(PANDA, TrackTask(pool=2), model, action="stiffness"),
+    "bristles": lambda model: cartesian_impedance(PANDA, WipeTask(), bristle_model(mass=model.mass), hybrid=True),
 }
 
 

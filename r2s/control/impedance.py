@@ -129,7 +129,7 @@ def joint_impedance(
         action,
         unit,
         parameters=p,
-        memory_size=law.STIFFNESS + 4 * robot.n + robot.n**2,
+        memory_size=law.STIFFNESS + (law.ROWS + 1) * robot.n + robot.n**2,
         cpp=JOINT,
         torque_limit=limit,
         model=InverseDynamics(robot, dynamics),
@@ -221,7 +221,7 @@ def cartesian_impedance(
         action,
         unit,
         parameters=p,
-        memory_size=law.STIFFNESS + law.SPRINGS + 3 * robot.n + 2 * robot.n**2,
+        memory_size=law.STIFFNESS + law.SPRINGS + law.ROWS * robot.n + 2 * robot.n**2,
         cpp=CARTESIAN,
         torque_limit=limit,
         model=InverseDynamics(robot, dynamics),
@@ -321,11 +321,14 @@ def _parameters(
     rows[:, law.MASS_ERROR] = own[:, MASS] - nominal[:, MASS]
     rows[:, law.MOMENT_ERROR : law.MOMENT_ERROR + 3] = moment[0] - moment[1]
     rows[:, law.OFFSET], rows[:, law.DRAG : law.DRAG + 2], rows[:, law.HOME] = d.offset, d.drag, robot.q_home
-    still, model = np.zeros((1, n)), InverseDynamics(robot, d)
-    rest = model(robot.q_home[None], still, still, still)[0]
+    rows[:, law.EDGES : law.EDGES + 2] = d.breakaway
+    if d.family.has_memory and "presliding" in d.family.names:
+        rows[:, law.PRESLIDING] = d.phi[:, d.family.names.index("presliding")]
+    load = InverseDynamics(robot, d).load_friction(robot.q_home[None])[0]
     for k in range(2 * law.NODES):  # at home, load-dependent friction included
-        v = law.FIRST_DQ * 4.0 ** (k % law.NODES) * (1 if k < law.NODES else -1)
-        rows[:, law.FRICTION + k] = model(robot.q_home[None], still, still, np.full((1, n), v))[0] - rest
+        side = 1 if k < law.NODES else -1
+        v = np.full(n, side * law.FIRST_DQ * 4.0 ** (k % law.NODES))
+        rows[:, law.FRICTION + k] = d.friction(v, np.sign(v)) + side * load
     frames = np.empty((n, POSE))
     law.arm_pose(robot.q_home, p, frames, np.empty((6, n)), np.empty(3))
     p[law.HOME_AXES : law.HOME_AXES + 9] = frames[-1, 3:]

@@ -121,15 +121,41 @@ struct Law {
   static void refill(const double* q, double* memory, int at) {
     if (memory[BEGUN] == 0.0) {
       memory[BEGUN] = 1.0, memory[LEVEL] = parameters[FILL];
+      for (int j = 0; j < n; ++j) memory[at + MEAN * n + j] = memory[at + ANCHOR * n + j] = q[j];
     } else {
       for (int j = 0; j < n; ++j)
-        memory[LEVEL] -= memory[at + n + j] * (q[j] - memory[at + 2 * n + j] -
-                                               follows() * memory[at + j] * parameters[CYCLE_S]);
+        memory[LEVEL] -= memory[at + DAMPED * n + j] * (q[j] - memory[at + BEFORE * n + j] -
+                                                        follows() * memory[at + j] * parameters[CYCLE_S]);
     }
     memory[LEVEL] = least(most(memory[LEVEL], 0.0), parameters[TANK]);
   }
-  static void feedforward(const double* q, const Pose* frames, const double (*jacobian)[n], const double* memory,
-                          int at, double* out) {
+  static double friction_at(double v, const double* joint) {
+    const double* table = joint + (v >= 0.0 ? FRICTION : FRICTION + NODES);
+    double low = 0.0, level = 0.0, high = FIRST_DQ;
+    int k = 0;
+    for (; std::abs(v) > high && k < NODES - 1; ++k) low = high, level = table[k], high *= 4.0;
+    return level + (table[k] - level) * (std::abs(v) - low) / (high - low);
+  }
+  static double friction_ahead(double v, double q, const double* joint, double* mean) {
+    double &anchor = mean[(ANCHOR - MEAN) * n], &z = mean[(DEFLECTION - MEAN) * n];
+    const double speed = (q - *mean) / SETTLE_S, distance = joint[PRESLIDING], fast = most(std::abs(v), FIRST_DQ);
+    *mean += parameters[CYCLE_S] * speed;
+    const double moved = *mean - anchor;
+    if (distance > 0.0) {
+      if (std::abs(moved) > STEP * distance) {
+        const double side = moved > 0.0 ? 1.0 : -1.0;
+        z = side + (z - side) * std::exp(-std::abs(moved) / distance);
+        anchor = *mean;
+      }
+      return std::abs(z) * friction_at(z >= 0.0 ? fast : -fast, joint);
+    }
+    if (parameters[APPROACH] == 1.0) return friction_at(v, joint);
+    const double level = std::abs(friction_at(v >= 0.0 ? fast : -fast, joint));
+    const double beyond = most(std::abs(v >= 0.0 ? joint[EDGES + 1] : joint[EDGES]) - level, 0.0);
+    return (level + beyond * most(1.0 - std::abs(speed) / REST_DQ, 0.0)) * std::tanh(v / DIRECTION_DQ);
+  }
+  static void feedforward(const double* q, const Pose* frames, const double (*jacobian)[n], double* memory, int at,
+                          double* out) {
     double m = 0.0, h[3] = {}, v[3], lever[3];
     for (int j = n - 1; j >= 0; --j) {
       const double* p = row(j);
@@ -142,11 +168,7 @@ struct Law {
       cross(lever, parameters + GRAVITY, v);
       for (int c = 0; c < 3; ++c) out[j] -= jacobian[3 + c][j] * v[c];
       out[j] -= p[OFFSET] + p[DRAG] * std::sin(q[j]) + p[DRAG + 1] * std::cos(q[j]);
-      const double v = memory[at + j], *table = p + (v >= 0.0 ? FRICTION : FRICTION + NODES);
-      double low = 0.0, level = 0.0, high = FIRST_DQ;
-      int k = 0;
-      for (; std::abs(v) > high && k < NODES - 1; ++k) low = high, level = table[k], high *= 4.0;
-      out[j] += level + (table[k] - level) * (std::abs(v) - low) / (high - low);
+      out[j] += friction_ahead(memory[at + j], q[j], p, memory + at + MEAN * n + j);
     }
   }
 """
@@ -179,7 +201,7 @@ for (bool pays = false; !pays;) {
 memory[LEVEL] = Law::least(memory[LEVEL] - raised, parameters[TANK]);
 Pose frames[n];
 Law::arm_pose(q, frames, jacobian, place);
-double* D = memory + at + 3 * n;
+double* D = memory + at + ROWS * n;
 if (memory[SINCE] == 0.0) {
   double stiffness[n * n] = {};
   Law::mass_matrix(frames, jacobian, mass);
@@ -192,7 +214,7 @@ for (int j = 0; j < n; ++j) {
   K[j] = out[j];
   for (int k = 0; k < n; ++k) damping -= parameters[RATIO] * D[j * n + k] * (dq[k] - memory[at + k]);
   out[j] = K[j] * error[j] * Law::factor(0.5 * K[j] * error[j] * error[j], Law::row(j)[JOINT_LIMIT]) + damping;
-  memory[at + n + j] = damping, memory[at + 2 * n + j] = q[j];
+  memory[at + DAMPED * n + j] = damping, memory[at + BEFORE * n + j] = q[j];
 }
 Law::feedforward(q, frames, jacobian, memory, at, out);
 memory[SINCE] = memory[SINCE] + 1.0 < parameters[HOLD] ? memory[SINCE] + 1.0 : 0.0;
@@ -243,7 +265,7 @@ _CARTESIAN = """
   static void update(const double* velocity, const Pose* frames, const double (*jacobian)[n], double* memory) {
     constexpr int a = AXES, at = STIFFNESS + SPRINGS;
     const double* K = memory + STIFFNESS;
-    double *D = memory + at + 3 * n, *N = D + n * n, mass[n * n], mobility[n * n], W[a * a], G[a][n], across[n];
+    double *D = memory + at + ROWS * n, *N = D + n * n, mass[n * n], mobility[n * n], W[a * a], G[a][n], across[n];
     mass_matrix(frames, jacobian, mass);
     for (int i = 0; i < n * n; ++i) mobility[i] = mass[i];
     invert(mobility, n);
@@ -358,7 +380,7 @@ if (pushes) {
   for (int k = 0; k < (slides ? 3 : 0); ++k) wrench[k] += normal[6 + k] + aside[k] + push * memory[SLOPE + k];
 }
 if (memory[SINCE] == 0.0) Law::update(velocity, frames, jacobian, memory);
-const double *D = memory + at + 3 * n, *N = D + n * n;
+const double *D = memory + at + ROWS * n, *N = D + n * n;
 for (int j = 0; j < n; ++j) {
   double damping = 0.0, torque = 0.0;
   for (int k = 0; k < n; ++k) {
@@ -367,7 +389,7 @@ for (int j = 0; j < n; ++j) {
   }
   for (int k = 0; k < AXES; ++k) torque += jacobian[k][j] * wrench[k];
   out[j] = torque + damping;
-  memory[at + n + j] = damping, memory[at + 2 * n + j] = q[j];
+  memory[at + DAMPED * n + j] = damping, memory[at + BEFORE * n + j] = q[j];
 }
 Law::feedforward(q, frames, jacobian, memory, at, out);
 memory[SINCE] = memory[SINCE] + 1.0 < parameters[HOLD] ? memory[SINCE] + 1.0 : 0.0;

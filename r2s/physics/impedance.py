@@ -8,7 +8,9 @@ Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. N is dynamically con
 Automation 1987). Every spring has a potential, also where its force is clipped, so its energy is known. An energy
 tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) pays for what a rising stiffness adds to that energy; damping refills
 it. The work of a moving target and of the null space is not in the tank (Dietrich, Ott and Stramigioli, RA-L 2016).
-Feedforward: friction at the reference speed dq_r, and errors of the arm's gravity compensation.
+Feedforward: errors of the arm's gravity compensation, and friction at the reference speed dq_r. Bristles deflect with
+the measured angle: at rest their friction may have any value within its edges, whatever the reference. Cancelling a
+spring k with a delay d adds damping (k - k e^(-i w d) has the imaginary part k sin w d); only an excess is unstable.
 """
 
 import numpy as np
@@ -37,17 +39,25 @@ APPROACH, HEAD = 43, 44
 SLIDES = 2  # a value of APPROACH
 # Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
 # friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
-# saturates, home
+# saturates, home, presliding distance rad (0: no bristles), breakaway Nm in both directions
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
-K_JOINT, JOINT_LIMIT, HOME, ROW = 44, 47, 48, 49
+K_JOINT, JOINT_LIMIT, HOME, PRESLIDING, EDGES, ROW = 44, 47, 48, 49, 50, 52
 # Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; of a sliding tip, the
-# integrals along the path and to its side (2) N and the slope of the surface (3); then the stiffnesses, and rows of
-# n: dq_r, the last damping torque, the last q; matrices D and N^T
+# integrals along the path and to its side (2) N and the slope of the surface (3); then the stiffnesses, and ROWS of
+# n: dq_r, the last damping torque, the last q, q behind a low-pass, that q at the last deflection, bristle deflection
+# in [-1, 1]; matrices D and N^T
 SINCE, BEGUN, LEVEL, INTEGRAL, ACROSS, SLOPE, STIFFNESS = 0, 1, 2, 3, 4, 6, 9
+DAMPED, BEFORE, MEAN, ANCHOR, DEFLECTION, ROWS = 1, 2, 3, 4, 5, 6
 SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
 FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
+# s, low-pass of the angles for friction: of the noise of a Panda's encoders, 1.4e-5 rad, a third is left. A bristle
+# deflects in steps of this share of its presliding distance, ten times that noise: noise alone does not move it
+SETTLE_S, STEP = 5e-3, 0.1
+# rad/s: speed below which a joint may rest, four times the noise of (q - MEAN) / SETTLE_S; reference speed that has a
+# direction, chosen with press.py on twins 0 and 1, where 0.003 to 0.01 do alike
+REST_DQ, DIRECTION_DQ = 0.01, 0.003
 # 1/s, of the estimated slope: it settles while a path gains its speed, `ramp_s` of 0.4 s. m/s, below which a sliding
 # tip shows less of it: five times the noise of a tip's speed, 3e-3 rad/s (Panda) at levers of 0.5 m in seven joints
 SLOPE_RATE, SLIDING = 10.0, 0.02
@@ -184,11 +194,13 @@ def refill(q, n, parameters, memory, at):
     """Add to the tank what the last damping torque took from the arm since the last cycle, J; at: place of dq_r."""
     if memory[BEGUN] == 0.0:
         memory[BEGUN], memory[LEVEL] = 1.0, parameters[FILL]
+        for j in range(n):
+            memory[at + MEAN * n + j], memory[at + ANCHOR * n + j] = q[j], q[j]
     else:
         for j in range(n):
             follows = 0.0 if parameters[APPROACH] == 1.0 else memory[at + j]
-            moved = q[j] - memory[at + 2 * n + j] - follows * parameters[CYCLE_S]
-            memory[LEVEL] -= memory[at + n + j] * moved
+            moved = q[j] - memory[at + BEFORE * n + j] - follows * parameters[CYCLE_S]
+            memory[LEVEL] -= memory[at + DAMPED * n + j] * moved
     memory[LEVEL] = min(max(memory[LEVEL], 0.0), parameters[TANK])
 
 
@@ -203,8 +215,34 @@ def friction_at(v, row):
 
 
 @njit(cache=True, error_model="numpy")
+def friction_ahead(v, q, j, n, parameters, memory, at):
+    """Return the friction, Nm, to be overcome by joint j at q rad, whose reference speed is v rad/s.
+
+    Bristles: that of their deflection z, which follows the measured angle (dz = (dq - |dq| z) / presliding, Dahl
+    1968). Otherwise that of the reference's direction, and of a joint at rest its breakaway. A target that approaches
+    a surface only gives the direction in which joints will creep: then friction at v. at: place of dq_r.
+    """
+    row = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW]
+    mean, anchor, z = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
+    speed, distance = (q - memory[mean]) / SETTLE_S, row[PRESLIDING]
+    memory[mean] += parameters[CYCLE_S] * speed
+    moved, fast = memory[mean] - memory[anchor], max(abs(v), FIRST_DQ)
+    if distance > 0.0:
+        if abs(moved) > STEP * distance:
+            side = 1.0 if moved > 0.0 else -1.0
+            memory[z] = side + (memory[z] - side) * np.exp(-abs(moved) / distance)
+            memory[anchor] = memory[mean]
+        return abs(memory[z]) * friction_at(fast if memory[z] >= 0.0 else -fast, row)
+    if parameters[APPROACH] == 1.0:
+        return friction_at(v, row)
+    level = abs(friction_at(fast if v >= 0.0 else -fast, row))
+    beyond = max(abs(row[EDGES + 1] if v >= 0.0 else row[EDGES]) - level, 0.0)
+    return (level + beyond * max(1.0 - abs(speed) / REST_DQ, 0.0)) * np.tanh(v / DIRECTION_DQ)
+
+
+@njit(cache=True, error_model="numpy")
 def feedforward(q, parameters, frames, jacobian, memory, at, out):
-    """Add friction at dq_r (memory[at:]), and errors of the gravity compensation, offset and drag, to `out`."""
+    """Add friction, and errors of the gravity compensation, offset and drag, to `out`; at: place of dq_r."""
     n = len(q)
     m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all that a joint carries
     for j in range(n - 1, -1, -1):
@@ -217,4 +255,4 @@ def feedforward(q, parameters, frames, jacobian, memory, at, out):
         a, b, c = v * c - w * b, w * a - u * c, u * b - v * a
         out[j] -= jacobian[3, j] * a + jacobian[4, j] * b + jacobian[5, j] * c
         out[j] -= row[OFFSET] + row[DRAG] * np.sin(q[j]) + row[DRAG + 1] * np.cos(q[j])
-        out[j] += friction_at(memory[at + j], row)
+        out[j] += friction_ahead(memory[at + j], q[j], j, n, parameters, memory, at)

@@ -6,8 +6,10 @@ from r2s.compiled import njit
 from r2s.physics.impedance import (
     ACROSS,
     APPROACH,
+    BEFORE,
     BEGUN,
     CYCLE_S,
+    DAMPED,
     DISPLACED,
     FORCE_LIMIT,
     FORCE_MAX,
@@ -30,6 +32,7 @@ from r2s.physics.impedance import (
     RATE,
     RATIO,
     ROW,
+    ROWS,
     SINCE,
     SLIDES,
     SLIDING,
@@ -89,7 +92,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
     memory[LEVEL] = min(memory[LEVEL] - raised, parameters[TANK])
     frames, jacobian, place = np.empty((n, POSE)), np.empty((6, n)), np.empty(3)
     arm_pose(q, parameters, frames, jacobian, place)
-    D = memory[at + 3 * n : at + 3 * n + n * n].reshape((n, n))
+    D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
     if memory[SINCE] == 0.0:
         mobility, joint_K = np.empty((n, n)), np.zeros((n, n))
         mass_matrix(parameters, frames, jacobian, mobility)
@@ -103,7 +106,7 @@ def joint_impedance_law(q, dq, command, parameters, memory, out):
             damping -= parameters[RATIO] * D[j, k] * (dq[k] - memory[at + k])
         s = 0.5 * K[j] * error[j] ** 2
         out[j] = K[j] * error[j] * spring(s, parameters[HEAD + j * ROW + JOINT_LIMIT])[1] + damping
-        memory[at + n + j], memory[at + 2 * n + j] = damping, q[j]
+        memory[at + DAMPED * n + j], memory[at + BEFORE * n + j] = damping, q[j]
     feedforward(q, parameters, frames, jacobian, memory, at, out)
     memory[SINCE] = (memory[SINCE] + 1.0) % parameters[HOLD]
 
@@ -164,8 +167,8 @@ def update(velocity, parameters, frames, jacobian, memory):
     """Write dq_r (n,) rad/s of the target's velocity (3,) m/s, D and N^T (n, n) of this posture into memory."""
     n, a, at = len(frames), int(parameters[TASK_AXES]), STIFFNESS + SPRINGS
     K = memory[STIFFNESS : STIFFNESS + SPRINGS]
-    D = memory[at + 3 * n : at + 3 * n + n * n].reshape((n, n))
-    N = memory[at + 3 * n + n * n : at + 3 * n + 2 * n * n].reshape((n, n))
+    D = memory[at + ROWS * n : at + ROWS * n + n * n].reshape((n, n))
+    N = memory[at + ROWS * n + n * n : at + ROWS * n + 2 * n * n].reshape((n, n))
     mass, mobility, W, G = np.empty((n, n)), np.empty((n, n)), np.empty((a, a)), np.empty((a, n))
     mass_matrix(parameters, frames, jacobian, mass)
     mobility[:, :] = mass
@@ -313,7 +316,7 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
                 wrench[k] += command[normal + 6 + k] + aside[k] + push * memory[SLOPE + k]
     if memory[SINCE] == 0.0:
         update(velocity, parameters, frames, jacobian, memory)
-    D, N, follows = at + 3 * n, at + 3 * n + n * n, 0.0 if parameters[APPROACH] == 1.0 else 1.0
+    D, N, follows = at + ROWS * n, at + ROWS * n + n * n, 0.0 if parameters[APPROACH] == 1.0 else 1.0
     for j in range(n):
         damping, torque = 0.0, 0.0
         for k in range(n):
@@ -323,6 +326,6 @@ def cartesian_impedance_law(q, dq, command, parameters, memory, out):
         for k in range(a):
             torque += jacobian[k, j] * wrench[k]
         out[j] = torque + damping
-        memory[at + n + j], memory[at + 2 * n + j] = damping, q[j]
+        memory[at + DAMPED * n + j], memory[at + BEFORE * n + j] = damping, q[j]
     feedforward(q, parameters, frames, jacobian, memory, at, out)
     memory[SINCE] = (memory[SINCE] + 1.0) % parameters[HOLD]

@@ -54,13 +54,14 @@ class InverseDynamics:
         if d.drag.any():
             out -= d.drag[:, 0] * np.sin(q) + d.drag[:, 1] * np.cos(q)
         if d.load.any():
-            gravity = np.empty(q.shape)
-            none = np.zeros(q.shape)
-            _rigid(
-                self._links[1], self._links[1], self.robot.gravity, none[0], (np.array(q), none, none), gravity, True
-            )
-            out += d.load * np.abs(gravity) * np.tanh(sliding / SLIDES)
+            out += self.load_friction(q) * np.tanh(sliding / SLIDES)
         return out
+
+    def load_friction(self, q: np.ndarray) -> np.ndarray:
+        """Return the level (m, n) Nm of load-dependent friction at q (m, n) rad."""
+        nominal, none, gravity = self._links[1], np.zeros(q.shape), np.empty(q.shape)
+        _rigid(nominal, nominal, self.robot.gravity, none[0], (np.array(q), none, none), gravity, True)
+        return self.dynamics.load * np.abs(gravity)
 
 
 @njit(cache=True, error_model="numpy")

@@ -29,6 +29,7 @@ from r2s.physics.contact_layout import COLUMNS as CONTACT_COLUMNS
 from r2s.physics.contact_layout import ROWS as CONTACT_ROWS
 from r2s.physics.control_laws import BUILT_IN as BUILT_IN_CONTROL
 from r2s.physics.control_laws import chain, control_law, registered
+from r2s.physics.friction import BRISTLE as BRISTLE_FAMILY
 from r2s.physics.friction import FAMILIES, PHI, WIDTH_DQ, Family
 from r2s.physics.linear_algebra import packed_element
 from r2s.physics.mujoco_layout import DATA_FIELDS, MODEL_FIELDS, struct_offsets
@@ -67,6 +68,7 @@ USUAL = 7  # joints that the driver's part is compiled for; others run slower
 # the index of a law is its number in `jnt_user`
 _BUILT_IN = (*(f.native for f in FAMILIES), *(f.sharp for f in FAMILIES if f.sharp is not None))
 _laws: list[Callable] = [*_BUILT_IN]
+BRISTLES, PRESLIDING = FAMILIES.index(BRISTLE_FAMILY), BRISTLE_FAMILY.names.index("presliding")
 
 
 def number(family: Family, hold: str) -> int:
@@ -243,9 +245,16 @@ def _friction(sizes, user, q, dq, forces, places):
             x, y, z = _first_moment(nominal, xpos[body], xmat[body], user[j, MOMENT : MOMENT + 3])
             lm, lx, ly, lz = lm + nominal, lx + x, ly + y, lz + z
             loaded = user[j, LOAD] * abs(_weight(lm, lx, ly, lz, anchor[j], axis[j], gravity))
-            sign = np.sign(v) if net else np.tanh(v / WIDTH_DQ)
+            if user[j, FAMILY] == BRISTLES:  # the bristles' deflection during the coming step
+                z, per_v = memory[j], user[j, STEP] / user[j, P1 + PRESLIDING]
+                sign, steep = z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
+            elif net:
+                sign, steep = np.sign(v), 0.0
+            else:
+                sign = np.tanh(v / WIDTH_DQ)
+                steep = (1.0 - sign * sign) / WIDTH_DQ
             friction += loaded * sign
-            slope += 0.0 if net else loaded * (1.0 - sign * sign) / WIDTH_DQ
+            slope += loaded * steep
         slope = max(slope, 0.0)  # an implicit falling branch would remove inertia
         # mj_passive has already subtracted dof_damping * v with the slope of the step before: correct it
         force = (damping[j] - user[j, DAMPING]) * v - friction

@@ -27,6 +27,9 @@ POINT, NORMAL, FORCES, HEIGHT, START = slice(0, 3), slice(3, 6), slice(6, 8), 8,
 LAG_M = 0.01  # m, by which the tip may follow its target: damping at approach_speed, and 2 N of wrong friction
 RESIDUAL_M = 5e-3  # m, displacement of an action of 1 under the task's own controller: a quarter of 20 N on the Panda
 FINE_M, FINE_V, FAR_N, FINE_N, HARD_N = 5e-3, 0.01, 5.0, 0.5, 10.0  # m, m/s, N: tanh scales
+# 1/rad, see `cartesian_impedance`: where joints stick, a torque of the null space reaches the tip. From 0.02 to 0.05
+# the forces of press.py on twins 0 and 1 are alike, at 0.2 a fifth worse
+NULL_STIFFNESS = 0.05
 REGULAR = 1e-3  # m^2/rad^2, of the least squares of the force: blind directions of the Jacobian count as force-free
 EXPECTED = 1.4e4, 1.25, 1.5, 0.3  # stiffness N/m, exponent, damping s/m, friction: middle of conf/dr/contact.yaml
 POSTURES = 12  # of a path, which the arm must reach
@@ -112,7 +115,10 @@ class SurfaceTask(TipTask):
         """
         Tip(robot)
         task = replace(self, model=InverseDynamics(robot, dynamics), speed_noise=self.noise_for(dynamics))
-        settings = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M} | self.own_settings
+        settings = {"torque_fraction": self.torque_fraction, "displacement": RESIDUAL_M} | {
+            "null_stiffness": NULL_STIFFNESS,
+            **self.own_settings,
+        }
         own = cartesian_impedance(robot, task, dynamics, hybrid=True, **settings)
         task._check_force(own)
         return replace(task, own=own, parameters=own.parameters)
