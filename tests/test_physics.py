@@ -10,7 +10,8 @@ import pytest
 
 from r2s.errors import UserError
 from r2s.physics.dynamics import AXES, Dynamics
-from r2s.physics.friction import COULOMB, FAMILIES, PHI, SIGMOID, STRIBECK, WIDTH_DQ, family, presliding
+from r2s.physics.friction import BRISTLE, COULOMB, FAMILIES, PHI, SIGMOID, STRIBECK, WIDTH_DQ, family, presliding
+from r2s.physics.inverse_dynamics import InverseDynamics
 from r2s.physics.robot import SIM_DT, load_robot
 from r2s.physics.simulator import Simulator
 
@@ -457,6 +458,24 @@ def test_levels_follow_the_parameters(law, at_rest):
     )  # fmt: skip
     np.testing.assert_allclose(law.torque(np.array([1.0, -1.0]), phi), [1.5, -1.1], rtol=1e-9)
     np.testing.assert_allclose(law.torque(np.zeros(2), phi, bristle=np.array([1.0, -1.0])), [at_rest, -at_rest / 1.5])
+
+
+def test_load_dependent_friction_of_bristles_holds_at_rest(panda):
+    """A joint holds its level and half of its load-dependent friction, within a few presliding distances; not 1.5."""
+    n, phi = panda.n, np.tile([1.0, 0.0, 0.0, 0.0, 0.1, 5e-4, 0.0, 0.0], (panda.n, 1))
+    d = replace(Dynamics.of(panda, phi, BRISTLE), load=np.full(n, 0.05))
+    level = InverseDynamics(panda, d).load_friction(panda.q_home[None])[0]
+    j = int(np.argmax(level))
+    tau = np.zeros((2, 1500, n))
+    tau[:, :, j] = 1.0 + level[j] * np.array([[0.5], [1.5]])
+    sim = Simulator(panda, d, 2, 1)
+    sim.reset(np.tile(panda.q_home, (2, 1)), np.zeros((2, n)))
+    out = sim.rollout(tau, record=("qpos", "qvel"))
+    moved, speed = np.abs(out["qpos"][:, -1, j] - panda.q_home[j]), np.abs(out["qvel"][:, -1, j])
+    assert speed[0] < 1e-6
+    assert moved[0] < 10 * 5e-4
+    assert speed[1] > 0.01
+    assert moved[1] > 100 * 5e-4
 
 
 def test_presliding_goes_by_the_distance():
