@@ -147,6 +147,18 @@ def _first_moment(mass, xpos, xmat, h):
     return x, y, z
 
 
+@njit(inline="always")
+def _direction(v, net, z, user):
+    """Return the direction of load-dependent friction in [-1, 1], and its slope s/rad; z: bristle deflection."""
+    if user[FAMILY] == BRISTLES:  # during the coming step, as in their own law
+        per_v = user[STEP] / user[P1 + PRESLIDING]
+        return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
+    if net:
+        return np.sign(v), 0.0
+    sign = np.tanh(v / WIDTH_DQ)
+    return sign, (1.0 - sign * sign) / WIDTH_DQ
+
+
 @cache
 def _callback(laws: tuple[Callable, ...], control_laws: tuple[Callable, ...]) -> Any:
     """Compile the force with these friction and control laws, in the order of their numbers, and install it."""
@@ -245,14 +257,7 @@ def _friction(sizes, user, q, dq, forces, places):
             x, y, z = _first_moment(nominal, xpos[body], xmat[body], user[j, MOMENT : MOMENT + 3])
             lm, lx, ly, lz = lm + nominal, lx + x, ly + y, lz + z
             loaded = user[j, LOAD] * abs(_weight(lm, lx, ly, lz, anchor[j], axis[j], gravity))
-            if user[j, FAMILY] == BRISTLES:  # the bristles' deflection during the coming step
-                z, per_v = memory[j], user[j, STEP] / user[j, P1 + PRESLIDING]
-                sign, steep = z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
-            elif net:
-                sign, steep = np.sign(v), 0.0
-            else:
-                sign = np.tanh(v / WIDTH_DQ)
-                steep = (1.0 - sign * sign) / WIDTH_DQ
+            sign, steep = _direction(v, net, memory[j], user[j])
             friction += loaded * sign
             slope += loaded * steep
         slope = max(slope, 0.0)  # an implicit falling branch would remove inertia
