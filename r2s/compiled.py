@@ -72,7 +72,7 @@ config.CACHE_LOCATOR_CLASSES = f"{_own},IPythonCacheLocator,ZipCacheLocator"  # 
 
 
 class _Announce(event.Listener):
-    """Prints on a terminal, once in a process, that a compilation takes long: it is minutes after an installation."""
+    """Prints on a terminal, once per process, that compiling takes long: minutes, the first time."""
 
     def __init__(self):
         self._printed = False

@@ -3,6 +3,7 @@
 Also here: at the end of a session nothing that it started may still run.
 """
 
+import gc
 import os
 import re
 import subprocess
@@ -22,6 +23,7 @@ from omegaconf import OmegaConf
 
 from r2s.physics.robot import OF_TASKS, Robot, load_robot
 
+gc.set_threshold(100_000, 20, 20)  # collections of what torch and numba keep would cost a tenth of the suite
 ROOT = Path(__file__).parent.parent
 REAL = ROOT.parent / "shared" / "data" / "gaz2019_panda" / "train.npz"
 # What takes seconds to make: tests that share one of a group run on one worker, so that it is made once.

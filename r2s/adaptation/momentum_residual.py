@@ -4,9 +4,9 @@ The change of momentum equals the integral of all torques, so nothing is differe
 one span of T s apart: y = (mean of the integrated model torque minus momentum, now minus before) / T, in Nm.
 It is linear in the unknown parameters: y = H x + noise.
 
-Each mean weighs two spans by a triangle, so a torque acts on y through a quadratic spline over three spans. Elastic
+Each mean has triangular weights over two spans, so y weighs torque by a quadratic spline over three spans. Elastic
 gears vibrate at 50 to 60 Hz and change the momentum at a rate of 10 to 30 Nm; sampled once per span, this would alias
-to torques of a few hertz. Of a vibration at 60 Hz a triangle leaves 2.4 %, the spline 0.4 %.
+to torques of a few hertz. A triangle passes 2.4 % of a 60 Hz vibration, the spline 0.4 %.
 """
 
 from typing import NamedTuple
@@ -83,7 +83,7 @@ class MomentumResidual(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def update_residual(arm, state, q, dq, tau, out):
-    """Process one cycle; return whether a span has ended. Its residual is then in `out`.
+    """Process one cycle; return whether `out` holds the residual of a new span.
 
     Args:
         arm: `ArmModel`. state: `ResidualState`. q, dq: (n,) rad, rad/s, of this cycle. tau: (n,) Nm without gravity,

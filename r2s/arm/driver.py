@@ -252,7 +252,7 @@ class Driver:
         return self.stopping is not None and bool(self._drivers.done[0])
 
     def stop(self, reason: str) -> None:
-        """Bring the arm to rest, from the next cycle on; the first reason stays."""
+        """Bring the arm to rest from the next cycle on; keep the first reason."""
         self._drivers.stop(reason)
 
     def __call__(

@@ -130,7 +130,7 @@ class State:
         return self.space.dynamics(self.space.from_unit(self.u))
 
     def slide(self, arm: Dynamics) -> Slide | None:
-        """Return how joints slide after breakaway; None without a Stribeck rise, or if bristles creep."""
+        """Return the motion after breakaway; None without a Stribeck rise, or with bristles."""
         if self.static_friction is None or self.nominal.family.has_memory:
             return None
         return self.static_friction.slide(arm)

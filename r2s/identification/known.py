@@ -78,9 +78,9 @@ class Known:
 
 
 def disagreement(known: Known, space: ParameterSpace, x: np.ndarray) -> tuple[float, str]:
-    """Return by how many standard deviations values x (P,) are off what was known, and the value that is off most.
+    """Return by how many standard deviations x (P,) contradicts the prior, and the name of the worst value.
 
-    The largest of the independent directions of its covariance, in units of the deviation of each value.
+    This is the largest deviation along a principal axis of the prior's correlation matrix.
     """
     known = known.where(lambda name: name in space.names and name not in space.fixed)
     if not known.names:

@@ -117,7 +117,7 @@ def scaled_prior(
     """Return standard deviations in SI units, without the flat priors (None).
 
     Torque-like parameters are given as shares of the largest torque; logarithmic ones have no unit. A viscous
-    coefficient of the arm's file is a guess: the prior is at least as wide as the nominal value.
+    coefficient in the arm's file is a guess: its standard deviation is at least its value.
     """
     out = {name: sigma for name, sigma in prior.items() if sigma is not None}
     for name, size in _sizes(robot, recording).items():

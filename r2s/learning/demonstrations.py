@@ -1,4 +1,4 @@
-"""Demonstrations: a task's model-based reference, with noise, acts while a training fills its replay buffer.
+"""Demonstrations: a task's model-based reference, with noise, fills the replay buffer before the updates.
 
 Off-policy learners need no more than good transitions in their buffer (Ball et al. 2023, arXiv:2302.02948). Random
 torques hardly ever reach a goal and stay there. The reference does both, and its noise shows what is near its motion.

@@ -32,7 +32,7 @@ class TaskEnv(EnvBase):
 
     Args:
         robot, task: the arm and its task.
-        draw: domain randomization, called at every reset; a draw that is `Pushes` also gives torques for every step.
+        draw: domain randomization, called at every reset; a `Pushes` also applies joint torques at every step.
         nsim: number of arms. nthread: threads, 0: all cores.
         seed: of goals, starts and draws.
         stagger: end the first episodes of GROUPS groups of arms at different times.

@@ -126,7 +126,7 @@ def computed_torque(robot: Robot, task: Task, dynamics: Dynamics) -> Oracle | Ze
 def hybrid_force(robot: Robot, task: Task, dynamics: Dynamics) -> ZeroAction:
     """Return `algo=hybrid_force`: zero actions under control=hybrid, which approaches and holds a task's force.
 
-    It has no feedback of the force: J^T f and the friction of its model.
+    Its force is open loop: J^T f plus the friction of its model.
 
     Raises:
         UserError: another controller, or a task without a contact.

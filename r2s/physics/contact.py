@@ -74,7 +74,7 @@ SHORT = 1e-6  # of the depth, a shorter path has the force of its middle: the po
 def mean_force(contact, begin, rate, coming, h):
     """Return the mean normal force, N, over a step from depth `begin` m, and its slope, N s/m, in `coming`.
 
-    rate, coming: m/s, of the depth at the beginning and at the end of the step.
+    rate, coming: m/s, penetration rates at the beginning and end of the step.
     """
     middle = 0.5 * (rate + coming)
     span = h * middle
@@ -359,7 +359,7 @@ def contact_torque(contact, jacobian, out):
 
 @njit(cache=True, error_model="numpy")
 def contact_velocity(touch, mass, damping, h, forces, dq_min, work, coming):
-    """Write the velocities (n,) at the end of a step in contact into `coming`, force and deflection into the contact.
+    """Solve a step in contact: write the final velocities (n,) to `coming`, force and deflection to the contact.
 
     Args:
         touch: contact (COLUMNS,) and Jacobian of `near`. work: (2 n + 6, n) at least, any content.

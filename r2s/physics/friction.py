@@ -333,7 +333,7 @@ def check_trusted(name: str, trust: Sequence[str], file: str) -> None:
 
 
 def family_path(one: Family) -> str:
-    """Return the argument of `family` for a family: its name, or the dotted path of its import."""
+    """Return the string that `family` resolves to this family: its name or its dotted path."""
     return next((path for path, f in _imported.items() if f is one), one.name)
 
 

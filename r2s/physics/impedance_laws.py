@@ -137,8 +137,8 @@ def task_stiffness(command, error, tilt, begins, parameters, memory):
 def rotation_error(R, command, parameters, error):
     """Write the rotation error (3,): axis times sine of the angle to the target; return 1 - cosine of the angle.
 
-    (Luh, Walker and Paul, IEEE TAC 1980, eq. 22.) The target is the rotation at home, rotated by the rotation vectors
-    of action and target.
+    (Luh, Walker and Paul, IEEE TAC 1980, eq. 22.) The target is the home orientation,
+    rotated by action plus target (rotation vectors).
     """
     x, y, z = 0.0, 0.0, 0.0
     if parameters[DISPLACED] >= 0.0:

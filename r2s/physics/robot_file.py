@@ -75,7 +75,7 @@ def rotors(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_loose(body: mujoco.MjsBody) -> bool:
-    """Return whether a body is an object on a free or ball joint that carries no hinge."""
+    """Return whether a body is loose: its subtree has free or ball joints only."""
     joints = [joint.type for below in (body, *body.find_all("body")) for joint in below.joints]
     return bool(joints) and all(kind in FREE_OR_BALL for kind in joints)
 

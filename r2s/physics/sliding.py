@@ -60,7 +60,7 @@ def _cross(a, b, out):
 
 @njit(cache=True, error_model="numpy")
 def load_box(contact, x, y, z):
-    """Write the lever of a contact at x, y, z m, and the friction of the table under the force of the last step."""
+    """Write the lever arm of a contact at x, y, z m, and the largest table friction under the last step's force."""
     a, b, c = contact[POINT], contact[POINT + 1], contact[POINT + 2]
     contact[ARM], contact[ARM + 1], contact[ARM + 2] = x - a, y - b, z - c
     down = 0.0

@@ -12,7 +12,7 @@ ALIKE = 0.05  # spread of the joints' factors if the clock is their cause
 
 
 def speed_factors(recording: Recording) -> np.ndarray:
-    """Return the change of q over the integral of dq (n,), nan for joints whose motion does not determine it.
+    """Return the ratio (n,) of the change of q to the integral of dq; nan where motion does not determine it.
 
     A straight trend is taken out of both in each trajectory, so that a biased dq does not count.
     """

@@ -52,8 +52,8 @@ def from_q(joints: int) -> Lateness:
 def lateness(recording: Recording, cutoff_hz: float) -> Lateness:
     """Return the lateness of dq, by least squares below `cutoff_hz`, where a filter acts like a delay.
 
-    A dq is often smoother than q: it is worth more with its lateness corrected than a derivative. Of a filter and a
-    delay, the one that leaves the smaller difference counts.
+    dq is often smoother than q, so correcting its lateness beats differentiating q. The correction inverts a filter
+    or a delay, whichever fits better.
     """
     smooth = spread(recording, COMPARED_S).resample(SIM_DT).smooth(cutoff_hz)
     slope, ddq, n = smooth.derivative(smooth.q), smooth.derivative(smooth.dq), recording.n_joints

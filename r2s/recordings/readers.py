@@ -73,8 +73,8 @@ def read(
         period: s, see `Recording`.
         name: of the recording; the default is the file's.
         topic: of a bag, see `bag_table`.
-        joints, model_joints: names of the robot's joints in the file and in its description; they give the order of
-            what the file names, see `by_names` and `choose_joints`.
+        joints, model_joints: the robot's joint names in the file and in its description; they select and order the
+            file's joints, see `by_names` and `choose_joints`.
         torque_constant: Nm/A at the joint, gear ratio included, (n,) or one for all; tau is then a motor current.
 
         limits: lowest and highest q of the robot (n,) rad: angles that differ by whole turns are turned into them.

@@ -248,7 +248,7 @@ class Recording:
         """Return the period of the motion, s, or None if the motion does not repeat itself.
 
         It repeats if, at some lag, at least 0.5 s recur within 0.01 rad RMS per joint while the arm moves by ten
-        times that. If the clock restarts, the repetitions may be trajectories: see `in_phase`.
+        times that. If the clock restarts, a trajectory may be a repetition: see `in_phase`.
         """
         return self._period_and_clock()[0]
 

@@ -91,7 +91,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _last_digits(text: str) -> list[float]:
-    """Return the value of one unit of the last digit of each number."""
+    """Return each number's resolution: one unit of its last digit."""
     parts = [x.lower().partition("e") for x in re.findall(NUMBER, text)]
     return [10.0 ** (int(power or 0) - len(number.partition(".")[2])) for number, _, power in parts]
 

@@ -1,4 +1,4 @@
-"""What stage=results shows: how the cells of a page compare with the committed ones, and of all pages so far."""
+"""Output of stage=results: page cells compared with the committed ones, and a summary of all pages so far."""
 
 import json
 from pathlib import Path

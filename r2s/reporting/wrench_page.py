@@ -86,7 +86,7 @@ def log_wrench(stream: rr.RecordingStream, robot: Robot, recording: Recording, w
 def cone(tip: np.ndarray, force: np.ndarray, half: np.ndarray) -> list[np.ndarray]:
     """Return lines of the cone in which the force's direction lies: its edge, and four lines to the tip.
 
-    Its edge is the outline of the ellipsoid with half axes `half`, seen along the force.
+    Its edge is the ellipsoid with half axes `half`, projected along the force.
     """
     size = max(float(np.linalg.norm(force)), 1e-9)
     across = np.linalg.svd(force[None] / size)[2][1:]

@@ -132,5 +132,5 @@ def calibration_of(cfg, source):
 
 
 def run_folder(path):
-    """Return the folder of a path to a run folder or to a file in it."""
+    """Return the run folder, from its path or that of a file in it."""
     return Path(path) if Path(path).is_dir() else Path(path).parent

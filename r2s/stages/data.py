@@ -25,7 +25,7 @@ class ArmData:
         excitation_seed: seed of the first motion; the second has the next one.
         excitation: file of the first motion; None: it is optimized.
         ramp_poses: postures at which every joint is ramped both ways; 0: no ramps.
-        presses: paths on a surface that are recorded instead; 0: none. press_point: (3,) m, press_normal: (3,), of
+        presses: number of surface paths to record instead; 0: none. press_point: (3,) m, press_normal: (3,), of
             its plane, roughly; None: a table below the tip at home.
 
     Raises:

@@ -69,7 +69,7 @@ def rollout(
 
     Args:
         policy: observation -> action. arms: simulated or real. task: with its controller.
-        starts: (E, n) rad. goals: (E, ...), see `Task.goals`; E a multiple of the arms' width.
+        starts: (E, n) rad. goals: (E, ...), see `Task.goals`; E is a multiple of `arms.width`.
         progress: callback with the number of finished episodes and their total.
     """
     robot, count, shape = arms.robot, len(goals), (len(goals), task.steps)

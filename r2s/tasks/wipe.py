@@ -31,8 +31,8 @@ STEADY = 0.25  # of the rate of an integral at which the path oscillates without
 class WipeTask(SurfaceTask):
     """Wipe a surface; a `Task` (r2s/tasks/task.py) from conf/task/wipe.yaml.
 
-    A goal is the row of `SurfaceTask` with the force at the path's begin and at its end, which `goals` makes equal,
-    then place, velocity and acceleration (9,) of the path before the first control step and after each.
+    A goal is the row of `SurfaceTask`, with equal forces at the path's start and end (`goals`), then the path:
+    position, velocity and acceleration (9,) before the first control step and after each.
 
     Attributes:
         speed: (low, high) m/s, drawn peak speed. size: (low, high) m, of paths about their middle. kinds: subset of

@@ -10,7 +10,7 @@ ENCODER = 2e-5  # rad, resolution
 
 
 def draw_links(robot: Robot, rng: np.random.Generator) -> Links:
-    """Return true masses, centres and tensors; U: uniform."""
+    """Draw masses, centers of mass and inertia tensors."""
     model = robot.model(gravity=True)
     n, bodies = robot.n, model.jnt_bodyid
     small = np.minimum(1.0, robot.tau_max / 12)[:, None]  # scale of arms smaller than a Panda's wrist

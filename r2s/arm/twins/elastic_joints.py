@@ -218,7 +218,7 @@ def _accelerate(p, s, f, bias, root, h, last):
 
 @njit(cache=True)
 def sense(p, s, noise, dq_filter):
-    """Read the sensors at the kept motion; noise (3, n) is standard normal."""
+    """Read the sensors from the *_AT rows; noise (3, n) is standard normal."""
     for i in range(s.shape[1]):
         s[Q_MEASURED, i] = ENCODER * np.round((s[THETA_AT, i] + p[NOISE_Q, i] * noise[0, i]) / ENCODER)
         s[DQ_MEASURED, i] += dq_filter * (s[W_AT, i] + p[NOISE_DQ, i] * noise[1, i] - s[DQ_MEASURED, i])

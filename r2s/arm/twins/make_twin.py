@@ -27,7 +27,7 @@ def make_twin(
     """Return a hidden twin. These are the keys of conf/arm/twin.yaml; see `TwinBase`.
 
     Args:
-        variant: 'rigid': rigid or quasi-statically bending gears, LuGre friction, in DART. 'elastic': effects that no
+        variant: 'rigid': rigid or quasi-statically elastic gears, LuGre friction, in DART. 'elastic': effects that no
             model of r2s contains, see r2s/arm/twins/elastic_twin.py.
 
     Raises:

@@ -28,7 +28,7 @@ STOP_MARGIN = 0.1  # rad from the position limits, where the reflexes stop the a
 class RigidTwin(TwinBase):
     """The rigid variant; arguments as in `TwinBase`.
 
-    Time and bristles restart at every `move_to`, too: an evaluation on a fresh twin is reproducible.
+    Each `move_to` also resets clock and bristles, so an evaluation on a fresh twin is reproducible.
 
     Args:
         stiffness: None: rigid gears. Otherwise the gears bend without oscillation, and the encoders on the motors'

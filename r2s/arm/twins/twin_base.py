@@ -89,7 +89,7 @@ class TwinBase:
     def move_to(self, q: np.ndarray) -> ArmState:
         """Place the arm at rest at q (n,) rad; friction holds what gravity compensation leaves.
 
-        Inside the surface it can only stay where it presses.
+        A tip in the surface may stay, not be placed there.
         """
         q = np.array(q, dtype=float)
         if q.shape != (self.robot.n,) or not np.isfinite(q).all():

@@ -110,7 +110,7 @@ def estimate_breakaway(
 ) -> Breakaway:
     """Estimate the command at which each ramped joint broke away, from t, q and tau alone.
 
-    A ramp that does not reach MOVED in its own direction, or whose joint moved before the command rose, gives NaN.
+    A ramp gives NaN if its joint does not move by MOVED in its direction, or moves before the command rises.
 
     Args:
         ramps: commands that rise (fall for sign -1) from rest, at any rate. The error is the rate times 0.5 to 3 ms

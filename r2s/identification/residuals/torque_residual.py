@@ -97,7 +97,7 @@ class TorqueResidual:
 
     @property
     def row_s(self) -> float:
-        """s, between moments, in whole milliseconds."""
+        """s, median time step in whole milliseconds."""
         return SIM_DT * max(1, round(float(np.median(np.diff(self.motion.t))) / SIM_DT))
 
     def _with(self, **changes: Any) -> "TorqueResidual":

@@ -36,7 +36,7 @@ def select_terms(
     alike = per_joint(np.mean(np.concatenate([f.squares([]) for f in folds]), axis=0))
 
     def score(chosen: Sequence[str]) -> np.ndarray:
-        """Return (blocks,) the mean square over joints, each with the same weight."""
+        """Return (blocks,) squared errors, summed over joints of equal weight."""
         return np.concatenate([f.squares(chosen) for f in folds]) @ alike
 
     chosen: list[str] = []

@@ -27,9 +27,9 @@ BLOCKS = 4  # of each fold, so that held-out motion has fast and slow parts like
 def late_signals(cv: CrossValidation, terms: Sequence[str]) -> dict[str, bool]:
     """Return {"delayed": whether torque is clearly late, "alike": whether it counts as late as the logged dq}.
 
-    1. The delay of torque is fitted with dq corrected; if it is clearly not 0, both are corrected.
-    2. Otherwise dq alone is corrected if this clearly improves the prediction of held-out torque, by more than a
-       standard error; if not, both count as equally late and stay as logged.
+    1. Fit the delay of torque with dq corrected; if it is clearly not 0, correct both.
+    2. Otherwise correct dq alone if this clearly improves the prediction of held-out torque, by more than a
+       standard error; if not, treat both as equally late and leave them as logged.
     """
     if DELAY in terms and torque_is_late(cv, terms):
         return {"delayed": True, "alike": False}

@@ -79,7 +79,7 @@ def sensitivity_table(grouped: Grouped, measure: str | None = None) -> pd.DataFr
 
 
 def held_out(settings: Sequence[Mapping[int, float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return per held-out seed (S,) the score of the setting that the other seeds choose, and of the median setting.
+    """Return per held-out seed (S,) the score of the other seeds' best setting, and the median over settings.
 
     Args:
         settings: {seed: score} of each, larger is better; the seeds that all of them have count. None if these are
@@ -128,7 +128,7 @@ def improvement_matrix(table: pd.DataFrame, measure: str) -> pd.DataFrame:
 
 
 def band(group: Sequence[Trained], x: str, y: str, points: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Return column x (points,), and of column y (3, points) interquartile mean, lowest and highest seed.
+    """Return a grid of x (points,), and y (3, points): interquartile mean, minimum, maximum over seeds.
 
     The seeds' curves are interpolated on the range that all of them cover.
     """

@@ -154,7 +154,7 @@ def _shades(error: np.ndarray) -> np.ndarray:
 
 
 def _shown_geoms(model: mujoco.MjModel) -> np.ndarray:
-    """Return the geoms that MuJoCo's own viewer shows (groups 0-2) but planes; all geoms if there are none."""
+    """Return the geoms that MuJoCo's viewer shows (groups 0-2), without planes; if none is left, all geoms."""
     shown = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
     return shown if len(shown) else np.arange(model.ngeom)
 
