@@ -242,14 +242,33 @@ def test_bristles_are_fed_forward_as_they_deflect():
     assert (np.abs(z) < 0.9).all()
 
 
-def test_noise_of_the_encoders_does_not_move_the_bristles():
+@pytest.mark.parametrize("distance", [1e-4, 3e-4, 1e-3])
+def test_noise_of_the_encoders_does_not_move_the_bristles(distance):
     """While joints rest for ten seconds under a Panda's noise, they deflect at most by a step that a motion began."""
-    control = joint_impedance(PANDA, REACH, bristle_model(), action="target", displacement=3.0)
-    rest = 2e-5 * np.round((2e-3 + 1.5e-5 * np.random.default_rng(0).normal(size=(10_000, N))) / 2e-5)
-    moves = np.linspace(0, 2e-3, 400)[:, None] * np.ones(N)
+    model = bristle_model()
+    model.phi[:, 5] = distance
+    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
+    noise = np.random.default_rng(0).normal(size=(10_000, N))
+    rest = 2e-5 * np.round((2 * distance + 1.5e-5 * noise) / 2e-5)
+    moves = np.linspace(0, 2 * distance, 400)[:, None] * np.ones(N)
     tau = ahead(control, PANDA.q_home + np.concatenate([moves, rest]))
-    left = np.exp(-2e-3 / 1e-3)  # of the deflection after 2 mrad, at most
-    np.testing.assert_allclose(tau[-1], tau[500], rtol=law.STEP * left)
+    step = 1.1 * max(law.STEP, law.ENCODER / distance)  # of the distance; what noise adds to it, a tenth
+    left = np.exp(step - 2)  # of the deflection when the motion ends, a step behind
+    np.testing.assert_allclose(tau[-1], tau[500], rtol=left * -np.expm1(-step) / (1 - left))
+
+
+def test_bristles_are_not_fed_forward_above_their_friction():
+    """At speed the falling friction of the measured speed counts, and load-dependent friction that of the posture."""
+    model, q = bristle_model(load=np.full(N, 0.05)), PANDA.q_home + np.linspace(-0.3, 0.4, N)
+    control = joint_impedance(PANDA, REACH, model, action="target", displacement=3.0)
+    for speed in (0.02, 0.08, 0.32, -0.32):
+        dq = np.full(N, speed)
+        got = ahead(control, q + DT * np.arange(-300, 1)[:, None] * dq)[-1]
+        level = InverseDynamics(PANDA, model).load_friction(q[None])[0]
+        wanted = model.friction(dq, np.sign(dq)) + np.sign(dq) * level
+        slow = model.friction(law.FIRST_DQ * np.sign(dq), np.sign(dq)) + np.sign(dq) * level
+        assert (np.abs(got) <= np.abs(wanted) * (1 + 1e-6)).all()
+        np.testing.assert_allclose(np.abs(got), np.minimum(np.abs(wanted), np.abs(slow)), rtol=0.01)
 
 
 def hostile_stiffness(control, rng, cycles):

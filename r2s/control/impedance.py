@@ -324,11 +324,10 @@ def _parameters(
     rows[:, law.EDGES : law.EDGES + 2] = d.breakaway
     if d.family.has_memory and "presliding" in d.family.names:
         rows[:, law.PRESLIDING] = d.phi[:, d.family.names.index("presliding")]
-    load = InverseDynamics(robot, d).load_friction(robot.q_home[None])[0]
-    for k in range(2 * law.NODES):  # at home, load-dependent friction included
-        side = 1 if k < law.NODES else -1
-        v = np.full(n, side * law.FIRST_DQ * 4.0 ** (k % law.NODES))
-        rows[:, law.FRICTION + k] = d.friction(v, np.sign(v)) + side * load
+    rows[:, law.LOAD] = d.load
+    for k in range(2 * law.NODES):
+        v = np.full(n, law.FIRST_DQ * 4.0 ** (k % law.NODES) * (1 if k < law.NODES else -1))
+        rows[:, law.FRICTION + k] = d.friction(v, np.sign(v))
     frames = np.empty((n, POSE))
     law.arm_pose(robot.q_home, p, frames, np.empty((6, n)), np.empty(3))
     p[law.HOME_AXES : law.HOME_AXES + 9] = frames[-1, 3:]

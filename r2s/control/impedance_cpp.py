@@ -105,19 +105,8 @@ struct Law {
     }
     for (int i = 0; i < n * n; ++i) out[i] *= std::sqrt(scale);
   }
-  static double spring(double s, double limit, double& factor) {
-    factor = s <= limit ? 1.0 : std::sqrt(limit / s);
-    return s <= limit ? s : 2.0 * factor * s - limit;
-  }
-  static double energy(double s, double limit) {
-    double factor;
-    return spring(s, limit, factor);
-  }
-  static double factor(double s, double limit) {
-    double out;
-    spring(s, limit, out);
-    return out;
-  }
+  static double factor(double s, double limit) { return s <= limit ? 1.0 : std::sqrt(limit / s); }
+  static double energy(double s, double limit) { return s <= limit ? s : 2.0 * factor(s, limit) * s - limit; }
   static void refill(const double* q, double* memory, int at) {
     if (memory[BEGUN] == 0.0) {
       memory[BEGUN] = 1.0, memory[LEVEL] = parameters[FILL];
@@ -129,46 +118,56 @@ struct Law {
     }
     memory[LEVEL] = least(most(memory[LEVEL], 0.0), parameters[TANK]);
   }
-  static double friction_at(double v, const double* joint) {
+  static double friction_at(double v, const double* joint, double load) {
     const double* table = joint + (v >= 0.0 ? FRICTION : FRICTION + NODES);
-    double low = 0.0, level = 0.0, high = FIRST_DQ;
-    int k = 0;
-    for (; std::abs(v) > high && k < NODES - 1; ++k) low = high, level = table[k], high *= 4.0;
-    return level + (table[k] - level) * (std::abs(v) - low) / (high - low);
+    const double part = v >= 0.0 ? load : -load;
+    double low = 0.0, level = 0.0, high = FIRST_DQ, top = table[0] + part;
+    for (int k = 0; std::abs(v) > high && k < NODES - 1;) {
+      low = high, level = top, high *= 4.0;
+      top = table[++k] + part;
+    }
+    return level + (top - level) * (std::abs(v) - low) / (high - low);
   }
-  static double friction_ahead(double v, double q, const double* joint, double* mean) {
+  static double friction_ahead(double v, double q, const double* joint, double load, double* mean) {
     double &anchor = mean[(ANCHOR - MEAN) * n], &z = mean[(DEFLECTION - MEAN) * n];
     const double speed = (q - *mean) / SETTLE_S, distance = joint[PRESLIDING], fast = most(std::abs(v), FIRST_DQ);
     *mean += parameters[CYCLE_S] * speed;
     const double moved = *mean - anchor;
     if (distance > 0.0) {
-      if (std::abs(moved) > STEP * distance) {
+      if (std::abs(moved) > most(STEP * distance, ENCODER)) {
         const double side = moved > 0.0 ? 1.0 : -1.0;
         z = side + (z - side) * std::exp(-std::abs(moved) / distance);
         anchor = *mean;
       }
-      return std::abs(z) * friction_at(z >= 0.0 ? fast : -fast, joint);
+      const double side = z >= 0.0 ? 1.0 : -1.0, now = most(std::abs(speed), FIRST_DQ);
+      const double level = std::abs(friction_at(side * fast, joint, load));
+      return z * least(level, std::abs(friction_at(side * now, joint, load)));
     }
-    if (parameters[APPROACH] == 1.0) return friction_at(v, joint);
-    const double level = std::abs(friction_at(v >= 0.0 ? fast : -fast, joint));
+    if (parameters[APPROACH] == 1.0) return friction_at(v, joint, load);
+    const double level = std::abs(friction_at(v >= 0.0 ? fast : -fast, joint, load));
     const double beyond = most(std::abs(v >= 0.0 ? joint[EDGES + 1] : joint[EDGES]) - level, 0.0);
     return (level + beyond * most(1.0 - std::abs(speed) / REST_DQ, 0.0)) * std::tanh(v / DIRECTION_DQ);
   }
+  static double weight_about(double mass, const double* moment, const double* p, const double (*jacobian)[n], int j) {
+    double lever[3], v[3];
+    for (int c = 0; c < 3; ++c) lever[c] = moment[c] - mass * p[c];
+    cross(lever, parameters + GRAVITY, v);
+    return jacobian[3][j] * v[0] + jacobian[4][j] * v[1] + jacobian[5][j] * v[2];
+  }
   static void feedforward(const double* q, const Pose* frames, const double (*jacobian)[n], double* memory, int at,
                           double* out) {
-    double m = 0.0, h[3] = {}, v[3], lever[3];
+    double error[4] = {}, all[4] = {}, v[3];  // mass and first moment of what a joint carries
     for (int j = n - 1; j >= 0; --j) {
-      const double* p = row(j);
+      const double *p = row(j), *place = frames[j].p;
       rotate(frames[j].r, p + MOMENT_ERROR, v);
-      m += p[MASS_ERROR];
-      for (int c = 0; c < 3; ++c) {
-        h[c] += v[c] + p[MASS_ERROR] * frames[j].p[c];
-        lever[c] = h[c] - m * frames[j].p[c];
-      }
-      cross(lever, parameters + GRAVITY, v);
-      for (int c = 0; c < 3; ++c) out[j] -= jacobian[3 + c][j] * v[c];
+      error[3] += p[MASS_ERROR], all[3] += p[MASS];
+      for (int c = 0; c < 3; ++c) error[c] += v[c] + p[MASS_ERROR] * place[c];
+      rotate(frames[j].r, p + COM, v);
+      for (int c = 0; c < 3; ++c) all[c] += p[MASS] * (v[c] + place[c]);
+      const double load = p[LOAD] * std::abs(weight_about(all[3], all, place, jacobian, j));
+      out[j] -= weight_about(error[3], error, place, jacobian, j);
       out[j] -= p[OFFSET] + p[DRAG] * std::sin(q[j]) + p[DRAG + 1] * std::cos(q[j]);
-      out[j] += friction_ahead(memory[at + j], q[j], p, memory + at + MEAN * n + j);
+      out[j] += friction_ahead(memory[at + j], q[j], p, load, memory + at + MEAN * n + j);
     }
   }
 """

@@ -8,9 +8,9 @@ Ott, Frese and Hirzinger (ICRA 2003), without eigenvectors. N is dynamically con
 Automation 1987). Every spring has a potential, also where its force is clipped, so its energy is known. An energy
 tank (Ferraguti, Secchi and Fantuzzi, ICRA 2013) pays for what a rising stiffness adds to that energy; damping refills
 it. The work of a moving target and of the null space is not in the tank (Dietrich, Ott and Stramigioli, RA-L 2016).
-Feedforward: errors of the arm's gravity compensation, and friction at the reference speed dq_r. Bristles deflect with
-the measured angle: at rest their friction may have any value within its edges, whatever the reference. Cancelling a
-spring k with a delay d adds damping (k - k e^(-i w d) has the imaginary part k sin w d); only an excess is unstable.
+Feedforward: errors of the arm's gravity compensation, and friction: that of bristles follows the measured angle, all
+other the reference speed dq_r. To cancel the bristles' stiffness k with a delay d adds damping at frequencies below
+pi / d, as k - k e^(-i w d) has the imaginary part k sin w d. Friction that is estimated too high drives the arm.
 """
 
 import numpy as np
@@ -39,9 +39,9 @@ APPROACH, HEAD = 43, 44
 SLIDES = 2  # a value of APPROACH
 # Rows of the joints behind the head: a row of `links_of`, rotor, errors of mass and first moment, offset, drag,
 # friction (NODES speeds of each direction), null-space or joint stiffness with its bounds, energy J at which it
-# saturates, home, presliding distance rad (0: no bristles), breakaway Nm in both directions
+# saturates, home, presliding distance rad (0: no bristles), breakaway Nm in both directions, friction per load Nm/Nm
 ROTOR, MASS_ERROR, MOMENT_ERROR, OFFSET, DRAG, FRICTION = 28, 29, 30, 33, 34, 36
-K_JOINT, JOINT_LIMIT, HOME, PRESLIDING, EDGES, ROW = 44, 47, 48, 49, 50, 52
+K_JOINT, JOINT_LIMIT, HOME, PRESLIDING, EDGES, LOAD, ROW = 44, 47, 48, 49, 50, 52, 53
 # Memory: cycles since the update, whether a motion has begun, level of the tank J, integral N; of a sliding tip, the
 # integrals along the path and to its side (2) N and the slope of the surface (3); then the stiffnesses, and ROWS of
 # n: dq_r, the last damping torque, the last q, q behind a low-pass, that q at the last deflection, bristle deflection
@@ -52,10 +52,10 @@ SPRINGS = 4  # stiffnesses in the task's axes
 ROUNDS = 14  # iterations of the geometric mean: a ratio of 1e4 of squared frequencies converges to round-off
 FREE = 1.0  # rad/s: modes without a spring are damped as by this frequency
 NODES, FIRST_DQ = 4, 0.02  # rad/s, speeds of the friction table: FIRST_DQ 4^k; the first is twice the speed of rest
-# s, low-pass of the angles for friction: of the noise of a Panda's encoders, 1.4e-5 rad, a third is left. A bristle
-# deflects in steps of this share of its presliding distance, ten times that noise: noise alone does not move it
-SETTLE_S, STEP = 5e-3, 0.1
-# rad/s: speed below which a joint may rest, four times the noise of (q - MEAN) / SETTLE_S; reference speed that has a
+# s, low-pass of the angles for friction; it leaves a third of the noise of a Panda's encoders, 1.4e-5 rad. Bristles
+# deflect in steps of this share of their presliding distance, but of ENCODER rad at least, ten times that noise
+SETTLE_S, STEP, ENCODER = 5e-3, 0.1, 5e-5
+# rad/s: speed below which a joint may rest, 3.5 times the noise of (q - MEAN) / SETTLE_S; reference speed that has a
 # direction, chosen with press.py on twins 0 and 1, where 0.003 to 0.01 do alike
 REST_DQ, DIRECTION_DQ = 0.01, 0.003
 # 1/s, of the estimated slope: it settles while a path gains its speed, `ramp_s` of 0.4 s. m/s, below which a sliding
@@ -205,39 +205,56 @@ def refill(q, n, parameters, memory, at):
 
 
 @njit(cache=True, error_model="numpy")
-def friction_at(v, row):
-    """Return friction, Nm, at v rad/s: linear between the speeds FIRST_DQ 4^k of a joint's row, and beyond."""
+def friction_at(v, row, load):
+    """Return friction, Nm, at v rad/s under a load-dependent part of `load` Nm.
+
+    It is linear between the speeds FIRST_DQ 4^k of a joint's row, and beyond.
+    """
     side, k = FRICTION if v >= 0.0 else FRICTION + NODES, 0
-    low, level, high = 0.0, 0.0, FIRST_DQ
+    sign = 1.0 if v >= 0.0 else -1.0
+    low, level, high, top = 0.0, 0.0, FIRST_DQ, row[side] + sign * load
     while abs(v) > high and k < NODES - 1:
-        low, level, high, k = high, row[side + k], 4.0 * high, k + 1
-    return level + (row[side + k] - level) * (abs(v) - low) / (high - low)
+        k += 1
+        low, level, high, top = high, top, 4.0 * high, row[side + k] + sign * load
+    return level + (top - level) * (abs(v) - low) / (high - low)
 
 
 @njit(cache=True, error_model="numpy")
-def friction_ahead(v, q, j, n, parameters, memory, at):
-    """Return the friction, Nm, to be overcome by joint j at q rad, whose reference speed is v rad/s.
+def friction_ahead(v, q, j, load, parameters, memory, at):
+    """Return the friction, Nm, that joint j at q rad has to overcome; v: its reference speed, rad/s.
 
-    Bristles: that of their deflection z, which follows the measured angle (dz = (dq - |dq| z) / presliding, Dahl
-    1968). Otherwise that of the reference's direction, and of a joint at rest its breakaway. A target that approaches
-    a surface only gives the direction in which joints will creep: then friction at v. at: place of dq_r.
+    Bristles: their deflection z follows the measured angle, dz = (dq - |dq| z) / presliding (Dahl 1968), and their
+    level is the lower one of reference and measured speed. Otherwise the direction is that of v, and a joint at rest
+    needs its breakaway torque. If a target approaches a surface, v is only the direction in which joints will creep,
+    and friction is that at v. load: Nm, load-dependent friction. at: place of dq_r.
     """
-    row = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW]
-    mean, anchor, z = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
+    row, n = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], (len(parameters) - HEAD) // ROW
+    mean, anchor, deflection = at + MEAN * n + j, at + ANCHOR * n + j, at + DEFLECTION * n + j
     speed, distance = (q - memory[mean]) / SETTLE_S, row[PRESLIDING]
     memory[mean] += parameters[CYCLE_S] * speed
     moved, fast = memory[mean] - memory[anchor], max(abs(v), FIRST_DQ)
     if distance > 0.0:
-        if abs(moved) > STEP * distance:
+        if abs(moved) > max(STEP * distance, ENCODER):
             side = 1.0 if moved > 0.0 else -1.0
-            memory[z] = side + (memory[z] - side) * np.exp(-abs(moved) / distance)
+            memory[deflection] = side + (memory[deflection] - side) * np.exp(-abs(moved) / distance)
             memory[anchor] = memory[mean]
-        return abs(memory[z]) * friction_at(fast if memory[z] >= 0.0 else -fast, row)
+        z, now = memory[deflection], max(abs(speed), FIRST_DQ)
+        side = 1.0 if z >= 0.0 else -1.0
+        return z * min(abs(friction_at(side * fast, row, load)), abs(friction_at(side * now, row, load)))
     if parameters[APPROACH] == 1.0:
-        return friction_at(v, row)
-    level = abs(friction_at(fast if v >= 0.0 else -fast, row))
+        return friction_at(v, row, load)
+    level = abs(friction_at(fast if v >= 0.0 else -fast, row, load))
     beyond = max(abs(row[EDGES + 1] if v >= 0.0 else row[EDGES]) - level, 0.0)
     return (level + beyond * max(1.0 - abs(speed) / REST_DQ, 0.0)) * np.tanh(v / DIRECTION_DQ)
+
+
+@njit(cache=True, error_model="numpy")
+def weight_about(j, mass, x, y, z, parameters, frames, jacobian):
+    """Return the torque, Nm, of gravity about joint j on a mass, kg, with the first moment x, y, z, kg m."""
+    x, y, z = x - mass * frames[j, 0], y - mass * frames[j, 1], z - mass * frames[j, 2]
+    a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
+    a, b, c = y * c - z * b, z * a - x * c, x * b - y * a
+    return jacobian[3, j] * a + jacobian[4, j] * b + jacobian[5, j] * c
 
 
 @njit(cache=True, error_model="numpy")
@@ -245,14 +262,16 @@ def feedforward(q, parameters, frames, jacobian, memory, at, out):
     """Add friction, and errors of the gravity compensation, offset and drag, to `out`; at: place of dq_r."""
     n = len(q)
     m, x, y, z = 0.0, 0.0, 0.0, 0.0  # errors of mass and first moment of all that a joint carries
+    M, X, Y, Z = 0.0, 0.0, 0.0, 0.0  # the mass and the first moment
     for j in range(n - 1, -1, -1):
-        row = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW]
-        u, v, w = rotate(pose_axes(frames[j]), row[MOMENT_ERROR], row[MOMENT_ERROR + 1], row[MOMENT_ERROR + 2])
+        row, R = parameters[HEAD + j * ROW : HEAD + (j + 1) * ROW], pose_axes(frames[j])
+        u, v, w = rotate(R, row[MOMENT_ERROR], row[MOMENT_ERROR + 1], row[MOMENT_ERROR + 2])
         e = row[MASS_ERROR]
         m, x, y, z = m + e, x + u + e * frames[j, 0], y + v + e * frames[j, 1], z + w + e * frames[j, 2]
-        u, v, w = x - m * frames[j, 0], y - m * frames[j, 1], z - m * frames[j, 2]
-        a, b, c = parameters[GRAVITY], parameters[GRAVITY + 1], parameters[GRAVITY + 2]
-        a, b, c = v * c - w * b, w * a - u * c, u * b - v * a
-        out[j] -= jacobian[3, j] * a + jacobian[4, j] * b + jacobian[5, j] * c
+        u, v, w = rotate(R, row[COM], row[COM + 1], row[COM + 2])
+        e = row[MASS]
+        M, X, Y, Z = M + e, X + e * (u + frames[j, 0]), Y + e * (v + frames[j, 1]), Z + e * (w + frames[j, 2])
+        load = row[LOAD] * abs(weight_about(j, M, X, Y, Z, parameters, frames, jacobian))
+        out[j] -= weight_about(j, m, x, y, z, parameters, frames, jacobian)
         out[j] -= row[OFFSET] + row[DRAG] * np.sin(q[j]) + row[DRAG + 1] * np.cos(q[j])
-        out[j] += friction_ahead(memory[at + j], q[j], j, n, parameters, memory, at)
+        out[j] += friction_ahead(memory[at + j], q[j], j, load, parameters, memory, at)

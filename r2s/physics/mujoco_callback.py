@@ -150,7 +150,7 @@ def _first_moment(mass, xpos, xmat, h):
 @njit(inline="always")
 def _direction(v, net, z, user):
     """Return the direction of load-dependent friction in [-1, 1], and its slope s/rad; z: bristle deflection."""
-    if user[FAMILY] == BRISTLES:  # during the coming step, as in their own law
+    if user[FAMILY] == BRISTLES:  # during the coming step, without their damping
         per_v = user[STEP] / user[P1 + PRESLIDING]
         return z + per_v * (v - abs(v) * z), per_v * (1.0 - (z if v > 0.0 else -z))
     if net:
